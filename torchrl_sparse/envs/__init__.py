@@ -1,0 +1,1 @@
+"""robosuite tasks as TorchRL environments, and scripted experts for them."""

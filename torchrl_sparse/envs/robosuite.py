@@ -1,0 +1,257 @@
+"""robosuite 1.5 tasks as TorchRL environments on the canonical keys."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.rendering import CameraRenderer
+from torchrl_sparse.envs.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
+from torchrl_sparse.envs.simulator import make_simulator
+from torchrl_sparse.envs.tasks import get_task
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Everything that fixes how an episode starts.
+
+    Attributes:
+        model_xml: the MuJoCo model; robosuite randomises sizes, so it belongs to the state.
+        sim_state: f64 [1 + nq + nv] time, positions, velocities.
+        seed: the seed it came from.
+    """
+
+    model_xml: str
+    sim_state: np.ndarray
+    seed: int
+
+
+class RobosuiteEnv(EnvBase):
+    """One robosuite task with Panda arms at 20 Hz.
+
+    An episode is *terminated* on success and *truncated* at the horizon. Each reset is fixed by one integer, reported under
+    ``("episode", "seed")``: the next of ``seeds``, or one more than the last after `set_seed`.
+
+    Args:
+        task: one of `torchrl_sparse.envs.tasks.TASKS`.
+        action_mode: "absolute", 10 numbers per arm (position in m, 6-D rotation of the grip site in the world frame, gripper
+            -1 open to 1 closed), or "delta", robosuite's 7 normalised OSC_POSE numbers per arm.
+        horizon: steps until truncation; the task's own by default.
+        seeds: seeds of successive episodes, repeated when used up. For paired evaluations.
+        camera: camera of ``("observation", "image")``, e.g. "agentview"; none by default.
+        wrist_camera: camera of ``("observation", "wrist_image")``, e.g. "robot0_eye_in_hand".
+        image_size: height and width of the images, pixels.
+        fast_render: see `CameraRenderer`.
+        instruction: write ``"language_instruction"``; True for the task's own words.
+        reward_shaping: robosuite's dense reward instead of 1 on success.
+
+    Raises:
+        ValueError: for an unknown task or action mode, or an action of a wrong size or that is not finite.
+
+    Examples:
+        >>> env = RobosuiteEnv("Lift", seeds=[7])
+        >>> env.reset()["observation", "state"].shape
+        torch.Size([19])
+        >>> env.rollout(3)["next", "success"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        action_mode: Literal["absolute", "delta"] = "absolute",
+        horizon: int | None = None,
+        seeds: Sequence[int] | None = None,
+        camera: str | None = None,
+        wrist_camera: str | None = None,
+        image_size: int = 84,
+        fast_render: bool = True,
+        instruction: bool | str = False,
+        reward_shaping: bool = False,
+        device: torch.device | str = "cpu",
+    ):
+        super().__init__(device=device, batch_size=[])
+        if action_mode not in ("absolute", "delta"):
+            raise ValueError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
+        if seeds is not None and not len(seeds):
+            raise ValueError("seeds: expected at least one seed, got none")
+        self.task = get_task(task)
+        self.action_mode = action_mode
+        self.horizon = self.task.horizon if horizon is None else horizon
+        self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
+        self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
+        self._image_size = image_size
+        self._fast_render = fast_render
+        self._instruction = self.task.instruction if instruction is True else instruction
+        self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
+        self._next_seed = int(torch.randint(2**31, ()))
+        self._episode_seed = self._next_seed
+        self._elapsed = 0
+        self._renderers: dict[tuple[int, int], CameraRenderer] = {}
+        self.sim_env = make_simulator(
+            self.task, absolute=action_mode == "absolute", reward_shaping=reward_shaping
+        )
+        self._make_specs()
+
+    # -- specs ---------------------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        size = self._image_size
+        observation = Composite(
+            state=Unbounded((self.task.state_dim,), device=self.device),
+            eef_vel=Unbounded((6 * self.task.arms,), device=self.device),
+        )
+        for _, name in self._cameras:
+            observation[name] = Bounded(0, 255, (3, size, size), dtype=torch.uint8, device=self.device)
+        self.observation_spec = Composite(
+            observation=observation,
+            success=self._flag_spec(),
+            episode=Composite(seed=self._count_spec(), step=self._count_spec()),
+        )
+        if self._instruction:
+            self.observation_spec[keys.INSTRUCTION] = NonTensor(
+                (), example_data=self._instruction, device=self.device
+            )
+        if self.action_mode == "absolute":
+            self.action_spec = Unbounded((ABSOLUTE_DIM * self.task.arms,), device=self.device)
+        else:
+            self.action_spec = Bounded(-1.0, 1.0, (POSE_DIM * self.task.arms,), device=self.device)
+        self.reward_spec = Unbounded((1,), device=self.device)
+        self.done_spec = Composite(
+            done=self._flag_spec(), terminated=self._flag_spec(), truncated=self._flag_spec()
+        )
+
+    def _flag_spec(self) -> Categorical:
+        return Categorical(2, (1,), dtype=torch.bool, device=self.device)
+
+    def _count_spec(self) -> Unbounded:
+        return Unbounded((1,), dtype=torch.int64, device=self.device)
+
+    # -- episodes ------------------------------------------------------------------------------------------------------
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._next_seed = int(seed)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
+    ) -> TensorDictBase:
+        self._close_renderers()
+        if initial_state is None:
+            self._start_from_seed(self._take_seed())
+        else:
+            self._start_from_state(initial_state)
+        self._elapsed = 0
+        return self._observe()
+
+    def _take_seed(self) -> int:
+        if self._seeds is not None:
+            return next(self._seeds)
+        seed, self._next_seed = self._next_seed, self._next_seed + 1
+        return seed
+
+    def _start_from_seed(self, seed: int) -> None:
+        # robosuite hands its generator to samplers when it builds them, so it is reseeded in place, never replaced.
+        self.sim_env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
+        self._episode_seed = seed
+        self.sim_env.reset()
+
+    def _start_from_state(self, state: InitialState) -> None:
+        sim_env = self.sim_env
+        sim_env.reset_from_xml_string(sim_env.edit_model_xml(state.model_xml))
+        sim_env.sim.set_state_from_flattened(state.sim_state)
+        sim_env.sim.forward()
+        for robot in sim_env.robots:  # the null-space posture is that of the episode's first configuration
+            joints = sim_env.sim.data.qpos[robot._ref_joint_pos_indexes]
+            robot.part_controllers["right"].update_initial_joints(joints)
+        sim_env._get_observations(force_update=True)  # relative poses are made from the poses of the last update
+        self._episode_seed = state.seed
+
+    def get_initial_state(self) -> InitialState:
+        """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
+        sim = self.sim_env.sim
+        return InitialState(sim.model.get_xml(), sim.get_state().flatten(), self._episode_seed)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._check_action(tensordict.get(keys.ACTION))
+        command = absolute_to_pose(action) if self.action_mode == "absolute" else action
+        _, reward, _, _ = self.sim_env.step(command)
+        self._elapsed += 1
+        out = self._observe()
+        success = out[keys.SUCCESS]
+        truncated = (out[keys.EPISODE_STEP] >= self.horizon) & ~success
+        out["reward"] = torch.tensor([reward], dtype=torch.float32, device=self.device)
+        out["terminated"], out["truncated"], out["done"] = success.clone(), truncated, success | truncated
+        return out
+
+    def _check_action(self, action: torch.Tensor) -> np.ndarray:
+        expected = self.action_spec.shape
+        if action.shape != expected:
+            raise ValueError(
+                f"action: expected {self.action_mode} shape {tuple(expected)}, got {tuple(action.shape)}"
+            )
+        action = action.detach().cpu().numpy().astype(np.float64)
+        if not np.isfinite(action).all():
+            raise ValueError(f"action: expected finite numbers, got {action.tolist()}")
+        return action
+
+    # -- observations --------------------------------------------------------------------------------------------------
+
+    def raw_observation(self) -> Mapping[str, np.ndarray]:
+        """The parts of the state by robosuite's names, f64, in the order in which they are concatenated."""
+        observed = self.sim_env._get_observations(force_update=True)
+        observed["object"] = observed["object-state"]
+        parts = {name: np.asarray(observed[name]) for name in self.task.state_keys}
+        return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
+
+    def _observe(self) -> TensorDict:
+        out = TensorDict(device=self.device)
+        out[keys.STATE] = torch.as_tensor(
+            np.concatenate([*self.raw_observation().values()]), dtype=torch.float32
+        )
+        out[keys.EEF_VEL] = torch.as_tensor(self._eef_velocity(), dtype=torch.float32)
+        for key, camera in self._cameras.items():
+            image = self.render(camera, self._image_size, self._image_size)
+            out[key] = torch.from_numpy(image).permute(2, 0, 1).contiguous()
+        if self._instruction:
+            out[keys.INSTRUCTION] = self._instruction
+        out[keys.SUCCESS] = torch.tensor([bool(self.sim_env._check_success())])
+        out[keys.EPISODE_SEED] = torch.tensor([self._episode_seed])
+        out[keys.EPISODE_STEP] = torch.tensor([self._elapsed])
+        return out
+
+    def _eef_velocity(self) -> np.ndarray:
+        """Velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
+        data = self.sim_env.sim.data
+        sites = [robot.gripper["right"].important_sites["grip_site"] for robot in self.sim_env.robots]
+        twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in sites]
+        return np.concatenate([part for twist in twists for part in twist])
+
+    def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
+        """u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
+        size = (height, width)
+        if size not in self._renderers:
+            self._renderers[size] = CameraRenderer(self.sim_env.sim, height, width, fast=self._fast_render)
+        return self._renderers[size].image(camera)
+
+    # -- clean-up ------------------------------------------------------------------------------------------------------
+
+    def _close_renderers(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers = {}
+
+    def close(self, *, raise_if_closed: bool = True) -> Any:
+        self._close_renderers()
+        self.sim_env.close()
+        return super().close(raise_if_closed=raise_if_closed)

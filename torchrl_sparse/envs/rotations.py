@@ -1,0 +1,86 @@
+"""Rotation conventions of Diffusion Policy's absolute actions.
+
+The 6-D rotation is the first two *rows* of the rotation matrix (the pytorch3d convention, arXiv:1812.07035), not its columns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+POSE_DIM = 7
+"""Position (3), rotation vector (3) and gripper (1) of one arm, as robosuite's absolute controller takes them."""
+
+ABSOLUTE_DIM = 10
+"""Position (3), 6-D rotation (6) and gripper (1) of one arm, as the policy predicts them."""
+
+
+def matrix_to_rot6d(matrix: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] rotation matrices to [..., 6] first two rows."""
+    return matrix[..., :2, :].reshape(*matrix.shape[:-2], 6)
+
+
+def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
+    """[..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
+
+    Raises:
+        ValueError: if the last axis is not 6, or the two rows are parallel or zero.
+    """
+    if rot6d.shape[-1] != 6:
+        raise ValueError(f"rot6d: expected a last axis of 6, got shape {tuple(rot6d.shape)}")
+    first, second = rot6d[..., :3], rot6d[..., 3:]
+    row0 = _unit(first)
+    row1 = _unit(second - (row0 * second).sum(-1, keepdims=True) * row0)
+    return np.stack([row0, row1, np.cross(row0, row1)], axis=-2)
+
+
+def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
+    """[..., 3] rotation vectors (rad) to [..., 6].
+
+    >>> rotvec_to_rot6d(np.zeros(3))
+    array([1., 0., 0., 0., 1., 0.])
+    """
+    matrix = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
+    return matrix_to_rot6d(matrix.reshape(*rotvec.shape[:-1], 3, 3))
+
+
+def rot6d_to_rotvec(rot6d: np.ndarray) -> np.ndarray:
+    """[..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
+    matrix = rot6d_to_matrix(rot6d)
+    return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(*rot6d.shape[:-1], 3)
+
+
+def pose_to_absolute(pose: np.ndarray) -> np.ndarray:
+    """[..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
+    arms = _split_arms(pose, POSE_DIM)
+    absolute = np.concatenate([arms[..., :3], rotvec_to_rot6d(arms[..., 3:6]), arms[..., 6:]], axis=-1)
+    return absolute.reshape(*pose.shape[:-1], -1)
+
+
+def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
+    """[..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
+    arms = _split_arms(absolute, ABSOLUTE_DIM)
+    pose = np.concatenate([arms[..., :3], rot6d_to_rotvec(arms[..., 3:9]), arms[..., 9:]], axis=-1)
+    return pose.reshape(*absolute.shape[:-1], -1)
+
+
+def downward_quaternion(quat: np.ndarray) -> np.ndarray:
+    """The one of +q and -q (xyzw) that is nearer to the Panda's rest orientation, gripper down: (1, 1, 0, 0) / sqrt(2).
+
+    Both are the same rotation. Conventions that look at w flip where w crosses zero, which is where a downward gripper lives,
+    and a policy would see a jump where nothing moved.
+    """
+    return -quat if quat[0] + quat[1] < 0 else quat
+
+
+def _split_arms(flat: np.ndarray, dim: int) -> np.ndarray:
+    if flat.shape[-1] == 0 or flat.shape[-1] % dim:
+        raise ValueError(f"action: expected {dim} numbers per arm, got a last axis of {flat.shape[-1]}")
+    return flat.reshape(*flat.shape[:-1], -1, dim)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(vector, axis=-1, keepdims=True)
+    if (norm < 1e-6).any():
+        raise ValueError("rot6d: its two rows are parallel or zero, so they fix no rotation")
+    return vector / norm

@@ -1,0 +1,70 @@
+"""The robosuite tasks: what each is called, observes and allows.
+
+Layouts follow the low-dimensional tasks of Diffusion Policy (arXiv:2303.04137): the task's object state first, then position,
+quaternion and finger positions of each arm. The quaternion is read from the grip *site*, the frame that absolute actions
+command; robosuite's ``robot0_eef_quat`` is another frame, about 90 degrees off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Task:
+    """One robosuite task.
+
+    Attributes:
+        name: robosuite's name.
+        arms: number of Panda arms.
+        object_dim: size of robosuite's ``object-state``.
+        horizon: steps after which an episode is truncated, as in Diffusion Policy's evaluation (20 Hz).
+        instruction: the task in words.
+    """
+
+    name: str
+    arms: int
+    object_dim: int
+    horizon: int
+    instruction: str
+
+    @property
+    def state_keys(self) -> tuple[str, ...]:
+        """robosuite observations whose concatenation is the state."""
+        per_arm = (f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
+        return ("object", *per_arm)
+
+    @property
+    def state_dim(self) -> int:
+        return self.object_dim + self.arms * sum(_PROPRIOCEPTION.values())
+
+    def state_slice(self, key: str) -> slice:
+        """Where one of `state_keys` lies in the state."""
+        sizes = [self.object_dim, *self.arms * tuple(_PROPRIOCEPTION.values())]
+        index = self.state_keys.index(key)
+        return slice(sum(sizes[:index]), sum(sizes[: index + 1]))
+
+
+_PROPRIOCEPTION = {"eef_pos": 3, "eef_quat_site": 4, "gripper_qpos": 2}
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task("Lift", 1, 10, 400, "lift the red cube"),
+        Task("PickPlaceCan", 1, 14, 400, "put the can into its bin"),
+        Task("NutAssemblySquare", 1, 14, 400, "put the square nut on the square peg"),
+        Task("TwoArmTransport", 2, 41, 700, "hand the hammer over and put it into the target bin"),
+        Task("ToolHang", 1, 44, 700, "assemble the frame and hang the tool on it"),
+    )
+}
+
+
+def get_task(name: str) -> Task:
+    """The task of that robosuite name.
+
+    Raises:
+        ValueError: if there is none; the message lists those there are.
+    """
+    if name not in TASKS:
+        raise ValueError(f"task: expected one of {', '.join(TASKS)}, got {name!r}")
+    return TASKS[name]

@@ -1,0 +1,89 @@
+"""What stands between a robosuite environment and a policy: observation history, and velocity where no simulator gives it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv, UnsqueezeTransform
+from torchrl.envs.transforms import Transform
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.tasks import Task
+
+
+def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
+    """A robosuite task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: the state's history and ``"is_init"``.
+
+    Args:
+        task: see `RobosuiteEnv`, as are ``kwargs``.
+        n_obs_steps: states in the history; the first of an episode is repeated at its start.
+
+    Examples:
+        >>> make_env("Lift").reset()["history", "state"].shape
+        torch.Size([2, 19])
+    """
+    return TransformedEnv(RobosuiteEnv(task, **kwargs), Compose(InitTracker(), *state_history(n_obs_steps)))
+
+
+def state_history(n_obs_steps: int) -> list[Transform]:
+    """Transforms that write ``("history", "state")``, f32 [*B, n_obs_steps, Ds], oldest first."""
+    if n_obs_steps < 1:
+        raise ValueError(f"n_obs_steps: expected at least 1, got {n_obs_steps}")
+    return [
+        UnsqueezeTransform(dim=-2, in_keys=[keys.STATE], out_keys=[keys.HISTORY_STATE]),
+        CatFrames(N=n_obs_steps, dim=-2, in_keys=[keys.HISTORY_STATE]),
+    ]
+
+
+class EndEffectorVelocity(Transform):
+    """Writes ``("observation", "eef_vel")`` from two successive poses, where there is no simulator to ask.
+
+    It is the mean over the step just made; the simulator's own, which `RobosuiteEnv` writes, is that at the step's end. Zero
+    after a reset.
+
+    Args:
+        task: tells where each arm's position and quaternion (xyzw) lie in the state.
+        control_freq: steps a second.
+    """
+
+    def __init__(self, task: Task, control_freq: float = 20.0):
+        super().__init__(in_keys=[keys.STATE], out_keys=[keys.EEF_VEL])
+        self.control_freq = control_freq
+        self._poses = [
+            (task.state_slice(f"robot{i}_eef_pos"), task.state_slice(f"robot{i}_eef_quat_site"))
+            for i in range(task.arms)
+        ]
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        state = tensordict_reset.get(keys.STATE)
+        return tensordict_reset.set(keys.EEF_VEL, state.new_zeros(*state.shape[:-1], 6 * len(self._poses)))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        before, after = tensordict.get(keys.STATE), next_tensordict.get(keys.STATE)
+        twists = [
+            torch.cat([after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat])], -1)
+            for pos, quat in self._poses
+        ]
+        return next_tensordict.set(keys.EEF_VEL, torch.cat(twists, -1) * self.control_freq)
+
+    def transform_observation_spec(self, observation_spec):
+        shape = (*observation_spec.shape, 6 * len(self._poses))
+        observation_spec[keys.EEF_VEL] = Unbounded(shape, device=observation_spec.device)
+        return observation_spec
+
+
+def rotation_between(before: Tensor, after: Tensor) -> Tensor:
+    """Rotation vector, [..., 3] rad in the world frame, that turns quaternion ``before`` into ``after`` ([..., 4], xyzw)."""
+    xyz0, w0 = before[..., :3], before[..., 3:]
+    xyz1, w1 = after[..., :3], after[..., 3:]
+    xyz = w0 * xyz1 - w1 * xyz0 - torch.linalg.cross(xyz1, xyz0)  # after * conjugate(before)
+    w = w0 * w1 + (xyz0 * xyz1).sum(-1, keepdim=True)
+    xyz, w = torch.where(w < 0, -xyz, xyz), w.abs()
+    sine = xyz.norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, w)
+    return xyz * torch.where(sine > 1e-8, angle / sine.clamp_min(1e-8), torch.full_like(sine, 2.0))
