@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 from typing import Any
 
@@ -43,6 +44,7 @@ class CameraRenderer:
                 self._scene.flags[flag] = 0
         self._options = mujoco.MjvOption()
         self._options.geomgroup[0] = 0  # collision shapes
+        atexit.register(self.close)  # a context that outlives EGL itself complains at exit
 
     def image(self, camera: str) -> np.ndarray:
         """u8 [height, width, 3], top row first.
@@ -66,6 +68,8 @@ class CameraRenderer:
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
+        """Frees the GL context. Call once."""
+        atexit.unregister(self.close)
         self._gl.make_current()
         self._context.free()
         self._gl.free()
