@@ -1,0 +1,177 @@
+"""What one evaluated episode leaves behind, and the log that survives a killed evaluation."""
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+__all__ = ["EpisodeLog", "EpisodeResult", "Totals", "totals"]
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """One finished episode.
+
+    Attributes:
+        seed: the episode's seed; it fixes the initial state and, with the step, all noise of every query.
+        success: whether the task's predicate held at any step.
+        length: environment steps.
+        queries: calls of the policy.
+        flops_total: FLOPs (2 * MAC) of all queries together, denoiser only.
+        prune_rate: mean of the masks of all queries, in [0, 1]; 0 where the policy writes no mask.
+        latency: seconds of each query as the policy reported it. A batched call reports its duration for
+            every row, so these describe the rollout; the figures of a table come from
+            :func:`measure_latency`.
+    """
+
+    seed: int
+    success: bool
+    length: int
+    queries: int
+    flops_total: float
+    prune_rate: float
+    latency: tuple[float, ...] = ()
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> "EpisodeResult":
+        """Inverse of ``dataclasses.asdict``.
+
+        Raises:
+            ValueError: if keys are missing or unknown.
+        """
+        expected = {field.name for field in fields(cls)}
+        if set(data) != expected:
+            raise ValueError(f"expected the keys {sorted(expected)}, got {sorted(data)}")
+        return cls(**{**data, "latency": tuple(data["latency"])})
+
+
+@dataclass(frozen=True)
+class Totals:
+    """Cost of several episodes: per query where a query is what costs, per episode where the episode does.
+
+    Attributes:
+        flops_per_query: FLOPs (2 * MAC).
+        prune_rate: mean over queries, in [0, 1].
+        episode_length: mean environment steps.
+        queries: number of queries.
+    """
+
+    flops_per_query: float
+    prune_rate: float
+    episode_length: float
+    queries: int
+
+
+def totals(episodes: Sequence[EpisodeResult]) -> Totals:
+    """Average episodes, every query counting the same.
+
+    Raises:
+        ValueError: if there are no episodes or no query.
+
+    >>> totals([EpisodeResult(0, True, 8, 1, 10.0, 0.5), EpisodeResult(1, True, 24, 3, 90.0, 0.9)])
+    Totals(flops_per_query=25.0, prune_rate=0.8, episode_length=16.0, queries=4)
+    """
+    queries = sum(episode.queries for episode in episodes)
+    if queries == 0:
+        raise ValueError(f"expected at least one query of the policy, got none in {len(episodes)} episodes")
+    return Totals(
+        flops_per_query=sum(episode.flops_total for episode in episodes) / queries,
+        prune_rate=sum(episode.prune_rate * episode.queries for episode in episodes) / queries,
+        episode_length=sum(episode.length for episode in episodes) / len(episodes),
+        queries=queries,
+    )
+
+
+class EpisodeLog:
+    """Append-only JSON-lines file of :class:`EpisodeResult`, one per seed, safe against a kill at any moment.
+
+    The first line names what was evaluated. Every episode is one line, flushed to the disk before
+    :meth:`append` returns.
+    A last line without its newline was torn by a kill: it is cut off on opening, and its seed runs again.
+
+    Args:
+        path: the file; it and its folder are made if missing.
+        identity: what the episodes belong to (method, task, policy fingerprint, ...), JSON values.
+            Reopening a log under another identity is refused, so that a resume never mixes two methods.
+
+    Raises:
+        ValueError: if the file is not such a log, has a damaged line before its last, or has another
+            identity.
+
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "dense.jsonl"
+    >>> EpisodeLog(path, {"method": "dense"}).append(EpisodeResult(7, True, 30, 4, 6.3e10, 0.0))
+    >>> EpisodeLog(path, {"method": "dense"}).episodes[7].length
+    30
+    """
+
+    def __init__(self, path: str | os.PathLike, identity: Mapping[str, Any] | None = None) -> None:
+        self.path = Path(path)
+        self.identity = dict(identity or {})
+        self.episodes: dict[int, EpisodeResult] = {}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        header = {"episode_log": _VERSION, "identity": self.identity}
+        content = self.path.read_bytes() if self.path.exists() else b""
+        if (json.dumps(header) + "\n").encode().startswith(content):
+            # A new log, or one killed while its header was written.
+            self.path.write_bytes(b"")
+            self._write(header)
+            return
+        # What follows the last newline is torn; it is cut off only once the header has shown whose file
+        # this is.
+        whole = content[: content.rfind(b"\n") + 1] or content
+        lines = whole.decode("utf-8").splitlines()
+        self._check_header(self._parse(lines[0], 1))
+        for number, line in enumerate(lines[1:], start=2):
+            self._add(self._parse(line, number), number)
+        os.truncate(self.path, len(whole))
+
+    def append(self, episode: EpisodeResult) -> None:
+        """Write one episode through to the disk.
+
+        Raises:
+            ValueError: if its seed is already in the log.
+        """
+        if episode.seed in self.episodes:
+            raise ValueError(f"{self.path}: seed {episode.seed} is already in the log")
+        self._write(asdict(episode))
+        self.episodes[episode.seed] = episode
+
+    def missing(self, seeds: Iterable[int]) -> list[int]:
+        """The seeds that have no episode yet, in their order."""
+        return [seed for seed in seeds if seed not in self.episodes]
+
+    def _write(self, data: Mapping[str, Any]) -> None:
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(data, allow_nan=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _parse(self, line: str, number: int) -> dict[str, Any]:
+        try:
+            data = json.loads(line)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{self.path}:{number}: expected a JSON object, got {line[:80]!r}") from error
+        if not isinstance(data, dict):
+            raise ValueError(f"{self.path}:{number}: expected a JSON object, got {type(data).__name__}")
+        return data
+
+    def _check_header(self, header: Mapping[str, Any]) -> None:
+        if header.get("episode_log") != _VERSION:
+            found = header.get("episode_log")
+            raise ValueError(f"{self.path}:1: expected an episode log of version {_VERSION}, got {found!r}")
+        found = header.get("identity")
+        # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
+        if found != json.loads(json.dumps(self.identity)):
+            raise ValueError(f"{self.path}: holds episodes of {found}, expected {self.identity}")
+
+    def _add(self, data: Mapping[str, Any], number: int) -> None:
+        try:
+            episode = EpisodeResult.from_json(data)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.path}:{number}: {error}") from error
+        self.episodes.setdefault(episode.seed, episode)

@@ -1,0 +1,189 @@
+"""Latency measured so that it can be compared: one process, interleaved, warmed up, synchronised, threads
+named.
+
+Timing one method to the end before the next compares two states of the machine (clock, caches, neighbours)
+as much as two methods. Here every round calls each candidate once, in an order shuffled per round, so that
+a slow minute hits all of them.
+"""
+
+import os
+import platform
+import random
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = ["Latency", "describe_machine", "measure_latency", "num_threads", "summarize_latency"]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Latency of one query.
+
+    Attributes:
+        p50: median, seconds.
+        p95: 95th percentile, seconds.
+        n: timed calls.
+        samples: every timed call in the order of execution, seconds.
+    """
+
+    p50: float
+    p95: float
+    n: int
+    samples: tuple[float, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """The ``latency_s`` object of ``results.json``."""
+        return {"p50": self.p50, "p95": self.p95, "n": self.n}
+
+
+def summarize_latency(samples: Sequence[float]) -> Latency:
+    """Percentiles (linear interpolation) of latencies in seconds.
+
+    Raises:
+        ValueError: if there are none, or one is negative or not finite.
+
+    >>> latency = summarize_latency([0.1, 0.2, 0.3])
+    >>> latency.p50, latency.n
+    (0.2, 3)
+    """
+    values = np.asarray(samples, dtype=np.float64)
+    if values.size == 0:
+        raise ValueError("expected at least one latency, got none")
+    if not np.isfinite(values).all() or (values < 0).any():
+        raise ValueError(
+            f"latencies must be finite and >= 0 s, got min {values.min()} s and max {values.max()} s"
+        )
+    p50, p95 = np.percentile(values, [50, 95])
+    return Latency(float(p50), float(p95), int(values.size), tuple(values.tolist()))
+
+
+def measure_latency(
+    callables: Mapping[str, Callable[[], Any]],
+    repeats: int = 20,
+    warmup: int = 3,
+    threads: int | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    on_round: Callable[[int, int], None] | None = None,
+) -> dict[str, Latency]:
+    """Time several callables against each other, without gradients.
+
+    Args:
+        callables: name -> function without arguments; one call is one query.
+        repeats: timed rounds; every round calls each candidate once.
+        warmup: untimed rounds before them.
+        threads: intra-op threads of PyTorch while measuring (restored afterwards); None leaves the setting
+            alone.
+        device: synchronised before the clock starts and before it stops.
+        seed: of the order within the rounds.
+        on_round: called as ``on_round(done, repeats)`` after each timed round.
+
+    Returns:
+        name -> :class:`Latency`, in the order of ``callables``.
+
+    Raises:
+        ValueError: if there is nothing to time or a count is out of range.
+
+    >>> result = measure_latency({"fast": lambda: None, "slow": lambda: sum(range(20000))}, repeats=5)
+    >>> result["fast"].p50 < result["slow"].p50, result["slow"].n
+    (True, 5)
+    """
+    if not callables:
+        raise ValueError("expected at least one callable to time, got none")
+    if repeats < 1 or warmup < 0:
+        raise ValueError(f"expected repeats >= 1 and warmup >= 0, got {repeats} and {warmup}")
+    device = torch.device(device)
+    order = list(callables)
+    generator = random.Random(seed)
+    samples: dict[str, list[float]] = {name: [] for name in callables}
+    with num_threads(threads), torch.no_grad():
+        for round_index in range(-warmup, repeats):
+            generator.shuffle(order)
+            for name in order:
+                seconds = _time_once(callables[name], device)
+                if round_index >= 0:
+                    samples[name].append(seconds)
+            if on_round is not None and round_index >= 0:
+                on_round(round_index + 1, repeats)
+    return {name: summarize_latency(values) for name, values in samples.items()}
+
+
+@contextmanager
+def num_threads(threads: int | None) -> Iterator[None]:
+    """Run a block with ``threads`` intra-op threads of PyTorch; None changes nothing.
+
+    >>> with num_threads(1):
+    ...     torch.get_num_threads()
+    1
+    """
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads must be >= 1 or None, got {threads}")
+    before = torch.get_num_threads()
+    if threads is not None:
+        torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> dict[str, Any]:
+    """The ``machine`` object of ``results.json``: what the latencies were measured on.
+
+    Args:
+        device: where the policy runs.
+        threads: the threads used; None takes PyTorch's present setting.
+
+    >>> sorted(describe_machine())
+    ['cpu', 'date', 'device', 'threads', 'torch']
+    """
+    device = torch.device(device)
+    name = f"{device.type} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
+    return {
+        "cpu": f"{_cpu_model()}, {_usable_cores()} cores usable",
+        "threads": torch.get_num_threads() if threads is None else int(threads),
+        "device": name,
+        "torch": torch.__version__,
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _time_once(call: Callable[[], Any], device: torch.device) -> float:
+    _synchronize(device)
+    start = time.perf_counter()
+    call()
+    _synchronize(device)
+    return time.perf_counter() - start
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    elif device.type == "mps":
+        torch.mps.synchronize()
+
+
+def _usable_cores() -> int:
+    # A container often sees all the host's cores but may run on a few of them only.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        key, _, value = line.partition(":")
+        if key.strip() == "model name":
+            return value.strip()
+    return platform.processor() or platform.machine()

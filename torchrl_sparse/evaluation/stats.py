@@ -1,0 +1,181 @@
+"""Intervals and verdicts for success rates, alone and paired with the dense policy.
+
+Episodes are Bernoulli trials. A rate gets Wilson's interval (E. B. Wilson, JASA 22, 1927). Two methods that
+ran on the same
+seeds are compared pair by pair: only the *discordant* pairs, in which one succeeds and the other fails, say
+anything about the difference, and its interval is Tango's asymptotic score interval (T. Tango, Statistics
+in Medicine 17, 1998, 891-908). It inverts a test whose variance is estimated under each hypothesised
+difference, and so keeps a positive width where a
+Wald interval collapses: with n pairs and no discordant one it is ``±z²/(n + z²)``, not ``±0``.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy.optimize import brentq
+from scipy.stats import binomtest, norm
+
+__all__ = [
+    "DEFAULT_MARGIN",
+    "PairedDifference",
+    "Verdict",
+    "episodes_needed",
+    "paired_difference",
+    "tango_interval",
+    "verdict",
+    "wilson_interval",
+]
+
+Verdict = Literal["non-inferior", "inferior", "undecided"]
+DEFAULT_MARGIN = 0.05
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """Success of a method minus success of the reference on the same seeds.
+
+    Attributes:
+        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse.
+        ci: two-sided confidence interval of ``diff``.
+        margin: the non-inferiority margin of ``verdict``, a positive difference of rates.
+        verdict: see :func:`verdict`.
+        won: pairs that only the method solved.
+        lost: pairs that only the reference solved.
+        n: pairs.
+    """
+
+    diff: float
+    ci: tuple[float, float]
+    margin: float
+    verdict: Verdict
+    won: int
+    lost: int
+    n: int
+
+
+def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a success rate.
+
+    Args:
+        k: successes, 0 <= k <= n.
+        n: trials, at least 1.
+        confidence: two-sided level, strictly between 0 and 1.
+
+    Raises:
+        ValueError: if the counts or the level are out of range.
+
+    >>> [round(limit, 4) for limit in wilson_interval(81, 263)]
+    [0.2553, 0.3662]
+    """
+    _check_level(confidence)
+    if n < 1 or not 0 <= k <= n:
+        raise ValueError(f"a rate needs 0 <= k <= n and n >= 1, got k={k}, n={n}")
+    interval = binomtest(k, n).proportion_ci(confidence_level=confidence, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Tango's score interval of ``(won - lost) / n``, the difference of two paired proportions.
+
+    Args:
+        won: pairs in which only the first member succeeds.
+        lost: pairs in which only the second member succeeds.
+        n: all pairs, concordant ones included, at least 1.
+        confidence: two-sided level, strictly between 0 and 1.
+
+    Raises:
+        ValueError: if the counts or the level are out of range.
+
+    >>> [round(limit, 3) for limit in tango_interval(1, 7, 21)]
+    [-0.517, -0.026]
+    """
+    _check_level(confidence)
+    if n < 1 or won < 0 or lost < 0 or won + lost > n:
+        raise ValueError(
+            f"pairs need won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
+        )
+    z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
+    if won + lost == 0:
+        # The equation below has a spurious root at 0 here; its other roots have this closed form.
+        half_width = z2 / (n + z2)
+        return -half_width, half_width
+
+    def excess(delta: float) -> float:
+        """Squared score statistic minus z², times its variance: negative inside the interval."""
+        variance = 2 * _constrained_loss_rate(won, lost, n, delta) + delta * (1 - delta)
+        return (won - lost - n * delta) ** 2 - z2 * n * variance
+
+    diff = (won - lost) / n
+    low = -1.0 if lost == n else brentq(excess, -1.0, diff, xtol=1e-12)
+    high = 1.0 if won == n else brentq(excess, diff, 1.0, xtol=1e-12)
+    return float(low), float(high)
+
+
+def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:
+    """Maximum-likelihood probability of a lost pair under a true difference ``delta`` (Tango 1998)."""
+    a = 2 * n
+    b = -won - lost + (2 * n - won + lost) * delta
+    c = -lost * delta * (1 - delta)
+    return (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
+
+
+def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
+    """What an interval of a paired difference says about a non-inferiority margin.
+
+    ``"non-inferior"`` if the whole interval lies above ``-margin``, ``"inferior"`` if all of it lies below,
+    else ``"undecided"``: the episodes do not suffice to tell.
+
+    >>> verdict((-0.03, 0.01)), verdict((-0.30, -0.12)), verdict((-0.11, 0.02))
+    ('non-inferior', 'inferior', 'undecided')
+    """
+    if not 0 < margin < 1:
+        raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
+    low, high = ci
+    if low > -margin:
+        return "non-inferior"
+    return "inferior" if high < -margin else "undecided"
+
+
+def paired_difference(
+    method: Sequence[bool],
+    reference: Sequence[bool],
+    margin: float = DEFAULT_MARGIN,
+    confidence: float = 0.95,
+) -> PairedDifference:
+    """Compare two methods on the same seeds; entry *i* of both sequences belongs to the same seed.
+
+    Raises:
+        ValueError: if the lengths differ or are zero.
+
+    >>> result = paired_difference([True, True, False, True], [True, True, True, True])
+    >>> result.diff, result.lost, result.verdict
+    (-0.25, 1, 'undecided')
+    """
+    if len(method) != len(reference) or not len(method):
+        raise ValueError(
+            f"pairs need as many episodes of both, and at least one, got {len(method)} and {len(reference)}"
+        )
+    pairs = [(bool(ours), bool(theirs)) for ours, theirs in zip(method, reference, strict=True)]
+    won, lost, n = pairs.count((True, False)), pairs.count((False, True)), len(pairs)
+    ci = tango_interval(won, lost, n, confidence)
+    return PairedDifference((won - lost) / n, ci, margin, verdict(ci, margin), won, lost, n)
+
+
+def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) -> int:
+    """Fewest pairs that can show non-inferiority at all: those that suffice when no pair is discordant.
+
+    >>> episodes_needed(0.05)
+    73
+    """
+    _check_level(confidence)
+    if not 0 < margin < 1:
+        raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
+    z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
+    return math.floor(z2 * (1 - margin) / margin) + 1
+
+
+def _check_level(confidence: float) -> None:
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must lie strictly between 0 and 1, got {confidence}")
