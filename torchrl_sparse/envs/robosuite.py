@@ -96,6 +96,7 @@ class RobosuiteEnv(EnvBase):
         self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
         self._next_seed = int(torch.randint(2**31, ()))
         self._episode_seed = self._next_seed
+        self._restored_xml: str | None = None
         self._elapsed = 0
         self._renderers: dict[tuple[int, int], CameraRenderer] = {}
         self.sim_env = make_simulator(
@@ -163,7 +164,7 @@ class RobosuiteEnv(EnvBase):
     def _start_from_seed(self, seed: int) -> None:
         # robosuite hands its generator to samplers when it builds them, so it is reseeded in place, never replaced.
         self.sim_env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-        self._episode_seed = seed
+        self._episode_seed, self._restored_xml = seed, None
         self.sim_env.reset()
 
     def _start_from_state(self, state: InitialState) -> None:
@@ -174,13 +175,13 @@ class RobosuiteEnv(EnvBase):
         for robot in sim_env.robots:  # the null-space posture is that of the episode's first configuration
             joints = sim_env.sim.data.qpos[robot._ref_joint_pos_indexes]
             robot.part_controllers["right"].update_initial_joints(joints)
-        sim_env._get_observations(force_update=True)  # relative poses are made from the poses of the last update
-        self._episode_seed = state.seed
+        self._episode_seed, self._restored_xml = state.seed, state.model_xml
 
     def get_initial_state(self) -> InitialState:
         """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
-        sim = self.sim_env.sim
-        return InitialState(sim.model.get_xml(), sim.get_state().flatten(), self._episode_seed)
+        # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
+        model_xml = self._restored_xml or self.sim_env.model.get_xml()
+        return InitialState(model_xml, self.sim_env.sim.get_state().flatten(), self._episode_seed)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._check_action(tensordict.get(keys.ACTION))
@@ -209,6 +210,8 @@ class RobosuiteEnv(EnvBase):
 
     def raw_observation(self) -> Mapping[str, np.ndarray]:
         """The parts of the state by robosuite's names, f64, in the order in which they are concatenated."""
+        # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
+        self.sim_env._update_observables(force=True)
         observed = self.sim_env._get_observations(force_update=True)
         observed["object"] = observed["object-state"]
         parts = {name: np.asarray(observed[name]) for name in self.task.state_keys}

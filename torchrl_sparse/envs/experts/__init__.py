@@ -1,0 +1,37 @@
+"""Scripted experts: one file a task family, and `make_expert` to get the right one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_sparse.envs.experts.base import Expert
+from torchrl_sparse.envs.experts.disturbance import Disturbance
+from torchrl_sparse.envs.experts.lift import LiftExpert
+from torchrl_sparse.envs.experts.operators import OPERATORS, Operator, Style, draw_operator
+
+EXPERTS: Mapping[str, type[Expert]] = {"Lift": LiftExpert}
+"""The expert of each robosuite task that has one."""
+
+
+def make_expert(task: str, sim_env: Any, style: Style) -> Expert:
+    """The expert of a task for one episode; see `Expert`.
+
+    Raises:
+        ValueError: if the task has none; the message lists those that have.
+    """
+    if task not in EXPERTS:
+        raise ValueError(f"task: expected one with an expert ({', '.join(EXPERTS)}), got {task!r}")
+    return EXPERTS[task](sim_env, style)
+
+
+__all__ = [
+    "EXPERTS",
+    "OPERATORS",
+    "Disturbance",
+    "Expert",
+    "Operator",
+    "Style",
+    "draw_operator",
+    "make_expert",
+]

@@ -1,0 +1,114 @@
+"""Receding-horizon execution: query the policy for a chunk, serve its actions one by one, query again."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+
+
+class ChunkExecutor(TensorDictModuleBase):
+    """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
+
+    A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
+    when the gate asks (``("control", "replan")``). Only samples that are due are handed to the policy. Everything the policy
+    writes stays in the TensorDict until that sample's next query, except costs, which are zero on served steps.
+
+    All state is in keys, so it follows the environment through any collector.
+
+    Args:
+        policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
+        n_action_steps: actions of a chunk that are executed before the next query (Ta).
+        gate: a TensorDictModule that may write ``("control", "replan")``; run at every step.
+
+    Raises:
+        ValueError: if a chunk is shorter than ``n_action_steps``.
+
+    Examples:
+        >>> actor = ChunkExecutor(policy, n_action_steps=8)  # doctest: +SKIP
+        >>> rollout = make_env("Lift").rollout(16, actor)  # doctest: +SKIP
+        >>> rollout["control", "queried"].sum()  # doctest: +SKIP
+        tensor(2)
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        n_action_steps: int = 8,
+        gate: TensorDictModuleBase | None = None,
+    ):
+        super().__init__()
+        if n_action_steps < 1:
+            raise ValueError(f"n_action_steps: expected at least 1, got {n_action_steps}")
+        self.policy = policy
+        self.n_action_steps = n_action_steps
+        self.gate = gate
+
+    @property
+    def in_keys(self):
+        return _unique([keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys])
+
+    @property
+    def out_keys(self):
+        own = [keys.ACTION, keys.AGE, keys.QUERIED]
+        return _unique([*own, *(self.gate.out_keys if self.gate is not None else ()), *self.policy.out_keys])
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.gate is not None:
+            tensordict = self.gate(tensordict)
+        due = self._due(tensordict)
+        if due.any():
+            self._query(tensordict, due)
+        self._clear_costs(tensordict, ~due)
+        age = torch.zeros_like(due, dtype=torch.int64)
+        if keys.AGE in tensordict.keys(True):
+            age = torch.where(due, age, tensordict.get(keys.AGE) + 1)
+        tensordict.set(keys.AGE, age)
+        tensordict.set(keys.QUERIED, due)
+        return tensordict.set(keys.ACTION, _take(tensordict.get(keys.CHUNK), age))
+
+    def _due(self, tensordict: TensorDictBase) -> Tensor:
+        """bool [*B, 1]: samples without an action to serve."""
+        is_init = tensordict.get(keys.IS_INIT)
+        age = tensordict.get(keys.AGE, None)
+        if age is None:
+            return torch.ones_like(is_init)
+        due = is_init | (age + 1 >= self.n_action_steps)
+        replan = tensordict.get(keys.REPLAN, None)
+        return due if replan is None else due | replan
+
+    def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
+        """Runs the policy on the due samples alone and writes what it returns into their rows."""
+        rows = tensordict.reshape(-1)
+        index = due.reshape(-1).nonzero().squeeze(-1)
+        answer = self.policy(rows[index].select(*self.policy.in_keys, strict=False))
+        chunk = answer.get(keys.CHUNK)
+        if chunk.shape[-2] < self.n_action_steps:
+            raise ValueError(
+                f"{keys.CHUNK}: expected at least n_action_steps={self.n_action_steps} actions, got {chunk.shape[-2]}"
+            )
+        for key in self.policy.out_keys:
+            value = answer.get(key)
+            whole = tensordict.get(key, None)
+            whole = value.new_zeros(*rows.batch_size, *value.shape[1:]) if whole is None else whole.reshape(-1, *value.shape[1:])
+            whole = whole.index_copy(0, index, value)
+            tensordict.set(key, whole.reshape(*tensordict.batch_size, *value.shape[1:]))
+
+    def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
+        for key in (keys.FLOPS, keys.LATENCY):
+            if key in self.policy.out_keys:
+                tensordict.set(key, tensordict.get(key).masked_fill(served, 0.0))
+
+
+def _take(chunk: Tensor, age: Tensor) -> Tensor:
+    """The action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
+    index = age[..., None].expand(*age.shape, chunk.shape[-1])
+    return chunk.gather(-2, index).squeeze(-2)
+
+
+def _unique(nested_keys: list) -> list:
+    return list(dict.fromkeys(nested_keys))

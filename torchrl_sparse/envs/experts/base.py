@@ -1,0 +1,136 @@
+"""The skeleton of a scripted expert: where the hand is, where it should go next, and one clipped step towards it.
+
+An expert decides from what a policy can observe too (poses, finger opening), not from clocks or remembered phases: its labels
+are then a function of the state, and it recovers by itself when something goes wrong. Only the operator's `Style` is hidden.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchrl_sparse.envs.experts.operators import Style
+
+OPEN, CLOSED = -1.0, 1.0
+DOWNWARD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""The grip site of a Panda that points straight down; its fingers move along its x axis, here the world's y axis."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What an arm's hand does now.
+
+    Attributes:
+        position: f64 [3] of the grip site, m, world frame.
+        rotation: f64 [3, 3] of the grip site.
+        opening: distance between the fingers, m: 0.08 fully open, 0 closed.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    opening: float
+
+    @property
+    def yaw(self) -> float:
+        """Turn about the vertical relative to `DOWNWARD`, rad in (-pi, pi]."""
+        return float(np.arctan2(-self.rotation[0, 0], self.rotation[1, 0]))
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Where a hand should be next: position f64 [3] in m, rotation f64 [3, 3], fingers `OPEN` or `CLOSED`."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+    gripper: float
+
+
+class Expert(ABC):
+    """A scripted expert for one episode of one robosuite environment.
+
+    Args:
+        sim_env: robosuite's environment under absolute world-frame poses, just reset (``RobosuiteEnv(...).sim_env``).
+        style: the operator's draw for this episode.
+
+    Examples:
+        >>> env = RobosuiteEnv("Lift", seeds=[0])
+        >>> _ = env.reset()
+        >>> make_expert("Lift", env.sim_env, style).command().shape
+        (7,)
+    """
+
+    def __init__(self, sim_env: Any, style: Style):
+        self.sim_env = sim_env
+        self.style = style
+
+    @abstractmethod
+    def waypoints(self) -> Sequence[Waypoint]:
+        """One waypoint per arm for the present state."""
+
+    def command(self) -> np.ndarray:
+        """f64 [7 * arms] absolute command: position (m), rotation vector (rad), gripper."""
+        pairs = zip(map(self.hand, range(len(self.sim_env.robots))), self.waypoints(), strict=True)
+        return np.concatenate([self._step_towards(hand, waypoint) for hand, waypoint in pairs])
+
+    def _step_towards(self, hand: Hand, waypoint: Waypoint) -> np.ndarray:
+        step = _clip(waypoint.position - hand.position, self.style.reach)
+        turn = _clip(Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec(), self.style.turn)
+        rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
+        return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
+
+    # -- what an expert sees -------------------------------------------------------------------------------------------
+
+    def hand(self, arm: int = 0) -> Hand:
+        """The hand of one arm."""
+        data = self.sim_env.sim.data
+        robot = self.sim_env.robots[arm]
+        site = robot.eef_site_id["right"]
+        left, right = data.qpos[robot._ref_gripper_joint_pos_indexes["right"]]
+        return Hand(data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3).copy(), float(left - right))
+
+    def body(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position f64 [3] and rotation f64 [3, 3] of a body."""
+        data = self.sim_env.sim.data
+        index = self.sim_env.sim.model.body_name2id(name)
+        return data.body_xpos[index].copy(), data.body_xmat[index].reshape(3, 3).copy()
+
+    # -- skills --------------------------------------------------------------------------------------------------------
+
+    def above(self, hand: Hand, goal: np.ndarray, clearance: float | None = None) -> np.ndarray:
+        """f64 [3] the next point of a funnel that ends in ``goal``: height and sideways bow shrink with the distance left."""
+        clearance = self.style.hover if clearance is None else clearance
+        away = goal[:2] - hand.position[:2]
+        distance = float(np.linalg.norm(away))
+        height = min(clearance, self.style.slope * max(0.0, distance - 0.01))
+        sideways = np.array([-away[1], away[0]]) / max(distance, 1e-6)
+        bow = self.style.bow * np.clip((distance - 0.03) / 0.05, 0.0, 1.0)
+        return goal + np.array([*(bow * sideways), height])
+
+
+def at(hand: Hand, goal: np.ndarray, rotation: np.ndarray, *, position: float, angle: float = 0.1) -> bool:
+    """Is the hand within ``position`` m and ``angle`` rad of a pose?"""
+    turn = Rotation.from_matrix(rotation @ hand.rotation.T).magnitude()
+    return bool(np.linalg.norm(hand.position - goal) < position and turn < angle)
+
+
+def downward(yaw: float) -> np.ndarray:
+    """f64 [3, 3] of a hand that points straight down, turned by ``yaw`` rad about the vertical."""
+    return Rotation.from_euler("z", yaw).as_matrix() @ DOWNWARD
+
+
+def nearest(angle: float, reference: float, period: float) -> float:
+    """The equivalent of ``angle`` modulo ``period`` that is nearest to ``reference``, rad.
+
+    >>> round(nearest(3.0, 0.0, 3.0), 6)
+    0.0
+    """
+    return reference + (angle - reference + period / 2) % period - period / 2
+
+
+def _clip(vector: np.ndarray, length: float) -> np.ndarray:
+    return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-9))

@@ -1,0 +1,88 @@
+"""What the operator's hand does besides what it was meant to: noise, pauses, bumps and slips on executed actions."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchrl_sparse.envs.experts.operators import Operator
+from torchrl_sparse.envs.rotations import POSE_DIM
+
+_MEMORY = 0.8  # autocorrelation of the noise from one step to the next
+_RAD_PER_M = 4.0  # 8 mm of position noise come with 0.03 rad of rotation noise
+_CALM = 0.06  # m of commanded step above which noise is at its full size; careful motions are made with less
+_BUMP_STEPS = 4
+_BUMP_SIZE = (0.03, 0.06)  # m
+_SLIP_STEPS = 4
+_PAUSE_STEPS = (3, 9)
+
+
+class Disturbance:
+    """Turns one episode's clean commands into executed ones.
+
+    Expert labels stay clean while the executed noise widens the states that they are given for, as in DART
+    (arXiv:1703.09327); noise shrinks with the commanded step, so grasps and insertions stay possible.
+
+    Args:
+        operator: its ``noise``, ``bump``, ``slip`` and ``hesitation``.
+        arms: number of arms; each has its own noise.
+        rng: generator of this episode.
+    """
+
+    def __init__(self, operator: Operator, arms: int, rng: np.random.Generator):
+        self._operator = operator
+        self._rng = rng
+        self._noise = np.zeros((arms, 6))
+        self._push = np.zeros(3)
+        self._steps = 0
+        self._closed_steps = 0
+        self._pause_left = 0
+        self._bump_start = rng.integers(3, 40) if rng.random() < operator.bump else None
+        self._slip_start = rng.integers(3, 6) if rng.random() < operator.slip else None
+
+    def __call__(self, clean: np.ndarray, present: np.ndarray) -> np.ndarray:
+        """The command to execute.
+
+        Args:
+            clean: f64 [7 * arms] the expert's command.
+            present: f64 [arms, 3] where the hands are, m.
+
+        Returns:
+            f64 [7 * arms].
+        """
+        arms = clean.reshape(-1, POSE_DIM).copy()
+        self._noise = _MEMORY * self._noise + np.sqrt(1 - _MEMORY**2) * self._rng.standard_normal(self._noise.shape)
+        calm = np.clip(np.linalg.norm(arms[:, :3] - present, axis=-1, keepdims=True) / _CALM, 0.25, 1.0)
+        if self._pausing():
+            arms[:, :3] = present
+        size = self._operator.noise * calm
+        arms[:, :3] += size * self._noise[:, :3] + self._bumped()
+        turned = Rotation.from_rotvec(size * _RAD_PER_M * self._noise[:, 3:]) * Rotation.from_rotvec(arms[:, 3:6])
+        arms[:, 3:6] = turned.as_rotvec()
+        arms[0, 6] = self._slipped(arms[0, 6])
+        self._steps += 1
+        return arms.reshape(-1)
+
+    def _pausing(self) -> bool:
+        if self._pause_left:
+            self._pause_left -= 1
+            return True
+        if self._rng.random() < self._operator.hesitation:
+            self._pause_left = int(self._rng.integers(*_PAUSE_STEPS))
+        return False
+
+    def _bumped(self) -> np.ndarray:
+        if self._steps == self._bump_start:
+            direction = self._rng.standard_normal(3)
+            direction[2] = abs(direction[2])  # up: a push into the table would break more than it teaches
+            self._push = direction / np.linalg.norm(direction) * self._rng.uniform(*_BUMP_SIZE)
+        over = self._bump_start is None or self._steps >= self._bump_start + _BUMP_STEPS
+        return np.zeros(3) if over else self._push
+
+    def _slipped(self, gripper: float) -> float:
+        self._closed_steps = self._closed_steps + 1 if gripper > 0 else 0
+        if self._slip_start is None or self._closed_steps < self._slip_start:
+            return gripper
+        if self._closed_steps == self._slip_start + _SLIP_STEPS - 1:
+            self._slip_start = None
+        return -1.0

@@ -1,0 +1,27 @@
+"""Lift: close the fingers on the cube and raise it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Waypoint, at, downward, nearest
+
+
+class LiftExpert(Expert):
+    """Approaches the cube from above with the finger axis along its nearest side, grasps and lifts."""
+
+    def waypoints(self) -> Sequence[Waypoint]:
+        hand = self.hand()
+        cube, rotation = self.body(self.sim_env.cube.root_body)
+        width = 2 * float(self.sim_env.cube.size[1])
+        side = np.arctan2(rotation[1, 0], rotation[0, 0])
+        aligned = downward(nearest(side, hand.yaw, np.pi / 2))
+        grasp = cube + self.style.offset * aligned[:, 1]
+        between_fingers = np.linalg.norm(hand.position - cube) < 0.025
+        if between_fingers and hand.opening < width + 0.003:
+            return [Waypoint(hand.position + np.array([0.0, 0.0, 0.2]), aligned, CLOSED)]
+        if at(hand, grasp, aligned, position=0.012):
+            return [Waypoint(grasp, aligned, CLOSED)]
+        return [Waypoint(self.above(hand, grasp), aligned, OPEN)]

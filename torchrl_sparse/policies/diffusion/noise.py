@@ -1,0 +1,48 @@
+"""All randomness of a query follows from one integer, so that two methods can be run on the same noise."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
+    """i64, non-negative: one seed for each step of each episode, the same in every process and batch.
+
+    A SplitMix64 round spreads neighbouring inputs over all 64 bits (Steele et al., OOPSLA 2014).
+
+    Args:
+        episode_seed, episode_step: i64 of one shape.
+    """
+    mixed = episode_seed * 1_000_003 + episode_step + _signed(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ _shift(mixed, 30)) * _signed(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ _shift(mixed, 27)) * _signed(0x94D049BB133111EB)
+    return (mixed ^ _shift(mixed, 31)) & (2**63 - 1)
+
+
+def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
+    """f32 [B, num_steps, H, A] standard normal, row i from ``seed[i]`` alone.
+
+    Entry 0 is the initial sample, whatever ``num_steps``: a ten-step and a hundred-step sampler start from the same point.
+
+    Args:
+        seed: i64 [B].
+        num_steps: denoising steps K.
+        chunk_shape: (H, A).
+    """
+    rows = []
+    for value in seed.tolist():
+        generator = torch.Generator().manual_seed(value)
+        initial = torch.randn(1, *chunk_shape, generator=generator)
+        rows.append(torch.cat([initial, torch.randn(num_steps - 1, *chunk_shape, generator=generator)]))
+    return torch.stack(rows).to(seed.device)
+
+
+def _signed(unsigned: int) -> int:
+    """The int64 with the same bits: torch has no unsigned arithmetic."""
+    return unsigned - 2**64 if unsigned >= 2**63 else unsigned
+
+
+def _shift(value: Tensor, bits: int) -> Tensor:
+    """Logical right shift; torch's own is arithmetic."""
+    return (value >> bits) & ((1 << (64 - bits)) - 1)
