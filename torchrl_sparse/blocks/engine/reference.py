@@ -1,0 +1,154 @@
+"""The reference engine: eager, differentiable, and the definition of what a prune mask means.
+
+Every other engine is tested against :func:`denoise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, validate_mask
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["FeatureRecorder", "denoise"]
+
+
+class FeatureRecorder:
+    """Keeps, detached, what every block added to the residual stream in every denoising step.
+
+    The published models need about 25 MB per query (K=100, L=8, H=10, d=256, f32).
+
+    Examples:
+        >>> recorder = FeatureRecorder()
+        >>> for step in range(4):
+        ...     for block in range(3):
+        ...         recorder(step, block, torch.ones(1, 10, 32))
+        >>> recorder.features().shape
+        torch.Size([3, 4, 1, 10, 32])
+    """
+
+    def __init__(self) -> None:
+        self._outputs: dict[int, list[Tensor]] = {}
+
+    def __call__(self, step: int, block: int, output: Tensor) -> None:
+        """Keep the ``output`` [B, H, d] of ``block``; steps come in execution order."""
+        self._outputs.setdefault(block, []).append(output.detach())
+
+    def features(self) -> Tensor:
+        """Everything recorded, [3L, K, B, H, d]."""
+        return torch.stack([torch.stack(outputs) for _, outputs in sorted(self._outputs.items())])
+
+
+def denoise(
+    network: TransformerForDiffusion,
+    scheduler: NoiseSchedule,
+    noise: Tensor,
+    cond: Tensor,
+    mask: Tensor | None = None,
+    *,
+    reuse: Reuse = "block",
+    record: Callable[[int, int, Tensor], None] | None = None,
+) -> Tensor:
+    """Denoise a batch of action chunks, skipping what ``mask`` prunes.
+
+    For every block ``b`` of every step, per row of the batch: ``d = block_b(x)`` where the mask is False, the
+    latest ``d`` of the reuse rule where it is True; ``x = x + d``. Nothing outlives the call.
+
+    Args:
+        network: the denoiser; gradients flow through it, and to ``noise`` and ``cond``.
+        scheduler: the denoising steps, K of them.
+        noise: f32 [B, K, H, A], standard normal; ``noise[:, 0]`` is the initial sample, ``noise[:, k]`` the
+            gaussian of the transition from step k-1 to step k (not read by DDIM).
+        cond: encoded observations f32 [B, To, D].
+        mask: bool [B, K, 3L], True = pruned, row 0 all False; rows of the batch may differ. None prunes
+            nothing.
+        reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`: ``"block"`` (BAC,
+            arXiv:2506.13456, §3) or ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
+            last-writer-wins).
+        record: called with (step, block, output) for every block, output [B, H, d] being what was added.
+
+    Returns:
+        normalised actions [B, H, A].
+
+    Raises:
+        ValueError: naming what was expected and what came, on a wrong shape, a wrong mask or an unknown
+        ``reuse``.
+
+    Examples:
+        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
+        ... ).eval()
+        >>> mask = torch.zeros(3, 10, 3, dtype=torch.bool)
+        >>> mask[:, 1::2] = True
+        >>> noise, cond = torch.randn(3, 10, 4, 7), torch.randn(3, 2, 5)
+        >>> denoise(network, NoiseSchedule("ddim", 10), noise, cond, mask).shape
+        torch.Size([3, 4, 7])
+    """
+    _check_inputs(network, scheduler, noise, cond, mask)
+    check_reuse(reuse)
+    plan = _Plan(mask)
+    latest: list[Tensor | None] = [None] * (network.num_blocks if reuse == "block" else len(BLOCK_TYPES))
+    sample = noise[:, 0]
+    for step, timestep in enumerate(scheduler.timesteps.tolist()):
+        x, memory = network.embed(sample), network.memory(timestep, cond)
+        for block in range(network.num_blocks):
+            slot = block % len(latest)
+            output = _block_output(network, block, x, memory, plan.rows(step, block), latest[slot])
+            latest[slot] = output
+            x = x + output
+            if record is not None:
+                record(step, block, output)
+        noise_k = noise[:, step + 1] if step + 1 < scheduler.num_inference_steps else None
+        sample = scheduler.step(network.head_out(x), step, sample, noise_k)
+    return sample
+
+
+def _block_output(
+    network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor
+) -> Tensor:
+    """What ``block`` adds: computed for ``rows`` (True: all of them, False: none), ``latest`` for the
+    others."""
+    if rows is True:
+        return network.block(block, x, memory)
+    if rows is False:
+        return latest
+    return latest.index_copy(0, rows, network.block(block, x[rows], memory[rows]))
+
+
+class _Plan:
+    """Which rows of the batch compute a block; the mask is read to the host once."""
+
+    def __init__(self, mask: Tensor | None) -> None:
+        self._device = None if mask is None else mask.device
+        self._computed = None if mask is None else ~mask.cpu()
+        self._all = None if mask is None else self._computed.all(dim=0).tolist()
+        self._any = None if mask is None else self._computed.any(dim=0).tolist()
+
+    def rows(self, step: int, block: int) -> Tensor | bool:
+        """True if every row computes, False if none does, else the i64 indices of those that do."""
+        if self._computed is None or self._all[step][block]:
+            return True
+        if not self._any[step][block]:
+            return False
+        return self._computed[:, step, block].nonzero().flatten().to(self._device)
+
+
+def _check_inputs(network, scheduler, noise: Tensor, cond: Tensor, mask: Tensor | None) -> None:
+    num_steps, batch = scheduler.num_inference_steps, len(cond)
+    for name, tensor, expected in (
+        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
+        ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),
+    ):
+        if tuple(tensor.shape) != expected:
+            raise ValueError(f"{name}: expected shape {list(expected)}, got {list(tensor.shape)}")
+    if mask is not None:
+        validate_mask(mask, num_steps, network.n_layer, batch=(batch,))

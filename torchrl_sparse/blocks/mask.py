@@ -1,0 +1,244 @@
+"""Prune masks over (denoising step × block): what they mean, how they are checked, and what they cost.
+
+A mask is bool [*B, K, 3L] with **True = pruned** (the symbol M of SAG, arXiv:2601.12894). Axis K counts the
+calls of the
+network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456, counts
+diffusion timesteps, which run down; ``NoiseSchedule.timesteps[step]`` translates.) Column ``3 * layer + {0:
+SA, 1: CA, 2: FFN}`` names the block. Row 0 never prunes, so there is always something to reuse.
+
+A pruned block adds an earlier output to the residual stream. Which one is the *reuse rule*:
+
+* ``"block"``: its own most recent output (BAC, update-then-reuse).
+* ``"type"``: the most recent output of *any* block of its type, be it of a shallower layer of the same step
+  or of a deeper layer of an earlier one (SAG, "one-for-all" buffers with zig-zag reuse).
+
+Costs follow the published convention: FLOPs = 2 · multiply-accumulates, over all K calls of the denoiser,
+vision excluded, and without counting norms, softmax and activations. For d=256, L=8, H=10, To=2 and K=100
+this is the 15.75 G of the papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = [
+    "BLOCK_TYPES",
+    "NetworkSizes",
+    "Reuse",
+    "block_macs",
+    "block_name",
+    "check_reuse",
+    "fixed_macs",
+    "mask_from_steps",
+    "prune_rate",
+    "query_flops",
+    "reuse_source",
+    "steps_from_mask",
+    "validate_mask",
+]
+
+BLOCK_TYPES = ("SA", "CA", "FFN")
+Reuse = Literal["block", "type"]
+
+
+def block_name(column: int) -> str:
+    """Name of a mask column, as in the BAC paper.
+
+    >>> block_name(17)
+    'layers.5.FFN'
+    """
+    layer, kind = divmod(column, len(BLOCK_TYPES))
+    return f"layers.{layer}.{BLOCK_TYPES[kind]}"
+
+
+def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
+    """Refuse anything that is not a prune mask.
+
+    Args:
+        mask: the candidate.
+        num_steps: denoising steps K.
+        num_layers: layers L.
+        batch: expected leading dimensions; None accepts any.
+
+    Raises:
+        ValueError: naming what was expected and what came, if ``mask`` is no bool tensor [*batch, K, 3L] or
+            if its first row prunes.
+
+    >>> validate_mask(torch.zeros(4, 10, 6, dtype=torch.bool), num_steps=10, num_layers=2)
+    """
+    tail = (num_steps, len(BLOCK_TYPES) * num_layers)
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+        came = f"dtype {mask.dtype}" if isinstance(mask, Tensor) else type(mask).__name__
+        raise ValueError(f"prune mask: expected a tensor of dtype torch.bool, got {came}")
+    lead = "*B, " if batch is None else "".join(f"{size}, " for size in batch)
+    if mask.shape[-2:] != tail or (batch is not None and mask.shape[:-2] != tuple(batch)):
+        raise ValueError(
+            f"prune mask: expected shape [{lead}{tail[0]}, {tail[1]}] (K={num_steps} denoising steps, "
+            f"3L={tail[1]} blocks), got {list(mask.shape)}"
+        )
+    first = mask[..., 0, :].reshape(-1, tail[1]).any(dim=0)
+    if first.any():
+        names = ", ".join(block_name(column) for column in first.nonzero().flatten().tolist())
+        raise ValueError(
+            f"prune mask: expected row 0 (the first denoising step) to prune nothing, got True for {names}"
+        )
+
+
+def check_reuse(reuse: str) -> None:
+    """Raise ValueError unless ``reuse`` names a reuse rule."""
+    if reuse not in ("block", "type"):
+        raise ValueError(f'reuse: expected "block" or "type", got {reuse!r}')
+
+
+def prune_rate(mask: Tensor) -> Tensor:
+    """Prune rate ρ, the mean of the mask over steps and blocks (row 0 included): bool [*B, K, 3L] to f32
+    [*B].
+
+    >>> prune_rate(torch.tensor([[False] * 3, [True, True, True]])).item()
+    0.5
+    """
+    return mask.float().mean(dim=(-2, -1))
+
+
+def mask_from_steps(steps: Sequence[Iterable[int]], num_steps: int) -> Tensor:
+    """Mask bool [K, 3L] from the computed steps of every block, in column order.
+
+    >>> mask_from_steps([[0, 2], [0], [0, 1]], num_steps=3).int().tolist()
+    [[0, 0, 0], [1, 1, 0], [0, 1, 1]]
+    """
+    mask = torch.ones(num_steps, len(steps), dtype=torch.bool)
+    for column, computed in enumerate(steps):
+        mask[list(computed), column] = False
+    return mask
+
+
+def steps_from_mask(mask: Tensor) -> tuple[tuple[int, ...], ...]:
+    """Computed steps of every block of a mask bool [K, 3L]: the inverse of :func:`mask_from_steps`."""
+    return tuple(tuple((~column).nonzero().flatten().tolist()) for column in mask.unbind(dim=1))
+
+
+def reuse_source(mask: Tensor, reuse: Reuse = "block") -> tuple[Tensor, Tensor]:
+    """Where the output that a block adds comes from: itself where it is computed, an earlier evaluation where
+    it is pruned.
+
+    Args:
+        mask: bool [*B, K, 3L], row 0 all False.
+        reuse: the reuse rule.
+
+    Returns:
+        (step, column): two i64 [*B, K, 3L]; block ``c`` of step ``t`` adds the output that block ``column[t,
+        c]`` computed in step ``step[t, c]``.
+
+    >>> step, column = reuse_source(mask_from_steps([[0, 2], [0], [0, 1]], num_steps=3))
+    >>> step.tolist()
+    [[0, 0, 0], [0, 0, 1], [2, 0, 1]]
+    """
+    check_reuse(reuse)
+    *batch, num_steps, num_blocks = mask.shape
+    # With evaluations numbered in order of execution, the newest computed one is a running maximum.
+    order = torch.arange(num_steps * num_blocks, device=mask.device).view(num_steps, num_blocks)
+    written = order.expand(mask.shape).masked_fill(mask, -1)
+    if reuse == "type":
+        written = written.reshape(*batch, -1, len(BLOCK_TYPES))
+    newest = written.cummax(dim=-2).values.reshape(mask.shape)
+    return newest // num_blocks, newest % num_blocks
+
+
+@dataclass(frozen=True)
+class NetworkSizes:
+    """The sizes of a denoiser that decide its cost.
+
+    Attributes:
+        num_layers: decoder layers L.
+        horizon: actions in a chunk H.
+        n_obs_steps: observations To; the memory holds 1 + To tokens.
+        width: embedding size d.
+        input_dim: size of a noisy action.
+        output_dim: size of a predicted noise vector.
+        cond_dim: size of one encoded observation.
+        num_cond_layers: layers of the condition encoder; 0 is the token-wise MLP of the published models.
+    """
+
+    num_layers: int
+    horizon: int
+    n_obs_steps: int
+    width: int
+    input_dim: int
+    output_dim: int
+    cond_dim: int
+    num_cond_layers: int = 0
+
+    @classmethod
+    def of(cls, network: TransformerForDiffusion) -> NetworkSizes:
+        """The sizes of ``network``."""
+        return cls(
+            num_layers=network.n_layer,
+            horizon=network.horizon,
+            n_obs_steps=network.n_obs_steps,
+            width=network.n_emb,
+            input_dim=network.input_dim,
+            output_dim=network.output_dim,
+            cond_dim=network.cond_dim,
+            num_cond_layers=network.n_cond_layers,
+        )
+
+
+def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
+    """Multiply-accumulates of one SA, one CA and one FFN block in one call, batch 1.
+
+    >>> lift = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
+    >>> [round(macs / sum(block_macs(lift)), 3) for macs in block_macs(lift)]
+    [0.277, 0.178, 0.544]
+    """
+    d, tokens, memory = sizes.width, sizes.horizon, 1 + sizes.n_obs_steps
+    self_attention = 4 * d * d * tokens + 2 * tokens * tokens * d
+    cross_attention = 2 * d * d * tokens + 2 * d * d * memory + 2 * tokens * memory * d
+    feed_forward = 8 * d * d * tokens
+    return self_attention, cross_attention, feed_forward
+
+
+def fixed_macs(sizes: NetworkSizes) -> int:
+    """Multiply-accumulates of one call outside the blocks (stems, condition encoder, head); they are never
+    pruned."""
+    d, memory = sizes.width, 1 + sizes.n_obs_steps
+    encoder = 8 * d * d * memory
+    if sizes.num_cond_layers:
+        encoder = sizes.num_cond_layers * (12 * d * d * memory + 2 * memory * memory * d)
+    stems_and_head = (
+        sizes.cond_dim * d * sizes.n_obs_steps + (sizes.input_dim + sizes.output_dim) * d * sizes.horizon
+    )
+    return encoder + stems_and_head
+
+
+def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -> Tensor:
+    """FLOPs (2 · MAC) of one query under ``mask``, over all K calls of the denoiser.
+
+    Args:
+        network: the denoiser or its sizes.
+        mask: bool [*B, K, 3L]; K is read from it.
+
+    Returns:
+        f32 [*B].
+
+    Raises:
+        ValueError: if ``mask`` is no prune mask for a network of this depth.
+
+    >>> lift = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
+    >>> round(query_flops(lift, torch.zeros(100, 24, dtype=torch.bool)).item() / 1e9, 2)
+    15.74
+    """
+    sizes = network if isinstance(network, NetworkSizes) else NetworkSizes.of(network)
+    num_steps = mask.shape[-2] if isinstance(mask, Tensor) and mask.ndim >= 2 else 1
+    validate_mask(mask, num_steps, sizes.num_layers)
+    cost = torch.tensor(block_macs(sizes), device=mask.device).repeat(sizes.num_layers)
+    # Whole numbers throughout: a query exceeds what float32 counts exactly.
+    macs = torch.where(mask, 0, cost).flatten(-2).sum(dim=-1) + num_steps * fixed_macs(sizes)
+    return (2 * macs).float()

@@ -1,0 +1,165 @@
+"""Planners: TensorDict modules that write the prune mask of a query, and nothing else.
+
+A new method subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
+does not) and writes one method.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, validate_mask
+from torchrl_sparse.keys import COND, PRUNE_MASK
+
+__all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
+
+
+@dataclass(frozen=True)
+class PlanSpec:
+    """What a planner plans for.
+
+    Attributes:
+        num_inference_steps: denoising steps K of a query.
+        num_layers: layers L of the network.
+        policy: fingerprint of the policy's weights; a plan that was made for one policy is refused by
+            another.
+    """
+
+    num_inference_steps: int
+    num_layers: int
+    policy: str
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks 3L, the width of a mask."""
+        return len(BLOCK_TYPES) * self.num_layers
+
+
+class Planner(TensorDictModuleBase):
+    """Base of everything that decides which blocks a query skips.
+
+    Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
+    A subclass writes :meth:`masks`; one that cannot serve every policy also overrides :meth:`bind` and raises
+    ValueError there. ``policy.plan = planner`` binds it.
+
+    Attributes:
+        reuse: what a pruned block reuses, ``"block"`` or ``"type"`` (see :mod:`torchrl_sparse.blocks.mask`).
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> class OnlyWhenFar(Planner):
+        ...     "Skips every second step of the observations that are far from zero."
+        ...     def masks(self, cond):
+        ...         odd = torch.arange(self.spec.num_inference_steps) % 2 == 1
+        ...         far = cond.abs().amax(dim=(1, 2)) > 1
+        ...         return (far[:, None] & odd)[..., None].expand(-1, -1, self.spec.num_blocks)
+        >>> planner = OnlyWhenFar()
+        >>> planner.bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="a policy"))
+        >>> td = planner(TensorDict({COND: torch.tensor([[[0.0]], [[2.0]]])}, [2]))
+        >>> td[PRUNE_MASK][..., 0].int().tolist()
+        [[0, 0, 0, 0], [0, 1, 0, 1]]
+    """
+
+    in_keys = [COND]
+    out_keys = [PRUNE_MASK]
+    reuse: Reuse = "block"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._spec: PlanSpec | None = None
+
+    @property
+    def spec(self) -> PlanSpec:
+        """What the planner is bound to.
+
+        Raises:
+            RuntimeError: before :meth:`bind`.
+        """
+        if self._spec is None:
+            raise RuntimeError(
+                f"{type(self).__name__} is not bound: assign it to `policy.plan`, or call bind(PlanSpec(...))"
+            )
+        return self._spec
+
+    def bind(self, spec: PlanSpec) -> None:
+        """Prepare to serve ``spec``; called when the planner is given to a policy and when the policy's
+        scheduler changes.
+
+        Raises:
+            ValueError: if the planner cannot serve it; the planner then stays as it was.
+        """
+        self._spec = spec
+
+    def masks(self, cond: Tensor) -> Tensor:
+        """Masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
+        raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the mask of every observation.
+
+        Raises:
+            RuntimeError: if the planner is not bound.
+            ValueError: if :meth:`masks` returns anything but masks for the bound spec.
+        """
+        spec = self.spec
+        cond = tensordict.get(COND)
+        batch = cond.shape[:-2]
+        rows = math.prod(batch)
+        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]))
+        try:
+            validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
+        except ValueError as error:
+            raise ValueError(f"{type(self).__name__}.masks: {error}") from error
+        tensordict.set(PRUNE_MASK, masks.reshape(*batch, spec.num_inference_steps, spec.num_blocks))
+        return tensordict
+
+
+class StaticPlanner(Planner):
+    """Base of the planners whose mask does not depend on the observation; a subclass writes :meth:`mask`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Not persistent: the mask belongs to the method, not to the policy's checkpoint.
+        self.register_buffer("_mask", None, persistent=False)
+
+    def mask(self, spec: PlanSpec) -> Tensor:
+        """The mask bool [K, 3L] of every query for ``spec``, row 0 all False.
+
+        Raises:
+            ValueError: if the planner cannot serve ``spec``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define mask(spec)")
+
+    def bind(self, spec: PlanSpec) -> None:
+        """Make and check the mask once."""
+        mask = self.mask(spec)
+        try:
+            validate_mask(mask, spec.num_inference_steps, spec.num_layers, batch=())
+        except ValueError as error:
+            raise ValueError(f"{type(self).__name__}.mask: {error}") from error
+        self._mask = mask
+        super().bind(spec)
+
+    def masks(self, cond: Tensor) -> Tensor:
+        """The mask, once per row of ``cond``."""
+        # A copy per row: an expanded view in the TensorDict would break whoever writes to one row in place.
+        return self._mask.to(cond.device).repeat(len(cond), 1, 1)
+
+
+class Dense(StaticPlanner):
+    """Prunes nothing: the unmodified policy, through the same code path as every method.
+
+    Examples:
+        >>> Dense().mask(PlanSpec(num_inference_steps=100, num_layers=8, policy="any")).any().item()
+        False
+    """
+
+    def mask(self, spec: PlanSpec) -> Tensor:
+        """All False, [K, 3L]."""
+        return torch.zeros(spec.num_inference_steps, spec.num_blocks, dtype=torch.bool)

@@ -1,0 +1,255 @@
+"""Static schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
+read.
+
+::
+
+    {
+      "format": "torchrl_sparse.schedule/1",
+      "method": "bac",
+      "policy": "<fingerprint of the policy that it was made for>",
+      "num_inference_steps": 100,
+      "num_layers": 8,
+      "settings": {"num_updates": 10, "top_k": 5},
+      "computed_steps": {
+        "layers.0.SA": [0, 7, 31, 99],
+        ...
+      }
+    }
+
+``computed_steps`` lists, for every block in column order, the denoising steps (in execution order) that
+compute it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from torchrl_sparse.blocks.mask import (
+    BLOCK_TYPES,
+    block_name,
+    mask_from_steps,
+    steps_from_mask,
+    validate_mask,
+)
+from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
+
+__all__ = ["Schedule", "StaticSchedule"]
+
+FORMAT = "torchrl_sparse.schedule/1"
+_FIELDS = ("format", "method", "policy", "num_inference_steps", "num_layers", "settings", "computed_steps")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Which blocks are computed at which denoising steps, and for which policy that was decided.
+
+    Attributes:
+        method: name of the method that made it, e.g. ``"bac"``.
+        policy: fingerprint of the policy that it was made for.
+        num_inference_steps: denoising steps K.
+        num_layers: layers L.
+        computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
+            with 0.
+        settings: how it was made; numbers, strings, lists and the like, for people and reports.
+
+    Raises:
+        ValueError: if a field does not hold what is described here.
+
+    Examples:
+        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> schedule.mask().int().tolist()
+        [[0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 1, 0]]
+    """
+
+    method: str
+    policy: str
+    num_inference_steps: int
+    num_layers: int
+    computed_steps: tuple[tuple[int, ...], ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("method", "policy"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value:
+                raise ValueError(f"{name}: expected a non-empty string, got {value!r}")
+        for name in ("num_inference_steps", "num_layers"):
+            value = getattr(self, name)
+            if not _is_int(value) or value < 1:
+                raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
+        if not isinstance(self.settings, dict):
+            raise ValueError(f"settings: expected an object, got {type(self.settings).__name__}")
+        expected = len(BLOCK_TYPES) * self.num_layers
+        if len(self.computed_steps) != expected:
+            raise ValueError(
+                f"computed_steps: expected {expected} blocks (3 * num_layers), got {len(self.computed_steps)}"
+            )
+        for column, steps in enumerate(self.computed_steps):
+            _check_steps(block_name(column), steps, self.num_inference_steps)
+        object.__setattr__(self, "computed_steps", tuple(tuple(steps) for steps in self.computed_steps))
+
+    @classmethod
+    def from_mask(
+        cls, mask: Tensor, *, method: str, policy: str, settings: dict[str, Any] | None = None
+    ) -> Schedule:
+        """The schedule of a mask bool [K, 3L].
+
+        Raises:
+            ValueError: if ``mask`` is no prune mask.
+        """
+        num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
+        num_layers = max(1, num_blocks // len(BLOCK_TYPES))
+        validate_mask(mask, num_steps, num_layers, batch=())
+        return cls(method, policy, num_steps, num_layers, steps_from_mask(mask), settings or {})
+
+    def mask(self) -> Tensor:
+        """The prune mask bool [K, 3L]."""
+        return mask_from_steps(self.computed_steps, self.num_inference_steps)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the file under a temporary name and move it into place, so that no reader ever sees half of
+        it.
+
+        Raises:
+            TypeError: if ``settings`` holds something that JSON cannot.
+        """
+        path = Path(path)
+        text = self._to_json()
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner can read.
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Schedule:
+        """Read and check a file; nothing in it is executed.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: naming the file and the field, what was expected and what came, if it is no valid
+            schedule.
+        """
+        try:
+            data = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (
+            ValueError
+        ) as error:  # Undecodable bytes or no JSON, which is what a truncated file looks like.
+            raise ValueError(f"schedule {path}: expected a complete JSON file, got: {error}") from error
+        try:
+            return cls(**_checked_fields(data))
+        except ValueError as error:
+            raise ValueError(f"schedule {path}: {error}") from error
+
+    def _to_json(self) -> str:
+        """JSON with one line per block, which the standard library's indentation cannot do."""
+        head = {
+            "format": FORMAT,
+            "method": self.method,
+            "policy": self.policy,
+            "num_inference_steps": self.num_inference_steps,
+            "num_layers": self.num_layers,
+            "settings": self.settings,
+        }
+        lines = [f"  {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
+        blocks = [
+            f"    {json.dumps(block_name(column))}: {json.dumps(steps)}"
+            for column, steps in enumerate(self.computed_steps)
+        ]
+        return "\n".join(["{", *lines, '  "computed_steps": {', ",\n".join(blocks), "  }", "}", ""])
+
+
+class StaticSchedule(StaticPlanner):
+    """Writes the mask of a schedule for every observation, and refuses every policy but the one that it was
+    made for.
+
+    Args:
+        schedule: the schedule, or the path of its file.
+
+    Raises:
+        ValueError, FileNotFoundError: if the file cannot be used, see :meth:`Schedule.load`.
+
+    Examples:
+        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> StaticSchedule(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
+        Traceback (most recent call last):
+        ...
+        ValueError: schedule 'by hand': made for policy fingerprint 'a policy', got 'another'
+    """
+
+    def __init__(self, schedule: Schedule | str | os.PathLike) -> None:
+        super().__init__()
+        self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.load(schedule)
+
+    def mask(self, spec: PlanSpec) -> Tensor:
+        """The schedule's mask [K, 3L].
+
+        Raises:
+            ValueError: if the schedule was made for another number of steps or layers, or for another policy.
+        """
+        for name, label in (
+            ("num_inference_steps", "num_inference_steps"),
+            ("num_layers", "num_layers"),
+            ("policy", "policy fingerprint"),
+        ):
+            made_for, asked = getattr(self.schedule, name), getattr(spec, name)
+            if made_for != asked:
+                raise ValueError(
+                    f"schedule {self.schedule.method!r}: made for {label} {made_for!r}, got {asked!r}"
+                )
+        return self.schedule.mask()
+
+
+def _checked_fields(data: Any) -> dict[str, Any]:
+    """Arguments of :class:`Schedule` from decoded JSON; the values themselves are checked by the class."""
+    if not isinstance(data, dict):
+        raise ValueError(f"expected a JSON object, got {type(data).__name__}")
+    if data.get("format") != FORMAT:
+        raise ValueError(f"format: expected {FORMAT!r}, got {data.get('format')!r}")
+    _check_names("fields", data, _FIELDS)
+    num_layers, blocks = data["num_layers"], data["computed_steps"]
+    if not isinstance(blocks, dict):
+        raise ValueError(f"computed_steps: expected an object, got {type(blocks).__name__}")
+    if _is_int(num_layers) and 3 * num_layers == len(blocks):
+        _check_names("computed_steps", blocks, [block_name(column) for column in range(len(blocks))])
+    fields = {name: data[name] for name in _FIELDS[1:-1]}
+    return fields | {"computed_steps": _in_column_order(blocks)}
+
+
+def _check_names(what: str, found: dict[str, Any], expected: Any) -> None:
+    missing, unknown = sorted(set(expected) - set(found)), sorted(set(found) - set(expected))
+    if missing or unknown:
+        raise ValueError(f"{what}: expected {', '.join(expected)}; missing {missing}, unknown {unknown}")
+
+
+def _in_column_order(blocks: dict[str, Any]) -> tuple[Any, ...]:
+    """The lists of steps in column order, whatever the order in the file."""
+    columns = {block_name(column): column for column in range(len(blocks))}
+    return tuple(blocks[name] for name in sorted(blocks, key=lambda name: columns.get(name, len(blocks))))
+
+
+def _check_steps(name: str, steps: Any, num_steps: int) -> None:
+    valid = isinstance(steps, (list, tuple)) and all(
+        _is_int(step) and 0 <= step < num_steps for step in steps
+    )
+    if not valid or not steps or steps[0] != 0 or any(a >= b for a, b in pairwise(steps)):
+        raise ValueError(
+            f"computed_steps of {name}: expected increasing whole numbers in 0..{num_steps - 1} "
+            f"that start with 0, got {steps!r}"
+        )
+
+
+def _is_int(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
