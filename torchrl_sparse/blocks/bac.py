@@ -11,8 +11,7 @@ Where print and release differ:
 * The printed recursion of ACS telescopes (every schedule scores the same) and is not offered.
   ``objective="anchor"`` is what the release computes; ``"consecutive"`` is the printed objective, whose
   optimum computes the steps that resemble their predecessor least.
-* The release always computes the last step, but by its absolute index 99; here ``force_last`` works for any
-  K.
+* The release always computes the last step, but by its index 99; here ``force_last`` works for any K.
 * The release skips BUA if fewer than two blocks are selected or anything fails; here it runs, or raises.
 """
 
@@ -104,8 +103,7 @@ def _anchored(similarity: Tensor, num_updates: int) -> tuple[int, ...]:
 
 
 def upstream_blocks(errors: Tensor | Sequence[float], top_k: int) -> tuple[int, ...]:
-    """Columns of the ``top_k`` blocks of highest error score (the set U of BUA), ascending; the shallower of
-    equals wins.
+    """The set U of BUA: columns of the ``top_k`` highest error scores, ascending; of equals the shallower.
 
     >>> upstream_blocks([0.1, 0.3, 0.2], top_k=2)
     (1, 2)
@@ -124,11 +122,10 @@ def bubbling_union(
     top_k: int = 5,
     transitive: bool = False,
 ) -> tuple[tuple[int, ...], ...]:
-    """Let the blocks of highest error compute whenever a downstream FFN does: ``C(u) ← C(u) ∪ ⋃_{v∈D(u)}
-    C(v)`` (BUA).
+    """BUA: let the blocks of highest error compute whenever a downstream FFN does.
 
-    U is the ``top_k`` blocks of highest error, FFNs included; D(u) the FFNs of u's own layer and deeper.
-    Afterwards C(u) ⊇ C(v) for every u in U and v in D(u).
+    ``C(u) ← C(u) ∪ ⋃_{v∈D(u)} C(v)`` for every u in U, the ``top_k`` blocks of highest error (FFNs included);
+    D(u) are the FFNs of u's own layer and deeper. Afterwards C(u) ⊇ C(v) for every v in D(u).
 
     Args:
         schedules: computed steps of the 3L blocks in column order.
@@ -169,8 +166,10 @@ def bac_blockwise_schedule(
     objective: Objective = "anchor",
     force_last: bool = True,
 ) -> Schedule:
-    """Ablation ``bac_blockwise`` (Table 2, "block-wise ACS"): ACS for every block, without BUA. Arguments:
-    :func:`bac_schedule`."""
+    """Ablation ``bac_blockwise`` (Table 2, "block-wise ACS"): ACS for every block, without BUA.
+
+    Arguments: :func:`bac_schedule`.
+    """
     steps = [
         _with_last(acs(block, num_updates, objective), block, force_last) for block in calibration.similarity
     ]
@@ -186,8 +185,7 @@ def bac_unified_schedule(
     objective: Objective = "anchor",
     force_last: bool = True,
 ) -> Schedule:
-    """Ablation ``bac_unified`` (Table 2, "unified ACS"): one schedule for all blocks, from their mean
-    similarity.
+    """Ablation ``bac_unified`` (Table 2, "unified ACS"): all blocks share the ACS of their mean similarity.
 
     Arguments: :func:`bac_schedule`.
     """

@@ -22,8 +22,7 @@ __all__ = ["Calibration", "block_error", "calibrate", "feature_similarity"]
 
 
 def feature_similarity(features: Tensor) -> Tensor:
-    """Cosine similarity of a block's outputs between every two denoising steps (Fig. 1), averaged over
-    samples.
+    """Cosine similarity of a block's outputs between denoising steps (Fig. 1), averaged over samples.
 
     Args:
         features: outputs of one block [K, B, ...]; each sample is flattened to one vector.

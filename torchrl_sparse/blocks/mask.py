@@ -1,10 +1,9 @@
 """Prune masks over (denoising step × block): what they mean, how they are checked, and what they cost.
 
 A mask is bool [*B, K, 3L] with **True = pruned** (the symbol M of SAG, arXiv:2601.12894). Axis K counts the
-calls of the
-network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456, counts
-diffusion timesteps, which run down; ``NoiseSchedule.timesteps[step]`` translates.) Column ``3 * layer + {0:
-SA, 1: CA, 2: FFN}`` names the block. Row 0 never prunes, so there is always something to reuse.
+calls of the network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456,
+counts diffusion timesteps, which run down; ``NoiseSchedule.timesteps[step]`` translates.) The column names
+the block: ``3 * layer + {0: SA, 1: CA, 2: FFN}``. Row 0 never prunes, so there is always something to reuse.
 
 A pruned block adds an earlier output to the residual stream. Which one is the *reuse rule*:
 
@@ -99,8 +98,7 @@ def check_reuse(reuse: str) -> None:
 
 
 def prune_rate(mask: Tensor) -> Tensor:
-    """Prune rate ρ, the mean of the mask over steps and blocks (row 0 included): bool [*B, K, 3L] to f32
-    [*B].
+    """Prune rate ρ f32 [*B], the mean of a mask bool [*B, K, 3L] over all steps (row 0 too) and blocks.
 
     >>> prune_rate(torch.tensor([[False] * 3, [True, True, True]])).item()
     0.5
@@ -126,16 +124,15 @@ def steps_from_mask(mask: Tensor) -> tuple[tuple[int, ...], ...]:
 
 
 def reuse_source(mask: Tensor, reuse: Reuse = "block") -> tuple[Tensor, Tensor]:
-    """Where the output that a block adds comes from: itself where it is computed, an earlier evaluation where
-    it is pruned.
+    """Which evaluation produced the output that a block adds: its own, or an earlier one if it is pruned.
 
     Args:
         mask: bool [*B, K, 3L], row 0 all False.
         reuse: the reuse rule.
 
     Returns:
-        (step, column): two i64 [*B, K, 3L]; block ``c`` of step ``t`` adds the output that block ``column[t,
-        c]`` computed in step ``step[t, c]``.
+        (step, column): two i64 [*B, K, 3L]; block c of step t adds what block ``column[t, c]`` computed in
+        step ``step[t, c]``.
 
     >>> step, column = reuse_source(mask_from_steps([[0, 2], [0], [0, 1]], num_steps=3))
     >>> step.tolist()
@@ -206,8 +203,7 @@ def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
 
 
 def fixed_macs(sizes: NetworkSizes) -> int:
-    """Multiply-accumulates of one call outside the blocks (stems, condition encoder, head); they are never
-    pruned."""
+    """Multiply-accumulates of one call outside the blocks: stems, condition encoder, head; never pruned."""
     d, memory = sizes.width, 1 + sizes.n_obs_steps
     encoder = 8 * d * d * memory
     if sizes.num_cond_layers:
@@ -239,6 +235,6 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
     num_steps = mask.shape[-2] if isinstance(mask, Tensor) and mask.ndim >= 2 else 1
     validate_mask(mask, num_steps, sizes.num_layers)
     cost = torch.tensor(block_macs(sizes), device=mask.device).repeat(sizes.num_layers)
-    # Whole numbers throughout: a query exceeds what float32 counts exactly.
+    # Summed as whole numbers: a query exceeds what float32 counts exactly.
     macs = torch.where(mask, 0, cost).flatten(-2).sum(dim=-1) + num_steps * fixed_macs(sizes)
     return (2 * macs).float()

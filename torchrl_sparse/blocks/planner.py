@@ -27,8 +27,7 @@ class PlanSpec:
     Attributes:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
-        policy: fingerprint of the policy's weights; a plan that was made for one policy is refused by
-            another.
+        policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
     """
 
     num_inference_steps: int
@@ -88,8 +87,7 @@ class Planner(TensorDictModuleBase):
         return self._spec
 
     def bind(self, spec: PlanSpec) -> None:
-        """Prepare to serve ``spec``; called when the planner is given to a policy and when the policy's
-        scheduler changes.
+        """Prepare to serve ``spec``; a policy calls it when it is given the planner or another scheduler.
 
         Raises:
             ValueError: if the planner cannot serve it; the planner then stays as it was.

@@ -25,6 +25,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -115,8 +116,7 @@ class Schedule:
         return mask_from_steps(self.computed_steps, self.num_inference_steps)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the file under a temporary name and move it into place, so that no reader ever sees half of
-        it.
+        """Write the file under a temporary name and move it into place: no reader ever sees half of it.
 
         Raises:
             TypeError: if ``settings`` holds something that JSON cannot.
@@ -139,14 +139,11 @@ class Schedule:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: naming the file and the field, what was expected and what came, if it is no valid
-            schedule.
+            ValueError: naming file and field, what was expected and what came, if it is no valid schedule.
         """
         try:
             data = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (
-            ValueError
-        ) as error:  # Undecodable bytes or no JSON, which is what a truncated file looks like.
+        except ValueError as error:  # no JSON or no text, as in a truncated file
             raise ValueError(f"schedule {path}: expected a complete JSON file, got: {error}") from error
         try:
             return cls(**_checked_fields(data))
@@ -172,8 +169,7 @@ class Schedule:
 
 
 class StaticSchedule(StaticPlanner):
-    """Writes the mask of a schedule for every observation, and refuses every policy but the one that it was
-    made for.
+    """Writes the mask of a schedule for every observation; serves only the policy that it was made for.
 
     Args:
         schedule: the schedule, or the path of its file.
@@ -222,22 +218,17 @@ def _checked_fields(data: Any) -> dict[str, Any]:
     num_layers, blocks = data["num_layers"], data["computed_steps"]
     if not isinstance(blocks, dict):
         raise ValueError(f"computed_steps: expected an object, got {type(blocks).__name__}")
-    if _is_int(num_layers) and 3 * num_layers == len(blocks):
-        _check_names("computed_steps", blocks, [block_name(column) for column in range(len(blocks))])
+    names = [block_name(column) for column in range(len(blocks))]
+    if _is_int(num_layers) and len(BLOCK_TYPES) * num_layers == len(blocks):
+        _check_names("computed_steps", blocks, names)
     fields = {name: data[name] for name in _FIELDS[1:-1]}
-    return fields | {"computed_steps": _in_column_order(blocks)}
+    return fields | {"computed_steps": tuple(blocks.get(name) for name in names)}
 
 
-def _check_names(what: str, found: dict[str, Any], expected: Any) -> None:
+def _check_names(what: str, found: dict[str, Any], expected: Sequence[str]) -> None:
     missing, unknown = sorted(set(expected) - set(found)), sorted(set(found) - set(expected))
     if missing or unknown:
         raise ValueError(f"{what}: expected {', '.join(expected)}; missing {missing}, unknown {unknown}")
-
-
-def _in_column_order(blocks: dict[str, Any]) -> tuple[Any, ...]:
-    """The lists of steps in column order, whatever the order in the file."""
-    columns = {block_name(column): column for column in range(len(blocks))}
-    return tuple(blocks[name] for name in sorted(blocks, key=lambda name: columns.get(name, len(blocks))))
 
 
 def _check_steps(name: str, steps: Any, num_steps: int) -> None:

@@ -70,7 +70,7 @@ def denoise(
         mask: bool [B, K, 3L], True = pruned, row 0 all False; rows of the batch may differ. None prunes
             nothing.
         reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`: ``"block"`` (BAC,
-            arXiv:2506.13456, §3) or ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
+            arXiv:2506.13456) or ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
             last-writer-wins).
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
 
@@ -113,10 +113,9 @@ def denoise(
 
 
 def _block_output(
-    network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor
+    network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor | None
 ) -> Tensor:
-    """What ``block`` adds: computed for ``rows`` (True: all of them, False: none), ``latest`` for the
-    others."""
+    """What ``block`` adds: computed for ``rows`` (True: all, False: none), ``latest`` for the others."""
     if rows is True:
         return network.block(block, x, memory)
     if rows is False:

@@ -1,0 +1,161 @@
+import pytest
+import torch
+
+from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
+from torchrl_sparse.blocks.mask import mask_from_steps, reuse_source
+
+from ..conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
+
+NUM_BLOCKS = 3 * NUM_LAYERS
+
+
+def dense_loop(network, scheduler, noise, cond):
+    sample = noise[:, 0]
+    for k, timestep in enumerate(scheduler.timesteps.tolist()):
+        noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
+        sample = scheduler.step(network(sample, timestep, cond), k, sample, noise_k)
+    return sample
+
+
+class TracingNetwork:
+    """Stands in for the network: block b of step k outputs the number 100 k + b, which shows every reuse."""
+
+    n_layer, num_blocks = NUM_LAYERS, NUM_BLOCKS
+    horizon, input_dim, n_obs_steps, cond_dim = HORIZON, ACTION_DIM, OBS_STEPS, COND_DIM
+
+    def __init__(self):
+        self.step = -1
+
+    def embed(self, sample):
+        self.step += 1
+        return sample
+
+    def memory(self, timestep, cond):
+        return cond
+
+    def block(self, index, x, memory):
+        return torch.full_like(x, 100 * self.step + index)
+
+    def head_out(self, x):
+        return torch.zeros_like(x)
+
+
+def trace(scheduler, masks, reuse):
+    """What each block added, [B, K, 3L]."""
+    recorder = FeatureRecorder()
+    noise = torch.zeros(len(masks), NUM_STEPS, HORIZON, ACTION_DIM)
+    cond = torch.zeros(len(masks), OBS_STEPS, COND_DIM)
+    denoise(TracingNetwork(), scheduler, noise, cond, masks, reuse=reuse, record=recorder)
+    return recorder.features()[..., 0, 0].permute(2, 1, 0)
+
+
+@pytest.mark.parametrize("reuse", ["block", "type"])
+def test_no_mask_and_an_all_false_mask_are_bit_exactly_dense(network, scheduler, query, reuse):
+    expected = dense_loop(network, scheduler, *query)
+    mask = torch.zeros(5, NUM_STEPS, NUM_BLOCKS, dtype=torch.bool)
+    assert torch.equal(denoise(network, scheduler, *query), expected)
+    assert torch.equal(denoise(network, scheduler, *query, mask, reuse=reuse), expected)
+
+
+def test_pruning_changes_the_result(network, scheduler, query):
+    difference = denoise(network, scheduler, *query, random_mask(5)) - denoise(network, scheduler, *query)
+    assert (difference.abs().amax(dim=(1, 2)) > 1e-3).all()
+
+
+@pytest.mark.parametrize("reuse", ["block", "type"])
+def test_a_row_with_its_own_mask_equals_the_row_alone(network, scheduler, query, reuse):
+    masks = random_mask(5, rate=0.6)
+    masks[1] = False
+    masks[2, 1:] = True
+    noise, cond = query
+    together = denoise(network, scheduler, noise, cond, masks, reuse=reuse)
+    for row in range(5):
+        part = slice(row, row + 1)
+        alone = denoise(network, scheduler, noise[part], cond[part], masks[part], reuse=reuse)
+        torch.testing.assert_close(together[part], alone, rtol=0, atol=1e-6)
+
+
+def test_type_reuse_follows_a_hand_computed_zigzag(ddpm):
+    everywhere = list(range(NUM_STEPS))
+    # SA: layer 0 computes in steps 0 and 2, layer 1 in steps 0 and 1.
+    steps = [[0, 2], everywhere, everywhere, [0, 1], everywhere, everywhere]
+    by_type = trace(ddpm, mask_from_steps(steps, NUM_STEPS)[None], "type")[0]
+    assert by_type[:4, 0].tolist() == [0, 3, 200, 200]
+    assert by_type[:4, 3].tolist() == [3, 103, 200, 200]
+    by_block = trace(ddpm, mask_from_steps(steps, NUM_STEPS)[None], "block")[0]
+    assert by_block[:4, 0].tolist() == [0, 0, 200, 200]
+    assert by_block[:4, 3].tolist() == [3, 103, 103, 103]
+
+
+@pytest.mark.parametrize("reuse", ["block", "type"])
+def test_every_block_adds_what_reuse_source_says(ddpm, reuse):
+    masks = random_mask(4, rate=0.7)
+    step, column = reuse_source(masks, reuse)
+    assert torch.equal(trace(ddpm, masks, reuse), (100 * step + column).float())
+
+
+def test_type_reuse_equals_the_equation_of_sag(network, ddpm, query):
+    """x <- x + (1-M) d + M tau; tau <- (1-M) d + M tau, with one tau for each type."""
+    noise, cond = query
+    masks = random_mask(5)
+    sample = noise[:, 0]
+    tau = [torch.zeros(())] * 3
+    for k, timestep in enumerate(ddpm.timesteps.tolist()):
+        x, memory = network.embed(sample), network.memory(timestep, cond)
+        for b in range(NUM_BLOCKS):
+            pruned = masks[:, k, b, None, None].float()
+            tau[b % 3] = (1 - pruned) * network.block(b, x, memory) + pruned * tau[b % 3]
+            x = x + tau[b % 3]
+        sample = ddpm.step(network.head_out(x), k, sample, noise[:, k + 1] if k + 1 < NUM_STEPS else None)
+    result = denoise(network, ddpm, noise, cond, masks, reuse="type")
+    torch.testing.assert_close(result, sample, rtol=0, atol=1e-5)
+
+
+def test_only_computed_blocks_of_computing_rows_are_run(network, ddpm, query, monkeypatch):
+    masks, rows_run = random_mask(5), []
+    block = network.block
+    monkeypatch.setattr(network, "block", lambda b, x, m: rows_run.append(len(x)) or block(b, x, m))
+    denoise(network, ddpm, *query, masks)
+    assert sum(rows_run) == (~masks).sum().item()
+
+
+def test_gradients_flow_through_computed_and_reused_outputs(network, ddpm, query):
+    noise, cond = query
+    cond = cond.requires_grad_()
+    network.requires_grad_(True)
+    masks = random_mask(5)
+    masks[0, 1:] = True
+    denoise(network, ddpm, noise, cond, masks).square().sum().backward()
+    assert (cond.grad.abs().amax(dim=(1, 2)) > 0).all()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_a_dense_query_records_what_every_block_adds(network, ddpm, query):
+    noise, cond = query
+    recorder = FeatureRecorder()
+    denoise(network, ddpm, noise, cond, record=recorder)
+    features = recorder.features()
+    assert features.shape == (NUM_BLOCKS, NUM_STEPS, 5, HORIZON, 32)
+    x = network.embed(noise[:, 0]) + features[:, 0].sum(dim=0)
+    eps = network(noise[:, 0], int(ddpm.timesteps[0]), cond)
+    torch.testing.assert_close(network.head_out(x), eps)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": torch.zeros(5, 9, 6, 4)}, r"noise: expected shape \[5, 10, 6, 4\], got \[5, 9, 6, 4\]"),
+        ({"noise": torch.zeros(5, 10, 6, 3)}, r"noise: expected shape \[5, 10, 6, 4\], got \[5, 10, 6, 3\]"),
+        ({"cond": torch.zeros(5, 2, 7)}, r"cond: expected shape \[5, 2, 5\], got \[5, 2, 7\]"),
+        ({"mask": random_mask(4)}, r"mask: expected shape \[5, 10, 6\].*got \[4, 10, 6\]"),
+        ({"mask": random_mask()}, r"mask: expected shape \[5, 10, 6\].*got \[10, 6\]"),
+        ({"mask": random_mask(5).float()}, r"expected a tensor of dtype torch.bool, got dtype torch.float32"),
+        ({"mask": torch.ones(5, 10, 6, dtype=torch.bool)}, r"row 0 .* to prune nothing, got True"),
+        ({"reuse": "single"}, r'reuse: expected "block" or "type", got \'single\''),
+    ],
+)
+def test_wrong_input_is_refused(network, ddpm, query, change, message):
+    arguments = {"noise": query[0], "cond": query[1], **change}
+    with pytest.raises(ValueError, match=message):
+        denoise(network, ddpm, **arguments)

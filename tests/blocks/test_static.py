@@ -1,0 +1,143 @@
+import json
+import re
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_sparse.blocks.planner import PlanSpec
+from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.keys import COND, PRUNE_MASK
+
+from .conftest import NUM_LAYERS, NUM_STEPS, random_mask
+
+
+@pytest.fixture
+def schedule():
+    return Schedule.from_mask(
+        random_mask(),
+        method="bac",
+        policy="8d1f",
+        settings={"num_updates": 3, "upstream_blocks": ["layers.1.SA"]},
+    )
+
+
+@pytest.fixture
+def path(schedule, tmp_path):
+    schedule.save(tmp_path / "schedule.json")
+    return tmp_path / "schedule.json"
+
+
+def test_a_file_brings_back_the_same_schedule(schedule, path):
+    loaded = Schedule.load(path)
+    assert loaded == schedule
+    assert torch.equal(loaded.mask(), random_mask())
+
+
+def test_a_file_is_small_plain_json_with_one_line_per_block(path):
+    text = path.read_text()
+    assert json.loads(text)["computed_steps"].keys() == {
+        f"layers.{i}.{b}" for i in (0, 1) for b in ("SA", "CA", "FFN")
+    }
+    assert len(text.splitlines()) == 6 + 6 + 4
+    assert re.search(r'^    "layers\.1\.CA": \[0, [\d, ]+\],$', text, re.MULTILINE)
+
+
+def test_blocks_may_be_listed_in_any_order(schedule, path):
+    data = json.loads(path.read_text())
+    data["computed_steps"] = dict(reversed(data["computed_steps"].items()))
+    path.write_text(json.dumps(data))
+    assert Schedule.load(path) == schedule
+
+
+def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
+    Schedule.from_mask(torch.zeros(4, 3, dtype=torch.bool), method="dense", policy="x").save(path)
+    assert Schedule.load(path).num_inference_steps == 4
+    unwritable = Schedule.from_mask(schedule.mask(), method="bac", policy="8d1f", settings={"bad": object()})
+    with pytest.raises(TypeError):
+        unwritable.save(path)
+    assert Schedule.load(path).num_inference_steps == 4
+    assert [file.name for file in path.parent.iterdir()] == ["schedule.json"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "expected a complete JSON file"),
+        (lambda text: "", "expected a complete JSON file"),
+        (lambda text: "[1, 2]", "expected a JSON object, got list"),
+        (lambda text: text.replace("schedule/1", "schedule/9"), "format: expected .*schedule/1.*schedule/9"),
+        (lambda text: "{}", "format: expected .*, got None"),
+        (lambda text: text.replace('"method": "bac",', ""), r"missing \['method'\]"),
+        (
+            lambda text: text.replace('"settings"', '"seting"'),
+            r"missing \['settings'\], unknown \['seting'\]",
+        ),
+        (
+            lambda text: text.replace('"policy": "8d1f"', '"policy": 7'),
+            "policy: expected a non-empty string, got 7",
+        ),
+        (lambda text: text.replace('_steps": 10', '_steps": 10.0'), "num_inference_steps: .*got 10.0"),
+        (lambda text: text.replace('_layers": 2', '_layers": "2"'), "num_layers: .*got '2'"),
+        (
+            lambda text: text.replace('_layers": 2', '_layers": 3'),
+            "computed_steps: expected 9 blocks .*got 6",
+        ),
+        (lambda text: text.replace("layers.1.CA", "layers.1.XX"), r"missing \['layers.1.CA'\]"),
+        (lambda text: text.replace('.CA": [0, ', '.CA": [', 1), r"layers\.0\.CA: .*that start with 0, got"),
+        (
+            lambda text: text.replace('.FFN": [0, ', '.FFN": [0, 0, ', 1),
+            r"layers\.0\.FFN: expected increasing",
+        ),
+        (lambda text: text.replace('.SA": [0, ', '.SA": [0, 10, ', 1), r"layers\.0\.SA: .*in 0\.\.9"),
+        (
+            lambda text: text.replace('.SA": [0, ', '.SA": [0, "1", ', 1),
+            r"layers\.0\.SA: expected .*whole numbers",
+        ),
+        (lambda text: re.sub(r'SA": \[.*\]', 'SA": null', text, count=1), r"layers\.0\.SA: .*got None"),
+        (lambda text: re.sub(r'SA": \[.*\]', 'SA": []', text, count=1), r"layers\.0\.SA: .*got \[\]"),
+    ],
+)
+def test_a_damaged_file_is_refused_naming_file_and_field(path, damage, message):
+    before = path.read_text()
+    path.write_text(damage(before))
+    assert path.read_text() != before
+    with pytest.raises(ValueError, match=f"(?s)schedule {re.escape(str(path))}: .*{message}"):
+        Schedule.load(path)
+
+
+def test_binary_rubbish_and_a_missing_file_are_refused(tmp_path):
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(ValueError, match="expected a complete JSON file"):
+        Schedule.load(tmp_path / "binary")
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
+        StaticSchedule(tmp_path / "nowhere.json")
+
+
+@pytest.mark.parametrize(
+    "mask", [torch.zeros(4, 5, dtype=torch.bool), torch.ones(4, 6, dtype=torch.bool), torch.zeros(4, 6)]
+)
+def test_only_prune_masks_become_schedules(mask):
+    with pytest.raises(ValueError, match="prune mask: expected"):
+        Schedule.from_mask(mask, method="by hand", policy="x")
+
+
+@pytest.mark.parametrize("from_file", [True, False])
+def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, from_file):
+    planner = StaticSchedule(path if from_file else schedule)
+    planner.bind(PlanSpec(NUM_STEPS, NUM_LAYERS, "8d1f"))
+    masks = planner(TensorDict({COND: torch.randn(3, 2, 5)}, [3]))[PRUNE_MASK]
+    assert torch.equal(masks, random_mask().expand(3, -1, -1))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (PlanSpec(NUM_STEPS, NUM_LAYERS, "77aa"), "policy fingerprint '8d1f', got '77aa'"),
+        (PlanSpec(100, NUM_LAYERS, "8d1f"), "num_inference_steps 10, got 100"),
+        (PlanSpec(NUM_STEPS, 8, "8d1f"), "num_layers 2, got 8"),
+    ],
+)
+def test_a_schedule_made_for_another_policy_is_refused_naming_both(schedule, spec, message):
+    with pytest.raises(ValueError, match=f"schedule 'bac': made for {message}"):
+        StaticSchedule(schedule).bind(spec)

@@ -1,0 +1,31 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_sparse.blocks.planner import PlanSpec
+from torchrl_sparse.blocks.uniform import Uniform, uniform_mask
+from torchrl_sparse.keys import COND, PRUNE_MASK
+
+
+def test_multiples_of_the_interval_compute_every_block_and_nothing_else_does():
+    mask = uniform_mask(10, 6, interval=4)
+    assert (~mask).all(dim=1).nonzero().flatten().tolist() == [0, 4, 8]
+    assert mask.all(dim=1).sum() == 7
+
+
+@pytest.mark.parametrize(("interval", "computed"), [(1, 10), (3, 4), (10, 1), (99, 1)])
+def test_number_of_computed_steps(interval, computed):
+    assert (~uniform_mask(10, 3, interval)).all(dim=1).sum() == computed
+
+
+def test_the_planner_writes_the_mask_for_every_observation():
+    planner = Uniform(interval=3)
+    planner.bind(PlanSpec(num_inference_steps=7, num_layers=2, policy="any"))
+    masks = planner(TensorDict({COND: torch.randn(4, 2, 5)}, [4]))[PRUNE_MASK]
+    assert torch.equal(masks, uniform_mask(7, 6, 3).expand(4, 7, 6))
+
+
+@pytest.mark.parametrize("interval", [0, -1, 2.5, "3"])
+def test_a_wrong_interval_is_refused(interval):
+    with pytest.raises(ValueError, match=r"interval: expected a whole number >= 1, got"):
+        Uniform(interval)
