@@ -16,6 +16,7 @@ class Task:
 
     Attributes:
         name: robosuite's name.
+        alias: robomimic's short name; folders and command lines use it.
         arms: number of Panda arms.
         object_dim: size of robosuite's ``object-state``.
         horizon: steps after which an episode is truncated, as in Diffusion Policy's evaluation (20 Hz).
@@ -23,6 +24,7 @@ class Task:
     """
 
     name: str
+    alias: str
     arms: int
     object_dim: int
     horizon: int
@@ -50,21 +52,22 @@ _PROPRIOCEPTION = {"eef_pos": 3, "eef_quat_site": 4, "gripper_qpos": 2}
 TASKS = {
     task.name: task
     for task in (
-        Task("Lift", 1, 10, 400, "lift the red cube"),
-        Task("PickPlaceCan", 1, 14, 400, "put the can into its bin"),
-        Task("NutAssemblySquare", 1, 14, 400, "put the square nut on the square peg"),
-        Task("TwoArmTransport", 2, 41, 700, "hand the hammer over and put it into the target bin"),
-        Task("ToolHang", 1, 44, 700, "assemble the frame and hang the tool on it"),
+        Task("Lift", "lift", 1, 10, 400, "lift the red cube"),
+        Task("PickPlaceCan", "can", 1, 14, 400, "put the can into its bin"),
+        Task("NutAssemblySquare", "square", 1, 14, 400, "put the square nut on the square peg"),
+        Task("TwoArmTransport", "transport", 2, 41, 700, "hand the hammer over and put it into the target bin"),
+        Task("ToolHang", "tool_hang", 1, 44, 700, "assemble the frame and hang the tool on it"),
     )
 }
 
 
 def get_task(name: str) -> Task:
-    """The task of that robosuite name.
+    """The task of that robosuite name or alias.
 
     Raises:
         ValueError: if there is none; the message lists those there are.
     """
-    if name not in TASKS:
-        raise ValueError(f"task: expected one of {', '.join(TASKS)}, got {name!r}")
-    return TASKS[name]
+    for task in TASKS.values():
+        if name in (task.name, task.alias):
+            return task
+    raise ValueError(f"task: expected one of {', '.join(TASKS)} or their aliases, got {name!r}")

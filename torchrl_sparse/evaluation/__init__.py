@@ -1,0 +1,53 @@
+"""Paired evaluation: shared seeds, intervals and verdicts, latency, ``results.json``, figures, videos."""
+
+from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult, totals
+from torchrl_sparse.evaluation.fidelity import action_error, block_errors
+from torchrl_sparse.evaluation.latency import Latency, describe_machine, measure_latency, summarize_latency
+from torchrl_sparse.evaluation.paired import rollout_episodes
+from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
+from torchrl_sparse.evaluation.report import (
+    MethodRun,
+    build_results,
+    format_table,
+    load_results,
+    save_results,
+)
+from torchrl_sparse.evaluation.schema import validate_results
+from torchrl_sparse.evaluation.stats import (
+    episodes_needed,
+    paired_difference,
+    tango_interval,
+    verdict,
+    wilson_interval,
+)
+from torchrl_sparse.evaluation.video import Caption, write_video
+
+__all__ = [
+    "Caption",
+    "EpisodeLog",
+    "EpisodeResult",
+    "Latency",
+    "MethodRun",
+    "action_error",
+    "block_errors",
+    "build_results",
+    "describe_machine",
+    "episodes_needed",
+    "format_table",
+    "load_results",
+    "measure_latency",
+    "paired_difference",
+    "plot_error_surge",
+    "plot_pareto",
+    "plot_schedule",
+    "plot_similarity",
+    "rollout_episodes",
+    "save_results",
+    "summarize_latency",
+    "tango_interval",
+    "totals",
+    "validate_results",
+    "verdict",
+    "wilson_interval",
+    "write_video",
+]

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_sparse import keys
@@ -38,8 +38,8 @@ def rollout_episodes(
 ) -> list[EpisodeResult]:
     """Run one episode per seed in a TorchRL ``Collector`` over a ``SerialEnv``.
 
-    Worker ``w`` of the environments gets ``seeds[w::num_envs]``. A worker that has done its seeds keeps stepping
-    until the last one is finished (its surplus episodes are dropped).
+    Worker ``w`` of the environments gets ``seeds[w::num_envs]``. A worker that has done its seeds keeps
+    stepping until the last one is finished (its surplus episodes are dropped).
 
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
@@ -102,12 +102,13 @@ class _Rollout:
             make_env,
             create_env_kwargs=[{"seeds": seeds[worker::num_envs]} for worker in range(num_envs)],
         )
+        if max_steps is not None:
+            env = TransformedEnv(env, StepCounter(max_steps))
         self._collector = Collector(
             env,
             actor,
             frames_per_batch=num_envs,
             total_frames=-1,
-            max_frames_per_traj=max_steps,
             policy_device=policy_device,
             storing_device=torch.device("cpu"),
             # The policy's noise is a key, not a distribution; RANDOM keeps any other actor as it was trained.

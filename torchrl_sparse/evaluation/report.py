@@ -1,88 +1,25 @@
-"""``results.json``: the only source of every table and figure.
-
-Schema version 1 (all numbers finite; no other keys)::
-
-    {"schema": 1, "task": str, "seed": int,
-     "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
-     "policy": {"params": int, "num_inference_steps": int, "horizon": int, "n_obs_steps": int,
-                "n_action_steps": int},
-     "methods": {NAME: {
-        "success": {"k": int, "n": int, "rate": float, "ci95": [lo, hi]},
-        "paired_vs_dense": {"diff": float, "ci95": [lo, hi], "margin": float, "verdict": str},
-        "prune_rate": float,
-        "flops": {"per_query": float, "ratio_to_dense": float},
-        "latency_s": {"p50": float, "p95": float, "n": int},
-        "speedup_vs_dense": float,
-        "action_error_vs_dense": {"mean": float, "max": float},
-        "episode_length": float}}}
-
-``success.ci95`` is Wilson's interval; ``paired_vs_dense`` compares success on the same seeds, with Tango's
-interval and a verdict ``"non-inferior"``, ``"inferior"`` or ``"undecided"`` against ``margin``;
-``prune_rate`` is the mean of the masks; ``flops`` are 2 * MAC of one query, denoiser only; ``latency_s`` is
-in seconds per query and ``speedup_vs_dense`` the ratio of the medians; ``action_error_vs_dense`` is the
-absolute difference of an action entry, on the same observations and the same noise; ``episode_length`` is a
-mean in environment steps.
-
-``methods`` always holds ``"dense"``. Its own ``paired_vs_dense`` is ``diff 0, ci95 [0, 0], "non-
-inferior"``: a policy equals itself by definition, nothing is estimated.
-"""
+"""From what was measured to ``results.json`` (its schema is in `schema.py`), and from there to the table."""
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.files import atomic_path
+from torchrl_sparse.files import atomic_path
 from torchrl_sparse.evaluation.latency import Latency
+from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, validate_results
 from torchrl_sparse.evaluation.stats import (
     DEFAULT_MARGIN,
     PairedDifference,
-    Verdict,
+    episodes_needed,
     paired_difference,
     wilson_interval,
 )
 
-__all__ = [
-    "REFERENCE",
-    "SCHEMA",
-    "MethodRun",
-    "build_results",
-    "load_results",
-    "save_results",
-    "validate_results",
-]
-
-SCHEMA = 1
-REFERENCE = "dense"
-
-_METHOD = {
-    "success": {"k": int, "n": int, "rate": float, "ci95": "interval"},
-    "paired_vs_dense": {"diff": float, "ci95": "interval", "margin": float, "verdict": str},
-    "prune_rate": float,
-    "flops": {"per_query": float, "ratio_to_dense": float},
-    "latency_s": {"p50": float, "p95": float, "n": int},
-    "speedup_vs_dense": float,
-    "action_error_vs_dense": {"mean": float, "max": float},
-    "episode_length": float,
-}
-_RESULTS = {
-    "schema": int,
-    "task": str,
-    "seed": int,
-    "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
-    "policy": {
-        "params": int,
-        "num_inference_steps": int,
-        "horizon": int,
-        "n_obs_steps": int,
-        "n_action_steps": int,
-    },
-    "methods": dict,
-}
+__all__ = ["MethodRun", "build_results", "format_table", "load_results", "save_results"]
 
 
 @dataclass(frozen=True)
@@ -207,90 +144,93 @@ def load_results(path: str | os.PathLike) -> dict[str, Any]:
     return results
 
 
-def validate_results(results: Any) -> None:
-    """Check that ``results`` is of schema version 1 and agrees with itself.
+def format_table(results: Mapping[str, Any]) -> str:
+    """The table of a benchmark, as markdown that also lines up in a terminal, and the lines that explain it.
+
+    Args:
+        results: content of a ``results.json``.
 
     Raises:
-        ValueError: naming the path inside ``results``, what was expected there and what came.
-
-    >>> validate_results({"schema": 2})
-    Traceback (most recent call last):
-    ...
-    ValueError: schema: expected 1, got 2
+        ValueError: if ``results`` is not of the schema.
     """
-    if isinstance(results, Mapping) and results.get("schema", SCHEMA) != SCHEMA:
-        raise _fault("schema", SCHEMA, results["schema"])
-    _check(results, _RESULTS, "")
-    if REFERENCE not in results["methods"]:
-        raise _fault("methods", f"the key {REFERENCE!r}", sorted(results["methods"]))
-    n = None
-    for name, method in results["methods"].items():
-        path = f"methods.{name}"
-        _check(method, _METHOD, path)
-        _check_method_values(method, path)
-        n = method["success"]["n"] if n is None else n
-        _require(
-            method["success"]["n"] == n, f"{path}.success.n", f"{n}, as every method", method["success"]["n"]
-        )
+    validate_results(results)
+    methods = results["methods"]
+    rows = [_table_row(name, method) for name, method in methods.items()]
+    columns = list(rows[0])
+    widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in columns}
+
+    def line(row: Mapping[str, str]) -> str:
+        cells = [
+            row[column].ljust(widths[column]) if column in _LEFT else row[column].rjust(widths[column])
+            for column in columns
+        ]
+        return f"| {' | '.join(cells)} |"
+
+    rule = "|".join(
+        ":" + "-" * (widths[c] + 1) if c in _LEFT else "-" * (widths[c] + 1) + ":" for c in columns
+    )
+    header = line({column: column for column in columns})
+    return "\n".join([header, f"|{rule}|", *map(line, rows), "", _table_notes(results)])
 
 
-def _check_method_values(method: Mapping[str, Any], path: str) -> None:
+_LEFT = ("method", "verdict")
+
+
+def _table_row(name: str, method: Mapping[str, Any]) -> dict[str, str]:
     success, paired, latency = method["success"], method["paired_vs_dense"], method["latency_s"]
-    k, n, rate = success["k"], success["n"], success["rate"]
-    _require(n >= 1, f"{path}.success.n", "at least 1", n)
-    _require(0 <= k <= n, f"{path}.success.k", f"0 to {n}", k)
-    _require(math.isclose(rate, k / n, abs_tol=1e-9), f"{path}.success.rate", f"k / n = {k / n}", rate)
-    _require(
-        all(0 <= limit <= 1 for limit in success["ci95"]),
-        f"{path}.success.ci95",
-        "within [0, 1]",
-        success["ci95"],
-    )
-    _require(-1 <= paired["diff"] <= 1, f"{path}.paired_vs_dense.diff", "-1 to 1", paired["diff"])
-    _require(0 < paired["margin"] < 1, f"{path}.paired_vs_dense.margin", "between 0 and 1", paired["margin"])
-    verdicts = get_args(Verdict)
-    _require(
-        paired["verdict"] in verdicts,
-        f"{path}.paired_vs_dense.verdict",
-        f"one of {verdicts}",
-        paired["verdict"],
-    )
-    _require(0 <= method["prune_rate"] <= 1, f"{path}.prune_rate", "0 to 1", method["prune_rate"])
-    _require(0 < latency["p50"] <= latency["p95"], f"{path}.latency_s", "0 < p50 <= p95", latency)
-    _require(latency["n"] >= 1, f"{path}.latency_s.n", "at least 1", latency["n"])
-    for key in ("flops", "action_error_vs_dense"):
-        _require(min(method[key].values()) >= 0, f"{path}.{key}", "values >= 0", method[key])
+    error, reference = method["action_error_vs_dense"], name == REFERENCE
+    return {
+        "method": name,
+        "success": f"{success['k']}/{success['n']} {_percent_range(success['ci95'])}",
+        "vs dense, points": "" if reference else f"{_points(paired['diff'])} {_point_range(paired['ci95'])}",
+        "verdict": "reference" if reference else paired["verdict"],
+        "pruned": f"{100 * method['prune_rate']:.1f} %",
+        "GFLOPs/query": f"{method['flops']['per_query'] / 1e9:.2f}",
+        "FLOPs ratio": f"{method['flops']['ratio_to_dense']:.3f}",
+        "p50, ms": _milliseconds(latency["p50"]),
+        "p95, ms": _milliseconds(latency["p95"]),
+        "speed-up": f"{method['speedup_vs_dense']:.2f}×",
+        "action error (max)": "" if reference else f"{error['mean']:.2g} ({error['max']:.2g})",
+        "steps": f"{method['episode_length']:.1f}",
+    }
 
 
-def _check(value: Any, spec: Any, path: str) -> None:
-    """Check a value against a nested specification of types."""
-    if isinstance(spec, Mapping):
-        _require(isinstance(value, Mapping), path or "results", "an object", value)
-        for key in spec:
-            _require(key in value, f"{path}.{key}".lstrip("."), "this key", "nothing")
-        unknown = sorted(str(key) for key in value if key not in spec)
-        _require(not unknown, path or "results", f"only the keys {sorted(spec)}", f"also {unknown}")
-        for key, inner in spec.items():
-            _check(value[key], inner, f"{path}.{key}".lstrip("."))
-    elif spec == "interval":
-        pair = isinstance(value, Sequence) and len(value) == 2 and all(_is_number(limit) for limit in value)
-        _require(pair and value[0] <= value[1], path, "[low, high] with low <= high", value)
-    elif spec is float:
-        _require(_is_number(value), path, "a finite number", value)
-    elif spec is int:
-        _require(isinstance(value, int) and not isinstance(value, bool), path, "an integer", value)
-    else:
-        _require(isinstance(value, spec), path, {str: "a string", dict: "an object"}[spec], value)
+def _table_notes(results: Mapping[str, Any]) -> str:
+    machine, policy = results["machine"], results["policy"]
+    reference = results["methods"][REFERENCE]
+    n, margin = reference["success"]["n"], reference["paired_vs_dense"]["margin"]
+    threads = f"{machine['threads']} thread{'s' if machine['threads'] != 1 else ''}"
+    lines = [
+        f"{results['task']}, {n} paired episodes a method (seed {results['seed']}): the same initial states "
+        "and the same noise for every method. Success with Wilson's 95 % interval, difference to dense with "
+        "Tango's.",
+        f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
+        f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell).",
+        f"Dense: {policy['params']:,} parameters, {policy['num_inference_steps']} denoising steps. FLOPs are "
+        "2·MAC of a query, denoiser only. Latency of a query, all methods interleaved in one process, on "
+        f"{machine['cpu']}, {machine['device']}, {threads}, torch {machine['torch']}, "
+        f"{machine['date'][:10]}.",
+    ]
+    if n < episodes_needed(margin):
+        lines.append(
+            f"{n} episodes cannot show non-inferiority at this margin even without one differing episode: "
+            f"{episodes_needed(margin)} are needed."
+        )
+    return "\n".join(lines)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+def _percent_range(interval: Sequence[float]) -> str:
+    return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}] %"
 
 
-def _require(condition: bool, path: str, expected: Any, got: Any) -> None:
-    if not condition:
-        raise _fault(path, expected, got)
+def _points(difference: float) -> str:
+    return f"{100 * difference:+.1f}"
 
 
-def _fault(path: str, expected: Any, got: Any) -> ValueError:
-    return ValueError(f"{path}: expected {expected}, got {got!r}")
+def _point_range(interval: Sequence[float]) -> str:
+    return f"[{_points(interval[0])}, {_points(interval[1])}]"
+
+
+def _milliseconds(seconds: float) -> str:
+    value = 1e3 * seconds
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

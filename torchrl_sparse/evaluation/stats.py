@@ -97,10 +97,14 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
             f"pairs need won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
         )
     z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
+    # Where the estimated variance is zero, the equation below also holds at the estimate itself, which is
+    # no limit of the interval; its other roots have closed forms there.
     if won + lost == 0:
-        # The equation below has a spurious root at 0 here; its other roots have this closed form.
-        half_width = z2 / (n + z2)
-        return -half_width, half_width
+        return -z2 / (n + z2), z2 / (n + z2)
+    if won == n:
+        return (n - z2) / (n + z2), 1.0
+    if lost == n:
+        return -1.0, (z2 - n) / (n + z2)
 
     def excess(delta: float) -> float:
         """Squared score statistic minus z², times its variance: negative inside the interval."""
@@ -108,9 +112,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
         return (won - lost - n * delta) ** 2 - z2 * n * variance
 
     diff = (won - lost) / n
-    low = -1.0 if lost == n else brentq(excess, -1.0, diff, xtol=1e-12)
-    high = 1.0 if won == n else brentq(excess, diff, 1.0, xtol=1e-12)
-    return float(low), float(high)
+    return float(brentq(excess, -1.0, diff, xtol=1e-12)), float(brentq(excess, diff, 1.0, xtol=1e-12))
 
 
 def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:

@@ -15,7 +15,7 @@ class LiftExpert(Expert):
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
         cube, rotation = self.body(self.sim_env.cube.root_body)
-        width = 2 * float(self.sim_env.cube.size[1])
+        width = 2 * float(max(self.sim_env.cube.size[:2]))  # either side may be the one that is held
         side = np.arctan2(rotation[1, 0], rotation[0, 0])
         aligned = downward(nearest(side, hand.yaw, np.pi / 2))
         grasp = cube + self.style.offset * aligned[:, 1]

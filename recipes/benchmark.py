@@ -1,0 +1,206 @@
+"""Benchmarks a policy: dense against accelerated, paired, with a table, plots and videos.
+
+    python recipes/benchmark.py task=lift methods=[dense,ddim10,bac] episodes=50 seed=0 out=outputs/lift
+
+Kill it and run it again to go on: finished episodes are read from OUT/episodes. Nothing else is kept between runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.evaluation.episodes import EpisodeResult
+from torchrl_sparse.evaluation.fidelity import action_error, block_errors
+from torchrl_sparse.evaluation.latency import Latency, describe_machine, measure_latency
+from torchrl_sparse.evaluation.methods import (
+    answer,
+    calibrate_policy,
+    check_method,
+    make_method,
+    record_queries,
+)
+from torchrl_sparse.evaluation.paired import rollout_episodes
+from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
+from torchrl_sparse.evaluation.report import MethodRun, build_results, format_table, save_results
+from torchrl_sparse.evaluation.video import Caption, write_video
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+EVALUATION_SEED = 100_000  # Diffusion Policy's test_start_seed: apart from the seeds of demonstrations
+CALIBRATION_SEED = 1_000_000
+SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
+
+
+@hydra.main(version_base=None, config_path=".", config_name="benchmark")
+def main(config: DictConfig) -> None:
+    out, task = Path(config.out), get_task(config.task)
+    for name in config.methods:
+        check_method(name)
+    policy = DiffusionPolicy.from_pretrained(config.policy)
+    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps)
+
+    @cache
+    def calibration():
+        seeds = range(CALIBRATION_SEED, CALIBRATION_SEED + config.calibration_samples)
+        return calibrate_policy(policy, environment, seeds)
+
+    names = dict.fromkeys(["dense", *config.methods])  # dense is what all others are compared with
+    methods = {
+        name: make_method(
+            name,
+            policy,
+            num_updates=config.num_updates,
+            schedules=Path(config.schedules),
+            calibration=calibration,
+        )
+        for name in names
+    }
+    first = EVALUATION_SEED + config.seed
+    seeds = range(first, first + config.episodes)
+
+    episodes = {name: evaluate(name, method, environment, seeds, config) for name, method in methods.items()}
+    queries = record_queries(executor(policy, config), environment, seeds[: config.probe_episodes])
+    latency = time_queries(methods, queries[0], config)
+    errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
+
+    results = build_results(
+        {name: MethodRun(episodes[name], latency[name], errors[name]) for name in methods},
+        task=task.name,
+        seed=config.seed,
+        machine=describe_machine(threads=config.threads),
+        policy=describe(policy, config),
+        margin=config.margin,
+    )
+    save_results(results, out / "results.json")
+    draw(results, methods, calibration(), queries, out)
+    film(methods, environment, seeds[0], config)
+    print(f"\n{format_table(results)}\n\n{config.episodes} paired episodes per method; files are in {out}")
+
+
+def executor(policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
+    return ChunkExecutor(policy, n_action_steps=config.n_action_steps)
+
+
+def evaluate(
+    name: str, policy: DiffusionPolicy, environment: Callable[..., EnvBase], seeds: range, config: DictConfig
+) -> list[EpisodeResult]:
+    """Closed-loop episodes of one method, read from its log as far as they are there."""
+    identity = {
+        "method": name,
+        "policy": policy.fingerprint,
+        "num_updates": config.num_updates,
+        "n_action_steps": config.n_action_steps,
+    }
+    with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
+
+        def show(_: EpisodeResult, done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        return rollout_episodes(
+            executor(policy, config),
+            environment,
+            seeds,
+            num_envs=config.num_envs,
+            results_file=Path(config.out) / "episodes" / f"{name}.jsonl",
+            identity=identity,
+            on_episode=show,
+        )
+
+
+def time_queries(
+    methods: dict[str, DiffusionPolicy], query: TensorDictBase, config: DictConfig
+) -> dict[str, Latency]:
+    """Latency of one observation, all methods interleaved."""
+    calls = {name: partial(answer, method, query) for name, method in methods.items()}
+    with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
+        return measure_latency(
+            calls,
+            repeats=config.latency_repeats,
+            threads=config.threads,
+            on_round=lambda done, total: bar.update(done - bar.n),
+        )
+
+
+def error_to_dense(method: DiffusionPolicy, queries: TensorDictBase) -> tuple[float, float]:
+    """Mean and maximum error of normalised actions to the dense answers."""
+    normalize = method.normalizer.normalize_action
+    return action_error(normalize(answer(method, queries)[keys.CHUNK]), normalize(queries[keys.CHUNK]))
+
+
+def describe(policy: DiffusionPolicy, config: DictConfig) -> dict[str, int]:
+    return {
+        "params": sum(parameter.numel() for parameter in policy.network.parameters()),
+        "num_inference_steps": policy.num_inference_steps,
+        "horizon": policy.horizon,
+        "n_obs_steps": policy.n_obs_steps,
+        "n_action_steps": config.n_action_steps,
+    }
+
+
+def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, queries, out: Path) -> None:
+    plot_pareto(results, out / "pareto.png")
+    plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
+    masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
+    for name, mask in masks.items():
+        ratio = results["methods"][name]["flops"]["ratio_to_dense"]
+        plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
+    surging = {name: masks[name] for name in SURGE_METHODS if name in masks}
+    if surging:
+        dense = methods["dense"]
+        noise = dense.sample_noise(queries[keys.SEED].squeeze(-1))
+        errors = block_errors(dense.network, dense.schedule, noise, queries[keys.COND], surging)
+        plot_error_surge(
+            {name: error.numpy() for name, error in errors.items()},
+            {name: mask.numpy() for name, mask in surging.items()},
+            out / "error_surge.png",
+        )
+
+
+def film(
+    methods: dict[str, DiffusionPolicy], environment: Callable[..., EnvBase], seed: int, config: DictConfig
+) -> None:
+    """A video of one episode per method; without a GL library, a line that says what to install."""
+    for name in config.videos:
+        if name not in methods:
+            continue
+        env = environment(seeds=[seed])
+        try:
+            frames, captions = follow(name, executor(methods[name], config), env)
+        except RuntimeError as error:
+            print(f"no video: {error}")
+            return
+        finally:
+            env.close()
+        write_video(frames, Path(config.out) / f"rollout_{name}.mp4", captions=captions)
+
+
+def follow(name: str, actor: ChunkExecutor, env: EnvBase) -> tuple[list, list[Caption]]:
+    frames, captions = [], []
+    latency = None
+
+    def watch(env: EnvBase, step: TensorDictBase) -> None:
+        nonlocal latency
+        queried = bool(step[keys.QUERIED])
+        latency = float(step[keys.LATENCY]) if queried else latency
+        frames.append(env.base_env.render("agentview", 320, 320))
+        captions.append(Caption(name, len(captions), queried, latency, bool(step["next", keys.SUCCESS])))
+
+    env.base_env.reset()
+    env.base_env.render("agentview", 320, 320)  # fails here, before any query, where there is no GL library
+    env.rollout(env.base_env.horizon, actor, callback=watch)
+    return frames, captions
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Computes the BAC schedules of a trained policy from one dense query.
+
+    python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_sparse.blocks.bac import SCHEDULES
+from torchrl_sparse.blocks.mask import prune_rate, query_flops
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.evaluation.methods import calibrate_policy
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+
+@hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")
+def main(config: DictConfig) -> None:
+    policy = DiffusionPolicy.from_pretrained(config.policy)
+    environment = partial(make_env, get_task(config.task).name, n_obs_steps=policy.n_obs_steps)
+    seeds = range(config.seed, config.seed + config.samples)
+    calibration = calibrate_policy(policy, environment, seeds)
+    dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
+    for name in config.methods:
+        options = {"top_k": config.top_k} if name == "bac" else {}
+        schedule = SCHEDULES[name](
+            calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
+        )
+        path = Path(config.out) / f"{name}.json"
+        schedule.save(path)
+        mask = schedule.mask()
+        ratio = query_flops(policy.network, mask) / dense
+        print(f"{path}: prune rate {prune_rate(mask):.3f}, {ratio:.3f} of the dense FLOPs")
+
+
+if __name__ == "__main__":
+    main()

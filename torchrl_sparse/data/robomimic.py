@@ -1,0 +1,175 @@
+"""Reading demonstrations from robomimic's HDF5 layout (arXiv:2108.03298) and cutting them into training windows.
+
+Layout: ``data/demo_<i>/actions`` [T, 7 * arms] absolute poses (position, rotation vector, gripper), ``data/demo_<i>/obs/<key>``
+[T, n], and the attribute ``num_samples`` = T on every demonstration. Writing is in `torchrl_sparse.data.hdf5_writer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.rotations import POSE_DIM, pose_to_absolute
+
+__all__ = ["Demonstrations", "read_demos"]
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Episodes laid end to end.
+
+    Attributes:
+        data: [N] with ``("observation", "state")`` f32 [N, Ds] and ``"action"`` f32 [N, 10 * arms], the action taken in that
+            state. It can be memory-mapped: ``data.memmap(folder)``.
+        starts: i64 [E + 1]; episode e is rows ``starts[e]`` up to, not including, ``starts[e + 1]``.
+    """
+
+    data: TensorDict
+    starts: Tensor
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self.starts) - 1
+
+    def episode(self, index: int) -> TensorDict:
+        """The rows of one episode."""
+        return self.data[int(self.starts[index]) : int(self.starts[index + 1])]
+
+    def window_rows(
+        self, horizon: int, n_obs_steps: int, n_action_steps: int, episodes: Sequence[int] | None = None
+    ) -> Tensor:
+        """Rows of all training windows, i64 [W, horizon], as Diffusion Policy's sampler cuts them.
+
+        A window may begin up to ``n_obs_steps - 1`` rows before its episode and end up to ``n_action_steps - 1`` after it; rows
+        outside repeat the first or last one. No window crosses episodes.
+
+        Args:
+            horizon: rows of a window; the first ``n_obs_steps`` are also its observations.
+            n_obs_steps: observations of a query.
+            n_action_steps: actions executed of a query.
+            episodes: episodes to cut; all by default.
+
+        Raises:
+            ValueError: if a size is below 1, or ``n_obs_steps - 1 + n_action_steps`` exceeds ``horizon``, or no window fits.
+        """
+        _check_window(horizon, n_obs_steps, n_action_steps)
+        windows = []
+        for index in range(len(self)) if episodes is None else episodes:
+            first, last = int(self.starts[index]), int(self.starts[index + 1]) - 1
+            begin = torch.arange(first - (n_obs_steps - 1), last + 1 - horizon + n_action_steps)
+            windows.append((begin[:, None] + torch.arange(horizon)).clamp(first, last))
+        rows = torch.cat(windows) if windows else torch.empty(0, horizon, dtype=torch.int64)
+        if not len(rows):
+            raise ValueError(f"no window of horizon {horizon} fits in the {len(windows)} episodes given")
+        return rows
+
+    def windows(self, rows: Tensor, n_obs_steps: int) -> TensorDict:
+        """Training samples [B] of windows ``rows`` i64 [B, H].
+
+        Returns:
+            ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A]; action ``To - 1`` belongs to the last observation.
+        """
+        return TensorDict(
+            {
+                keys.HISTORY_STATE: self.data.get(keys.STATE)[rows[:, :n_obs_steps]],
+                keys.ACTION: self.data.get(keys.ACTION)[rows],
+            },
+            batch_size=[len(rows)],
+        )
+
+
+def read_demos(path: str | Path, state_keys: Sequence[str]) -> Demonstrations:
+    """All demonstrations of a robomimic file, in the order of their numbers.
+
+    Args:
+        path: HDF5 file.
+        state_keys: observations that make up the state, concatenated in this order.
+
+    Returns:
+        f32 demonstrations; actions are converted from rotation vectors to 6-D rotations.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: if the file is truncated or malformed; the message names file, demonstration and dataset.
+
+    Examples:
+        >>> demos = read_demos("data/lift.h5", get_task("Lift").state_keys)
+        >>> demos.data["action"].shape[1], len(demos)
+        (10, 200)
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"demonstrations: no file {path}")
+    if not state_keys:
+        raise ValueError("state_keys: expected at least one observation key, got none")
+    try:
+        with h5py.File(path, "r") as file:
+            names = _demo_names(path, file)
+            episodes = [_read_episode(path, file["data"], name, state_keys) for name in names]
+    except OSError as error:
+        raise ValueError(f"{path}: expected a complete HDF5 file, got one that h5py cannot open ({error})") from error
+    lengths = torch.tensor([0] + [len(action) for _, action in episodes])
+    widths = sorted({(state.shape[1], action.shape[1]) for state, action in episodes})
+    if len(widths) > 1:
+        raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
+    state, action = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*episodes, strict=True))
+    data = TensorDict({keys.STATE: state, keys.ACTION: action}, batch_size=[len(state)])
+    return Demonstrations(data, lengths.cumsum(0))
+
+
+def _demo_names(path: Path, file: h5py.File) -> list[str]:
+    if "data" not in file or not isinstance(file["data"], h5py.Group):
+        raise ValueError(f"{path}: expected a group 'data', got {sorted(file)}")
+    names = [name for name in file["data"] if name.startswith("demo_") and name[5:].isdigit()]
+    if not names:
+        raise ValueError(f"{path}: expected groups data/demo_<number>, got {sorted(file['data'])}")
+    return sorted(names, key=lambda name: int(name[5:]))
+
+
+def _read_episode(path: Path, data: h5py.Group, name: str, state_keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """State [T, Ds] and absolute action [T, 10 * arms] of one demonstration, float64."""
+    where = f"{path}, {name}"
+    try:
+        demo = data[name]
+        length = int(demo.attrs["num_samples"])
+        pose = _read_dataset(where, demo, "actions", length)
+        state = [_read_dataset(where, demo, f"obs/{key}", length) for key in state_keys]
+    except (OSError, KeyError, RuntimeError) as error:
+        # h5py reports damaged files through all three.
+        raise ValueError(f"{where}: cannot be read: {error}") from error
+    if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
+        raise ValueError(f"{where}, actions: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
+    return np.concatenate(state, axis=1), pose_to_absolute(pose)
+
+
+def _read_dataset(where: str, demo: h5py.Group, name: str, length: int) -> np.ndarray:
+    if name not in demo:
+        raise ValueError(f"{where}: expected a dataset {name!r}, got {_dataset_names(demo)}")
+    value = np.asarray(demo[name], dtype=np.float64)
+    if value.ndim != 2 or len(value) != length or not length:
+        raise ValueError(f"{where}, {name}: expected shape [{length} = num_samples > 0, n], got {list(value.shape)}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"{where}, {name}: expected finite numbers, got {value[~np.isfinite(value)][0]}")
+    return value
+
+
+def _dataset_names(demo: h5py.Group) -> list[str]:
+    names: list[str] = []
+    demo.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return sorted(names)
+
+
+def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:
+    if min(horizon, n_obs_steps, n_action_steps) < 1 or n_obs_steps - 1 + n_action_steps > horizon:
+        raise ValueError(
+            "expected n_obs_steps >= 1, n_action_steps >= 1 and n_obs_steps - 1 + n_action_steps <= horizon, got "
+            f"horizon={horizon}, n_obs_steps={n_obs_steps}, n_action_steps={n_action_steps}"
+        )

@@ -1,0 +1,64 @@
+"""PickPlaceCan: grasp the can, carry it over the walls, put it into its bin and let go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward, nearest
+
+_WIDTH = 0.05  # m, the can's diameter
+_WALLS = 0.92  # m, the can's height from which it may travel sideways
+_CARRY = 0.17  # m over the place of release
+
+
+class PickPlaceCanExpert(Expert):
+    """Grasps the can upright with an unturned hand, or across its axis where it has toppled."""
+
+    def waypoints(self) -> Sequence[Waypoint]:
+        hand = self.hand()
+        can, rotation = self.body(self._object.root_body)
+        grasp, aligned = self._grasp_pose(hand, can, rotation)
+        held = np.linalg.norm(hand.position - can) < 0.035 and hand.opening < _WIDTH + 0.004
+        if self._over_bin(can, margin=0.035) and can[2] < self._bin[2] + 0.095:
+            return [self._let_go(hand, held)]
+        if held:
+            return [self._carry(hand, can)]
+        if at(hand, grasp, aligned, position=0.012):
+            return [Waypoint(grasp, aligned, CLOSED)]
+        return [Waypoint(self.above(hand, grasp), aligned, OPEN)]
+
+    @property
+    def _object(self):
+        return self.sim_env.objects[self.sim_env.object_id]
+
+    @property
+    def _bin(self) -> np.ndarray:
+        return self.sim_env.target_bin_placements[self.sim_env.object_id]
+
+    def _grasp_pose(self, hand: Hand, can: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        axis = rotation[:, 2]
+        if abs(axis[2]) > 0.7:
+            aligned = downward(0.0)
+            return can + np.array([0.0, 0.0, 0.012]) + self.style.offset * aligned[:, 1], aligned
+        # The fingers' axis is the world's y axis at yaw 0; across a lying can it is square to the can's own axis.
+        aligned = downward(nearest(np.arctan2(axis[1], axis[0]), hand.yaw, np.pi))
+        return can + self.style.offset * aligned[:, 1], aligned
+
+    def _carry(self, hand: Hand, can: np.ndarray) -> Waypoint:
+        release = np.array([*(hand.position[:2] + self._bin[:2] - can[:2]), self._bin[2] + 0.085])
+        goal = self.above(hand, release, clearance=_CARRY)
+        rising = np.clip((can[2] - _WALLS) / 0.04, 0.0, 1.0)
+        travels = 1.0 if self._over_bin(can, margin=0.025) else rising
+        goal[:2] = hand.position[:2] + travels * (goal[:2] - hand.position[:2])
+        return Waypoint(goal, downward(0.0), CLOSED)
+
+    def _over_bin(self, can: np.ndarray, margin: float) -> bool:
+        """Is the can's centre over its quarter of the bin, ``margin`` m or more from the edge?"""
+        room = np.asarray(self.sim_env.bin_size[:2]) / 4 - margin
+        return bool((np.abs(can[:2] - self._bin[:2]) < room).all())
+
+    def _let_go(self, hand: Hand, held: bool) -> Waypoint:
+        up = np.array([0.0, 0.0, 0.0 if held else 0.15])
+        return Waypoint(hand.position + up, downward(0.0), OPEN)

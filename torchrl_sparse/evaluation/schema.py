@@ -1,0 +1,153 @@
+"""``results.json``: the only source of every table and figure.
+
+Schema version 1 (all numbers finite; no other keys)::
+
+    {"schema": 1, "task": str, "seed": int,
+     "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
+     "policy": {"params": int, "num_inference_steps": int, "horizon": int, "n_obs_steps": int,
+                "n_action_steps": int},
+     "methods": {NAME: {
+        "success": {"k": int, "n": int, "rate": float, "ci95": [lo, hi]},
+        "paired_vs_dense": {"diff": float, "ci95": [lo, hi], "margin": float, "verdict": str},
+        "prune_rate": float,
+        "flops": {"per_query": float, "ratio_to_dense": float},
+        "latency_s": {"p50": float, "p95": float, "n": int},
+        "speedup_vs_dense": float,
+        "action_error_vs_dense": {"mean": float, "max": float},
+        "episode_length": float}}}
+
+``success.ci95`` is Wilson's interval; ``paired_vs_dense`` compares success on the same seeds, with Tango's
+interval and a verdict ``"non-inferior"``, ``"inferior"`` or ``"undecided"`` against ``margin``;
+``prune_rate`` is the mean of the masks; ``flops`` are 2 * MAC of one query, denoiser only; ``latency_s`` is
+in seconds per query and ``speedup_vs_dense`` the ratio of the medians; ``action_error_vs_dense`` is the
+absolute difference of an action entry, on the same observations and the same noise; ``episode_length`` is a
+mean in environment steps.
+
+``methods`` always holds ``"dense"``. Its own ``paired_vs_dense`` is ``diff 0, ci95 [0, 0], "non-
+inferior"``: a policy equals itself by definition, nothing is estimated.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+from torchrl_sparse.evaluation.stats import Verdict
+
+__all__ = ["REFERENCE", "SCHEMA", "validate_results"]
+
+SCHEMA = 1
+REFERENCE = "dense"
+
+_METHOD = {
+    "success": {"k": int, "n": int, "rate": float, "ci95": "interval"},
+    "paired_vs_dense": {"diff": float, "ci95": "interval", "margin": float, "verdict": str},
+    "prune_rate": float,
+    "flops": {"per_query": float, "ratio_to_dense": float},
+    "latency_s": {"p50": float, "p95": float, "n": int},
+    "speedup_vs_dense": float,
+    "action_error_vs_dense": {"mean": float, "max": float},
+    "episode_length": float,
+}
+_RESULTS = {
+    "schema": int,
+    "task": str,
+    "seed": int,
+    "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
+    "policy": {
+        "params": int,
+        "num_inference_steps": int,
+        "horizon": int,
+        "n_obs_steps": int,
+        "n_action_steps": int,
+    },
+    "methods": dict,
+}
+
+
+def validate_results(results: Any) -> None:
+    """Check that ``results`` is of schema version 1 and agrees with itself.
+
+    Raises:
+        ValueError: naming the path inside ``results``, what was expected there and what came.
+
+    >>> validate_results({"schema": 2})
+    Traceback (most recent call last):
+    ...
+    ValueError: schema: expected 1, got 2
+    """
+    if isinstance(results, Mapping) and results.get("schema", SCHEMA) != SCHEMA:
+        raise _fault("schema", SCHEMA, results["schema"])
+    _check(results, _RESULTS, "")
+    if REFERENCE not in results["methods"]:
+        raise _fault("methods", f"the key {REFERENCE!r}", sorted(results["methods"]))
+    n = None
+    for name, method in results["methods"].items():
+        path = f"methods.{name}"
+        _check(method, _METHOD, path)
+        _check_method_values(method, path)
+        n = method["success"]["n"] if n is None else n
+        _require(
+            method["success"]["n"] == n, f"{path}.success.n", f"{n}, as every method", method["success"]["n"]
+        )
+
+
+def _check_method_values(method: Mapping[str, Any], path: str) -> None:
+    success, paired, latency = method["success"], method["paired_vs_dense"], method["latency_s"]
+    k, n, rate = success["k"], success["n"], success["rate"]
+    _require(n >= 1, f"{path}.success.n", "at least 1", n)
+    _require(0 <= k <= n, f"{path}.success.k", f"0 to {n}", k)
+    _require(math.isclose(rate, k / n, abs_tol=1e-9), f"{path}.success.rate", f"k / n = {k / n}", rate)
+    _require(
+        all(0 <= limit <= 1 for limit in success["ci95"]),
+        f"{path}.success.ci95",
+        "within [0, 1]",
+        success["ci95"],
+    )
+    _require(-1 <= paired["diff"] <= 1, f"{path}.paired_vs_dense.diff", "-1 to 1", paired["diff"])
+    _require(0 < paired["margin"] < 1, f"{path}.paired_vs_dense.margin", "between 0 and 1", paired["margin"])
+    verdicts = get_args(Verdict)
+    _require(
+        paired["verdict"] in verdicts,
+        f"{path}.paired_vs_dense.verdict",
+        f"one of {verdicts}",
+        paired["verdict"],
+    )
+    _require(0 <= method["prune_rate"] <= 1, f"{path}.prune_rate", "0 to 1", method["prune_rate"])
+    _require(0 < latency["p50"] <= latency["p95"], f"{path}.latency_s", "0 < p50 <= p95", latency)
+    _require(latency["n"] >= 1, f"{path}.latency_s.n", "at least 1", latency["n"])
+    for key in ("flops", "action_error_vs_dense"):
+        _require(min(method[key].values()) >= 0, f"{path}.{key}", "values >= 0", method[key])
+
+
+def _check(value: Any, spec: Any, path: str) -> None:
+    """Check a value against a nested specification of types."""
+    if isinstance(spec, Mapping):
+        _require(isinstance(value, Mapping), path or "results", "an object", value)
+        for key in spec:
+            _require(key in value, f"{path}.{key}".lstrip("."), "this key", "nothing")
+        unknown = sorted(str(key) for key in value if key not in spec)
+        _require(not unknown, path or "results", f"only the keys {sorted(spec)}", f"also {unknown}")
+        for key, inner in spec.items():
+            _check(value[key], inner, f"{path}.{key}".lstrip("."))
+    elif spec == "interval":
+        pair = isinstance(value, Sequence) and len(value) == 2 and all(_is_number(limit) for limit in value)
+        _require(pair and value[0] <= value[1], path, "[low, high] with low <= high", value)
+    elif spec is float:
+        _require(_is_number(value), path, "a finite number", value)
+    elif spec is int:
+        _require(isinstance(value, int) and not isinstance(value, bool), path, "an integer", value)
+    else:
+        _require(isinstance(value, spec), path, {str: "a string", dict: "an object"}[spec], value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _require(condition: bool, path: str, expected: Any, got: Any) -> None:
+    if not condition:
+        raise _fault(path, expected, got)
+
+
+def _fault(path: str, expected: Any, got: Any) -> ValueError:
+    return ValueError(f"{path}: expected {expected}, got {got!r}")

@@ -1,0 +1,1 @@
+"""Reading and writing policies. Nothing in a checkpoint is ever executed."""

@@ -1,0 +1,77 @@
+"""Training objective of Diffusion Policy: predict the noise of a noised action chunk (arXiv:2303.04137, Eq. 5)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["DiffusionLoss", "noise_prediction_loss"]
+
+
+def noise_prediction_loss(
+    network: TransformerForDiffusion, schedule: NoiseSchedule, action: Tensor, cond: Tensor, noise: Tensor, timestep: Tensor
+) -> Tensor:
+    """Mean squared error between ``noise`` and the network's prediction of it, a scalar.
+
+    Args:
+        network: noise predictor.
+        schedule: noises the actions.
+        action: normalised chunks [B, H, A].
+        cond: encoded observations [B, To, D].
+        noise: standard normal [B, H, A].
+        timestep: i64 [B], one for each chunk.
+    """
+    noisy = schedule.add_noise(action, noise, timestep)
+    return torch.nn.functional.mse_loss(network(noisy, timestep, cond).float(), noise)
+
+
+class DiffusionLoss(LossModule):
+    """Chunked noise-prediction loss.
+
+    Reads ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A], both in environment units; writes ``"loss"``. Timestep
+    and noise are drawn from torch's global generator.
+
+    Args:
+        network: the network to train; its parameters are the loss module's.
+        normalizer: of states and actions.
+        schedule: gives the noise levels; DDPM with 100 by default.
+
+    Examples:
+        >>> network = TransformerForDiffusion(input_dim=10, output_dim=10, horizon=4, n_obs_steps=2, cond_dim=3, n_layer=1)
+        >>> normalizer = Normalizer(torch.ones(3), torch.zeros(3), torch.ones(10), torch.zeros(10))
+        >>> loss = DiffusionLoss(network, normalizer)
+        >>> batch = {("history", "state"): torch.zeros(5, 2, 3), "action": torch.zeros(5, 4, 10)}
+        >>> loss(TensorDict(batch, [5]))["loss"].shape
+        torch.Size([])
+    """
+
+    in_keys = [keys.HISTORY_STATE, keys.ACTION]
+    out_keys = ["loss"]
+
+    def __init__(
+        self, network: TransformerForDiffusion, normalizer: Normalizer, schedule: NoiseSchedule | None = None
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.normalizer = normalizer
+        self.schedule = NoiseSchedule() if schedule is None else schedule
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """``{"loss": scalar}`` of a batch.
+
+        Raises:
+            ValueError: if the chunk does not have the network's horizon and action size.
+        """
+        action = self.normalizer.normalize_action(tensordict.get(keys.ACTION))
+        cond = self.normalizer.normalize_state(tensordict.get(keys.HISTORY_STATE))
+        timestep = torch.randint(self.schedule.num_train_timesteps, (len(action),), device=action.device)
+        noise = torch.randn_like(action)
+        loss = noise_prediction_loss(self.network, self.schedule, action, cond, noise, timestep)
+        return TensorDict({"loss": loss}, batch_size=[])

@@ -1,0 +1,236 @@
+"""A diffusion policy as a TensorDict pipeline: encode the observations, plan what to skip, denoise a chunk of actions.
+
+The planner only writes ``("diffusion", "prune_mask")``; the denoiser only reads it. The dense policy is the same pipeline with
+the `Dense` planner, so that every method is compared on one code path.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.reference import denoise
+from torchrl_sparse.blocks.mask import query_flops
+from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
+from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.policies.checkpoints.pretrained import read_pretrained, write_pretrained
+from torchrl_sparse.policies.diffusion.noise import query_seed, sample_noise
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+
+class DiffusionPolicy(TensorDictSequential):
+    """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
+
+    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds]. The noise of a query follows from ``("episode", "seed")`` and
+    ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does), else from torch's global generator.
+    Writes the chunk, from the present step on, and everything that a table needs: see ``out_keys``.
+
+    Args:
+        network: the denoiser.
+        normalizer: of states and actions.
+        schedule: sampler; DDPM with all training steps by default.
+        plan: what to skip; nothing by default.
+
+    Attributes:
+        plan: the planner. Assign another to change the method: ``policy.plan = planner``.
+        schedule: the sampler. Assign another to change it: ``policy.schedule = NoiseSchedule("ddim", 10)``.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> td = policy(TensorDict({"history": {"state": torch.zeros(4, 2, 19)}}, [4]))
+        >>> td["vla_action", "chunk"].shape
+        torch.Size([4, 9, 10])
+    """
+
+    def __init__(
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        *,
+        schedule: NoiseSchedule | None = None,
+        plan: Planner | None = None,
+    ):
+        schedule = NoiseSchedule() if schedule is None else schedule
+        stages = OrderedDict(
+            encode=ObservationEncoder(network, normalizer),
+            plan=Dense(),
+            denoise=ActionDenoiser(network, normalizer, schedule),
+        )
+        super().__init__(stages)
+        self._fingerprint: str | None = None
+        self.plan = Dense() if plan is None else plan
+        self.eval()
+
+    # -- the parts -----------------------------------------------------------------------------------------------------
+
+    @property
+    def network(self) -> TransformerForDiffusion:
+        return self.module["denoise"].network
+
+    @property
+    def normalizer(self) -> Normalizer:
+        return self.module["denoise"].normalizer
+
+    @property
+    def plan(self) -> Planner:
+        return self.module["plan"]
+
+    @property
+    def schedule(self) -> NoiseSchedule:
+        return self.module["denoise"].schedule
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # nn.Module registers any module that is assigned, so properties with setters never see it.
+        if name == "plan":
+            self._install(value, self.schedule)
+        elif name == "schedule":
+            self._install(self.plan, value)
+        else:
+            super().__setattr__(name, value)
+
+    def _install(self, plan: Planner, schedule: NoiseSchedule) -> None:
+        """Changes planner and sampler together, or, if the planner cannot serve that sampler, neither."""
+        plan.bind(PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint))
+        denoiser = self.module["denoise"]
+        denoiser.schedule, denoiser.reuse = schedule, plan.reuse
+        self.module["plan"] = plan
+        self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
+        self.out_keys = [*out_keys, keys.LATENCY]
+
+    # -- numbers about it ----------------------------------------------------------------------------------------------
+
+    @property
+    def num_inference_steps(self) -> int:
+        """Denoising steps K."""
+        return self.schedule.num_inference_steps
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks of a denoising step, 3L."""
+        return self.network.num_blocks
+
+    @property
+    def horizon(self) -> int:
+        """Actions that the network denoises, H; a chunk leaves out those before the present step."""
+        return self.network.horizon
+
+    @property
+    def n_obs_steps(self) -> int:
+        return self.network.n_obs_steps
+
+    @property
+    def fingerprint(self) -> str:
+        """Names these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
+        if self._fingerprint is None:
+            digest = hashlib.sha256(repr(sorted(self.network.config.items())).encode())
+            for name, value in sorted(self.network.state_dict().items()):
+                digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
+            self._fingerprint = digest.hexdigest()[:16]
+        return self._fingerprint
+
+    # -- running it ----------------------------------------------------------------------------------------------------
+
+    def sample_noise(self, seed: Tensor) -> Tensor:
+        """All noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
+        return sample_noise(seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        device = next(self.network.parameters()).device
+        start = _synchronised_clock(device)
+        tensordict = super().forward(tensordict)
+        seconds = _synchronised_clock(device) - start
+        return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def save_pretrained(self, path: str | Path) -> None:
+        """Writes ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
+        write_pretrained(
+            Path(path), network=self.network, normalizer=self.normalizer, schedule=self.schedule.config
+        )
+
+    @classmethod
+    def from_pretrained(cls, path: str | Path) -> DiffusionPolicy:
+        """Reads what `save_pretrained` wrote. Nothing in the files is executed.
+
+        Raises:
+            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+        """
+        network, normalizer, schedule = read_pretrained(Path(path))
+        return cls(network, normalizer, schedule=NoiseSchedule(**schedule))
+
+
+class ObservationEncoder(TensorDictModuleBase):
+    """Normalised observations as the denoiser's condition, and the seed of the query's noise."""
+
+    in_keys = [keys.HISTORY_STATE, keys.EPISODE_SEED, keys.EPISODE_STEP]
+    out_keys = [keys.COND, keys.SEED]
+
+    def __init__(self, network: TransformerForDiffusion, normalizer: Normalizer):
+        super().__init__()
+        self.normalizer = normalizer
+        self._state_shape = (network.n_obs_steps, network.cond_dim)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state = tensordict.get(keys.HISTORY_STATE)
+        self._check(state)
+        tensordict.set(keys.COND, self.normalizer.normalize_state(state))
+        return tensordict.set(keys.SEED, self._seed(tensordict))
+
+    def _check(self, state: Tensor) -> None:
+        if tuple(state.shape[-2:]) != self._state_shape:
+            raise ValueError(
+                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self._state_shape[0]}, "
+                f"{self._state_shape[1]}], got {list(state.shape)}"
+            )
+        if not state.isfinite().all():
+            bad = (~state.isfinite()).nonzero()[0].tolist()
+            raise ValueError(f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}")
+
+    @staticmethod
+    def _seed(tensordict: TensorDictBase) -> Tensor:
+        seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
+        if seed is None or step is None:
+            return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
+        return query_seed(seed, step)
+
+
+class ActionDenoiser(TensorDictModuleBase):
+    """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost."""
+
+    in_keys = [keys.COND, keys.SEED, keys.PRUNE_MASK]
+    out_keys = [keys.CHUNK, keys.FLOPS]
+
+    def __init__(self, network: TransformerForDiffusion, normalizer: Normalizer, schedule: NoiseSchedule):
+        super().__init__()
+        self.network = network
+        self.normalizer = normalizer
+        self.schedule = schedule
+        self.reuse = "block"
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        batch = tensordict.batch_size
+        cond = tensordict.get(keys.COND).flatten(0, -3) if batch else tensordict.get(keys.COND)[None]
+        mask = tensordict.get(keys.PRUNE_MASK).reshape(cond.shape[0], -1, self.network.num_blocks)
+        shape = (self.network.horizon, self.network.input_dim)
+        noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.schedule.num_inference_steps, shape)
+        actions = denoise(self.network, self.schedule, noise, cond, mask, reuse=self.reuse)
+        chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
+        tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
+        return tensordict.set(keys.FLOPS, query_flops(self.network, mask).reshape(*batch, 1))
+
+
+def _synchronised_clock(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

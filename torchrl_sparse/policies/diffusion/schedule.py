@@ -1,0 +1,142 @@
+"""Denoising schedules: diffusers' DDPM and DDIM schedulers with every noise tensor handed in from outside.
+
+Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta schedule
+(arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0) samples the same network
+in any smaller number of steps.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler
+from torch import Tensor
+
+__all__ = ["NoiseSchedule"]
+
+
+class NoiseSchedule:
+    """The denoising steps of one query, in execution order, and the noising of training.
+
+    Scheduler steps of diffusers draw their own noise; here the caller passes it, so that two methods can share all noise of a
+    query. The arithmetic is the scheduler's own.
+
+    Args:
+        kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
+        num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``.
+        num_train_timesteps: diffusion steps that the network was trained with.
+
+    Attributes:
+        timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
+        scheduler: the diffusers scheduler.
+
+    Raises:
+        ValueError: on an unknown ``kind`` or a number of steps out of range.
+
+    Examples:
+        >>> schedule = NoiseSchedule("ddim", num_inference_steps=10)
+        >>> schedule.timesteps.tolist()
+        [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]
+        >>> sample = torch.zeros(1, 10, 7)
+        >>> schedule.step(torch.zeros_like(sample), 0, sample).shape
+        torch.Size([1, 10, 7])
+    """
+
+    def __init__(
+        self,
+        kind: Literal["ddpm", "ddim"] = "ddpm",
+        num_inference_steps: int = 100,
+        num_train_timesteps: int = 100,
+    ) -> None:
+        if kind not in ("ddpm", "ddim"):
+            raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
+        if not 1 <= num_inference_steps <= num_train_timesteps:
+            raise ValueError(
+                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), got {num_inference_steps}"
+            )
+        self.kind = kind
+        self.num_inference_steps = num_inference_steps
+        self.num_train_timesteps = num_train_timesteps
+        common = {
+            "num_train_timesteps": num_train_timesteps,
+            "beta_schedule": "squaredcos_cap_v2",
+            "clip_sample": True,
+            "prediction_type": "epsilon",
+        }
+        if kind == "ddpm":
+            self.scheduler = DDPMScheduler(variance_type="fixed_small", **common)
+        else:
+            self.scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
+        self.scheduler.set_timesteps(num_inference_steps)
+        self.timesteps: Tensor = self.scheduler.timesteps.clone()
+
+    @property
+    def config(self) -> dict:
+        """The constructor's arguments: ``NoiseSchedule(**schedule.config)`` is an equal schedule."""
+        return {
+            "kind": self.kind,
+            "num_inference_steps": self.num_inference_steps,
+            "num_train_timesteps": self.num_train_timesteps,
+        }
+
+    def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
+        """The sample after denoising step ``k``.
+
+        Args:
+            eps: predicted noise [B, H, A].
+            k: index of the denoising step in execution order, 0 .. K-1.
+            sample: the sample that ``eps`` was predicted for, [B, H, A].
+            noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by DDIM nor by the last
+                step.
+
+        Raises:
+            IndexError: if ``k`` is not in 0..K-1.
+            ValueError: if DDPM needs ``noise_k`` and it is None.
+        """
+        if not 0 <= k < self.num_inference_steps:
+            raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
+        timestep = int(self.timesteps[k])
+        if self.kind == "ddim":
+            return self.scheduler.step(eps, timestep, sample, eta=0.0).prev_sample
+        if timestep == 0:
+            # diffusers adds no noise at timestep 0, so the step is a pure function of its inputs.
+            return self.scheduler.step(eps, timestep, sample).prev_sample
+        if noise_k is None:
+            raise ValueError(f"DDPM step k={k} (timestep {timestep}) needs noise_k, got None")
+        return _ddpm_step(self.scheduler, eps, timestep, sample, noise_k)
+
+    def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
+        """Noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
+
+        Args:
+            clean: normalised actions [B, H, A].
+            noise: standard normal [B, H, A].
+            timestep: i64 [B], 0 .. num_train_timesteps - 1.
+        """
+        return self.scheduler.add_noise(clean, noise, timestep)
+
+    def __repr__(self) -> str:
+        return f"NoiseSchedule({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def _ddpm_step(scheduler: DDPMScheduler, eps: Tensor, timestep: int, sample: Tensor, noise: Tensor) -> Tensor:
+    """``DDPMScheduler.step`` (arXiv:2006.11239, Eq. 7) with the variance noise handed in.
+
+    diffusers draws the noise inside its step and offers no way to pass it; its expressions are repeated in their order, so that
+    results are equal to the last bit.
+    """
+    previous = scheduler.previous_timestep(timestep)
+    alpha_prod = scheduler.alphas_cumprod[timestep]
+    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.one
+    beta_prod = 1 - alpha_prod
+    beta_prod_prev = 1 - alpha_prod_prev
+    alpha = alpha_prod / alpha_prod_prev
+    beta = 1 - alpha
+
+    clean = (sample - beta_prod ** (0.5) * eps) / alpha_prod ** (0.5)
+    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
+    clean_coeff = (alpha_prod_prev ** (0.5) * beta) / beta_prod
+    sample_coeff = alpha ** (0.5) * beta_prod_prev / beta_prod
+    mean = clean_coeff * clean + sample_coeff * sample
+    return mean + (scheduler._get_variance(timestep) ** 0.5) * noise

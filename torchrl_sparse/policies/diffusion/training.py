@@ -1,0 +1,281 @@
+"""Training a diffusion policy: one resumable object that knows weights, their average, the optimiser and the step.
+
+Everything random in step s (which windows, timesteps, noise, dropout) follows from ``(seed, s)``; a training that is stopped
+and resumed therefore continues bit by bit as if it had not been.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from diffusers.optimization import get_cosine_schedule_with_warmup
+from diffusers.training_utils import EMAModel
+from torch import Tensor
+
+from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+
+__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train; the defaults are those published for robomimic's low-dimensional tasks (arXiv:2303.04137, Table VII).
+
+    Attributes:
+        max_steps: optimiser steps; the cosine schedule ends there.
+        batch_size: windows in a step.
+        n_action_steps: actions executed of a chunk; decides how far windows reach over an episode's end.
+        lr: peak learning rate.
+        lr_warmup_steps: steps of linear warm-up.
+        weight_decay: of Linear and attention weights.
+        max_grad_norm: gradient norm clip; 0 does not clip, as published.
+        ema_power, ema_max_decay: of the weight average, decay ``min(max, 1 - (1 + s) ** -power)``.
+        precision: "fp32", or "bf16" (autocast; the weights and the optimiser stay fp32).
+        val_ratio: share of the episodes, the last ones, that are not trained on.
+        seed: fixes everything random.
+    """
+
+    max_steps: int
+    batch_size: int = 256
+    n_action_steps: int = 8
+    lr: float = 1e-4
+    lr_warmup_steps: int = 1000
+    weight_decay: float = 1e-3
+    max_grad_norm: float = 0.0
+    ema_power: float = 0.75
+    ema_max_decay: float = 0.9999
+    precision: Literal["fp32", "bf16"] = "fp32"
+    val_ratio: float = 0.02
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.max_steps < 1 or self.batch_size < 1:
+            raise ValueError(
+                f"expected max_steps and batch_size >= 1, got max_steps={self.max_steps}, batch_size={self.batch_size}"
+            )
+        if self.precision not in ("fp32", "bf16"):
+            raise ValueError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
+        if not 0 <= self.val_ratio < 1:
+            raise ValueError(f"val_ratio: expected a share in [0, 1), got {self.val_ratio}")
+
+
+class PolicyTrainer:
+    """Trains a network on demonstrations.
+
+    Args:
+        network: the network, trained in place.
+        normalizer: of states and actions.
+        demos: demonstrations.
+        config: how to train.
+
+    Attributes:
+        step: optimiser steps taken.
+        lr: the learning rate of the next step.
+
+    Raises:
+        ValueError: if ``val_ratio`` leaves no episode to train on.
+    """
+
+    def __init__(
+        self, network: TransformerForDiffusion, normalizer: Normalizer, demos: Demonstrations, config: TrainConfig
+    ) -> None:
+        self.network, self.normalizer, self.demos, self.config = network, normalizer, demos, config
+        self.loss = DiffusionLoss(network, normalizer, NoiseSchedule())
+        num_val = math.ceil(config.val_ratio * len(demos))
+        if num_val >= len(demos):
+            raise ValueError(f"val_ratio {config.val_ratio} of {len(demos)} episodes leaves none to train on")
+        sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
+        split = len(demos) - num_val
+        self.train_rows = demos.window_rows(*sizes, range(split))
+        self.val_rows = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
+        self._ema = EMAModel(
+            network.parameters(),
+            decay=config.ema_max_decay,
+            power=config.ema_power,
+            update_after_step=0,
+            use_ema_warmup=True,
+            foreach=True,
+        )
+        self._optimizer = torch.optim.AdamW(
+            optimizer_groups(network, config.weight_decay), lr=config.lr, betas=(0.9, 0.95), fused=True
+        )
+        self.step = 0
+        self._set_schedule()
+
+    @property
+    def lr(self) -> float:
+        return self._schedule.get_last_lr()[0]
+
+    def train_step(self) -> float:
+        """One optimiser step; returns its loss.
+
+        Raises:
+            FloatingPointError: if the loss is not finite; the weights are then those of the step before.
+        """
+        torch.manual_seed(step_seed(self.config.seed, self.step))
+        index = batch_indices(len(self.train_rows), self.config.batch_size, self.step, self.config.seed)
+        self.network.train()
+        self._optimizer.zero_grad(set_to_none=True)
+        loss = self._batch_loss(self.train_rows[index])
+        if not math.isfinite(value := loss.item()):
+            raise FloatingPointError(f"step {self.step}: loss is {value}")
+        loss.backward()
+        if self.config.max_grad_norm > 0:
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
+        self._optimizer.step()
+        self._schedule.step()
+        self._ema.step(self.network.parameters())
+        self.step += 1
+        return value
+
+    @torch.no_grad()
+    def validate(self, max_windows: int = 512) -> float:
+        """Loss of the averaged weights on the held-out episodes, on noise that is the same in every call; nan without any."""
+        if self.val_rows is None:
+            return float("nan")
+        self.network.eval()
+        with torch.random.fork_rng(devices=[]), self._averaged_weights():
+            torch.manual_seed(self.config.seed)
+            rows = self.val_rows[torch.randperm(len(self.val_rows))[:max_windows]]
+            return self._batch_loss(rows.repeat(math.ceil(max_windows / len(rows)), 1)).item()
+
+    def ema_network(self) -> TransformerForDiffusion:
+        """A copy of the network with the averaged weights, in evaluation mode."""
+        network = copy.deepcopy(self.network).eval()
+        self._ema.copy_to(network.parameters())
+        return network
+
+    def save(self, path: str | Path) -> None:
+        """Writes a checkpoint. A kill leaves the old file or the new one, never a part of one."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(path.name + ".tmp")
+        with open(temporary, "wb") as file:
+            torch.save(self._state(), file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+
+    def load(self, path: str | Path) -> None:
+        """Continues from a checkpoint. Nothing in the file is executed.
+
+        Raises:
+            ValueError: if it is no checkpoint of this class, or was made with another network, data set or configuration.
+        """
+        state = _read_checkpoint(path)
+        for name in ("config", "network_config", "data"):
+            if state[name] != (expected := self._state_header()[name]):
+                raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
+        self.network.load_state_dict(state["network"])
+        self._ema.load_state_dict(state["ema"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self.step = state["step"]
+        self._set_schedule()
+
+    def _batch_loss(self, rows: Tensor) -> Tensor:
+        batch = self.demos.windows(rows, self.network.n_obs_steps)
+        device = next(self.network.parameters()).device
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
+            return self.loss(batch.to(device)).get("loss")
+
+    def _averaged_weights(self) -> _Swap:
+        return _Swap(self._ema, self.network)
+
+    def _set_schedule(self) -> None:
+        for group in self._optimizer.param_groups:
+            group["initial_lr"] = self.config.lr
+        self._schedule = get_cosine_schedule_with_warmup(
+            self._optimizer, self.config.lr_warmup_steps, self.config.max_steps, last_epoch=self.step - 1
+        )
+
+    def _state_header(self) -> dict[str, Any]:
+        rows, data = len(self.train_rows), self.demos.data
+        return {
+            "config": asdict(self.config),
+            "network_config": dict(self.network.config),
+            "data": {"windows": rows, "checksum": sum(float(v.double().sum()) for v in data.values(True, True))},
+        }
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            **self._state_header(),
+            "step": self.step,
+            "network": self.network.state_dict(),
+            "ema": self._ema.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+        }
+
+
+class _Swap:
+    """Averaged weights in the network while the block runs."""
+
+    def __init__(self, ema: EMAModel, network: torch.nn.Module) -> None:
+        self._ema, self._network = ema, network
+
+    def __enter__(self) -> None:
+        self._ema.store(self._network.parameters())
+        self._ema.copy_to(self._network.parameters())
+
+    def __exit__(self, *_: object) -> None:
+        self._ema.restore(self._network.parameters())
+
+
+def step_seed(seed: int, step: int) -> int:
+    """Seed of torch's global generator in step ``step``; distinct for all steps of a training.
+
+    torch's CPU generator reads only the low 32 bits of a seed, so both numbers have to be mixed into those.
+
+    Examples:
+        >>> step_seed(0, 5), step_seed(1, 5) == step_seed(0, 5)
+        (5, False)
+    """
+    return (seed * 0x9E3779B1 + step) % 2**32
+
+
+def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Tensor:
+    """Windows of step ``step``, i64 [batch_size]: every epoch is a permutation of all windows that follows from (seed, epoch).
+
+    Batches run on over the end of an epoch, so that every window is used equally often.
+
+    Examples:
+        >>> torch.cat([batch_indices(6, 3, step, seed=0) for step in range(2)]).sort().values.tolist()
+        [0, 1, 2, 3, 4, 5]
+    """
+    position = torch.arange(step * batch_size, (step + 1) * batch_size)
+    epoch, offset = position // num_windows, position % num_windows
+    index = torch.empty_like(offset)
+    for number in epoch.unique().tolist():
+        generator = torch.Generator().manual_seed(step_seed(seed, number))
+        chosen = epoch == number
+        index[chosen] = torch.randperm(num_windows, generator=generator)[offset[chosen]]
+    return index
+
+
+def _read_checkpoint(path: str | Path) -> dict[str, Any]:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        # torch reports damaged and unsafe files through many exception types.
+        raise ValueError(f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}") from error
+    expected = {"config", "network_config", "data", "step", "network", "ema", "optimizer"}
+    if not isinstance(state, dict) or set(state) != expected:
+        found = sorted(state) if isinstance(state, dict) else type(state).__name__
+        raise ValueError(f"{path}: expected a training checkpoint with {sorted(expected)}, got {found}")
+    return state
+
+
+def _difference(expected: dict, found: dict) -> str:
+    names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
+    return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)
