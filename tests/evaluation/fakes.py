@@ -65,7 +65,7 @@ class FakeEnv(EnvBase):
 
 
 class FakeActor(TensorDictModuleBase):
-    """Queries every `CHUNK_LENGTH` steps. Its cost keys hold nonsense on served steps: nobody may read them there.
+    """Queries every `CHUNK_LENGTH` steps; its cost keys hold nonsense on served steps, where nobody may look.
 
     Args:
         crash_at: raise on this call, as a machine that dies would.

@@ -84,6 +84,7 @@ def plot_pareto(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
     axes.set_xlim(low / 1.5, high * 1.5)
     bottom = min(low for low, _ in intervals.values())
     axes.set_ylim(max(bottom - 4, -2), 103)
+    axes.set_yticks([tick for tick in axes.get_yticks() if max(bottom - 4, -2) <= tick <= 100])
     axes.annotate(
         f"dense − {margin:g} points",
         (high * 1.48, rate[REFERENCE] - margin),

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
-from torchrl_sparse.files import atomic_path
 from torchrl_sparse.evaluation.latency import Latency
 from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, validate_results
 from torchrl_sparse.evaluation.stats import (
@@ -18,6 +17,7 @@ from torchrl_sparse.evaluation.stats import (
     paired_difference,
     wilson_interval,
 )
+from torchrl_sparse.files import atomic_path
 
 __all__ = ["MethodRun", "build_results", "format_table", "load_results", "save_results"]
 
