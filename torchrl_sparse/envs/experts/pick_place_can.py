@@ -10,7 +10,9 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 
 _WIDTH = 0.05  # m, the can's diameter
 _WALLS = 0.92  # m, the can's height from which it may travel sideways
-_CARRY = 0.17  # m over the place of release
+_CARRY = 0.13  # m over the place of release
+_PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
+_RELEASE = 0.12  # m over the bin's floor, the can's height when let go; its lower half is then below the walls' top
 
 
 class PickPlaceCanExpert(Expert):
@@ -21,7 +23,7 @@ class PickPlaceCanExpert(Expert):
         can, rotation = self.body(self._object.root_body)
         grasp, aligned = self._grasp_pose(hand, can, rotation)
         held = np.linalg.norm(hand.position - can) < 0.035 and hand.opening < _WIDTH + 0.004
-        if self._over_bin(can, margin=0.035) and can[2] < self._bin[2] + 0.095:
+        if self._over_bin(can, margin=0.035) and can[2] < self._bin[2] + _RELEASE + 0.012:
             return [self._let_go(hand, held)]
         if held:
             return [self._carry(hand, can)]
@@ -47,7 +49,8 @@ class PickPlaceCanExpert(Expert):
         return can + self.style.offset * aligned[:, 1], aligned
 
     def _carry(self, hand: Hand, can: np.ndarray) -> Waypoint:
-        release = np.array([*(hand.position[:2] + self._bin[:2] - can[:2]), self._bin[2] + 0.085])
+        place = np.array([*(self._bin[:2] + _PLACE), self._bin[2] + _RELEASE])
+        release = hand.position + place - can
         goal = self.above(hand, release, clearance=_CARRY)
         rising = np.clip((can[2] - _WALLS) / 0.04, 0.0, 1.0)
         travels = 1.0 if self._over_bin(can, margin=0.025) else rising

@@ -1,0 +1,222 @@
+"""Collecting scripted demonstrations: run experts, keep what succeeded, survive being killed.
+
+The demonstrations are scripted, never human. Episode ``i`` is fixed by ``seed + i`` alone, so a file can be made again, and
+continued after a kill, to the same bytes on the same machine.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
+from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.rotations import pose_to_absolute
+from torchrl_sparse.envs.simulator import controller_config, import_robosuite
+from torchrl_sparse.envs.tasks import Task, get_task
+
+_EXPERT_STREAM = 1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What to collect.
+
+    Attributes:
+        task: robosuite's name of a task that has an expert.
+        episodes: demonstrations to keep; with ``keep_failures``, episodes to attempt.
+        quality: "proficient" or "mixed", see `torchrl_sparse.envs.experts.operators`.
+        seed: the first episode's; the others follow in order.
+        keep_failures: keep failed episodes too.
+    """
+
+    task: str
+    episodes: int
+    quality: str = "proficient"
+    seed: int = 0
+    keep_failures: bool = False
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a collection went: episodes attempted, how many succeeded, how many are kept, and their mean number of steps."""
+
+    attempts: int
+    successes: int
+    kept: int
+    mean_length: float
+
+    def __str__(self) -> str:
+        return (
+            f"successes/attempts {self.successes}/{self.attempts}, kept {self.kept}, "
+            f"mean length {self.mean_length:.1f} steps"
+        )
+
+
+def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Episode:
+    """One scripted episode, to success or to the environment's horizon.
+
+    Args:
+        env: an environment of absolute actions.
+        seed: fixes the initial state, the operator, their style and every disturbance.
+        quality: "proficient" or "mixed".
+
+    Raises:
+        ValueError: if the task has no expert or the quality is unknown.
+
+    Examples:
+        >>> episode = demonstrate(RobosuiteEnv("Lift"), seed=0)
+        >>> episode.success, episode.actions.shape[1]
+        (True, 7)
+    """
+    rng = np.random.default_rng([seed, _EXPERT_STREAM])
+    operator = draw_operator(quality, rng)
+    env.set_seed(seed)
+    present = env.reset()
+    start = env.get_initial_state()
+    expert = make_expert(env.task.name, env.sim_env, operator.draw(rng))
+    disturb = Disturbance(operator, env.task.arms, rng)
+    steps: list[dict[str, Any]] = []
+    while not steps or not steps[-1]["done"]:
+        clean = expert.command()
+        hands = np.stack([expert.hand(arm).position for arm in range(env.task.arms)])
+        executed = disturb(clean, hands)
+        step = {"action": clean, "executed": executed, "obs": env.raw_observation()}
+        step["state"] = env.sim_env.sim.get_state().flatten()
+        present[keys.ACTION] = torch.as_tensor(pose_to_absolute(executed), dtype=torch.float32)
+        present = env.step(present)["next"]
+        step["success"], step["done"] = bool(present[keys.SUCCESS]), bool(present["done"])
+        steps.append(step)
+    succeeded = np.array([step["success"] for step in steps])
+    return Episode(
+        seed=seed,
+        operator=operator.name,
+        success=bool(succeeded[-1]),
+        model_file=start.model_xml,
+        states=np.stack([step["state"] for step in steps]),
+        actions=np.stack([step["action"] for step in steps]),
+        executed_actions=np.stack([step["executed"] for step in steps]),
+        rewards=succeeded.astype(np.float64),
+        dones=succeeded.astype(np.int64),
+        observations={key: np.stack([step["obs"][key] for step in steps]) for key in env.task.state_keys},
+    )
+
+
+def collect(
+    path: str | Path,
+    collection: Collection,
+    *,
+    env: RobosuiteEnv | None = None,
+    on_episode: Callable[[Summary], None] | None = None,
+) -> Summary:
+    """Collects demonstrations into ``path``, going on where a killed run stopped.
+
+    Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the end. Calling
+    again after that only reports.
+
+    Args:
+        path: the HDF5 file to make; layout in `torchrl_sparse.data.hdf5_writer`.
+        collection: what to collect.
+        env: an environment of that task to use; made when it is needed by default.
+        on_episode: called with the tally so far, after episodes found on disk and after each new one.
+
+    Raises:
+        ValueError: if ``path`` or its parts were collected with other settings, or an option is out of range.
+    """
+    path = Path(path)
+    _check(collection)
+    parts = path.with_name(path.name + ".parts")
+    settings = asdict(collection)
+    if path.exists():
+        shutil.rmtree(parts, ignore_errors=True)  # a kill between the two last steps leaves them
+        return _finished(path, settings)
+    _claim(parts, settings)
+    kept: list[Path] = []
+    tally = Summary(0, 0, 0, 0.0)
+    while tally.kept < collection.episodes:
+        part = parts / f"{collection.seed + tally.attempts:010d}.h5"
+        if not part.exists():
+            env = env or RobosuiteEnv(collection.task)
+            write_episode(part, demonstrate(env, collection.seed + tally.attempts, collection.quality))
+        tally = _add(tally, part, kept, collection.keep_failures)
+        if on_episode is not None:
+            on_episode(tally)
+        _check_yield(tally)
+    made_in = env_args(get_task(collection.task))
+    merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
+    shutil.rmtree(parts)
+    return tally
+
+
+def env_args(task: Task) -> dict[str, Any]:
+    """robomimic's description of the environment that demonstrations were made in."""
+    return {
+        "env_name": task.name,
+        "env_version": import_robosuite().__version__,
+        "type": 1,  # robomimic's EnvType.ROBOSUITE_TYPE
+        "env_kwargs": {
+            "robots": ["Panda"] * task.arms,
+            "controller_configs": controller_config(absolute=True),
+            "control_freq": 20,
+            "has_renderer": False,
+            "has_offscreen_renderer": False,
+            "use_camera_obs": False,
+            "reward_shaping": False,
+        },
+    }
+
+
+def _check(collection: Collection) -> None:
+    if collection.episodes < 1:
+        raise ValueError(f"episodes: expected at least 1, got {collection.episodes}")
+    if collection.seed < 0:
+        raise ValueError(f"seed: expected 0 or more, got {collection.seed}")
+
+
+def _check_yield(tally: Summary) -> None:
+    if tally.attempts >= 20 and tally.successes * 20 < tally.attempts:
+        raise RuntimeError(f"the expert fails: {tally}; keep_failures=true collects its episodes for a look")
+
+
+def _claim(parts: Path, settings: Mapping[str, Any]) -> None:
+    """Starts or goes on with a folder of finished episodes; they must have been made with the same settings."""
+    parts.mkdir(parents=True, exist_ok=True)
+    note = parts / "settings.json"
+    if not note.exists():
+        temporary = note.with_suffix(".tmp")
+        temporary.write_text(json.dumps(settings, indent=1))
+        temporary.replace(note)
+    _same(note, json.loads(note.read_text()), settings)
+
+
+def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:
+    with h5py.File(path, "r") as file:
+        made = json.loads(file["data"].attrs.get("collection", "{}"))
+    summary = made.pop("summary", None)
+    _same(path, made, settings)
+    return Summary(**summary)
+
+
+def _same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    different = [f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]]
+    if different:
+        raise ValueError(f"{where} was collected with other settings ({'; '.join(different)}): move it or choose another file")
+
+
+def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:
+    length, success = episode_length(part)
+    total = tally.mean_length * tally.kept
+    if success or keep_failures:
+        kept.append(part)
+        total += length
+    return Summary(tally.attempts + 1, tally.successes + success, len(kept), total / max(len(kept), 1))

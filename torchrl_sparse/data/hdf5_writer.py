@@ -1,0 +1,112 @@
+"""Writing demonstrations in robomimic's HDF5 layout, one episode at a time and safely.
+
+============================  =====================  ==========================================================
+in the file                   shape, type            meaning
+============================  =====================  ==========================================================
+``data`` attributes           ``env_args`` json,     how the environment was made; number of samples of all
+                              ``total`` int          demonstrations; ``collection`` json, how they were made
+``data/demo_<i>`` attributes  int, str, bool         ``num_samples``, ``model_file`` (MuJoCo xml), ``seed``,
+                                                     ``operator``, ``success``
+``states``                    f64 [T, S]             simulator state before each action; the first restores the
+                                                     episode's start
+``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m; rotation
+                                                     vector, rad; gripper, -1 open to 1 closed
+``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
+``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
+``obs/<key>``                 f64 [T, n]             observations before each action
+============================  =====================  ==========================================================
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One finished episode; the arrays are those of the table above, ``observations`` by key."""
+
+    seed: int
+    operator: str
+    success: bool
+    model_file: str
+    states: np.ndarray
+    actions: np.ndarray
+    executed_actions: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+    observations: Mapping[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def write_episode(path: Path, episode: Episode) -> None:
+    """Writes one episode as a file of its own. A kill leaves either the whole file or none."""
+    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        _fill(file.create_group("demo"), episode)
+
+
+def episode_length(path: Path) -> tuple[int, bool]:
+    """Number of steps of an episode written by `write_episode`, and whether it succeeded."""
+    with h5py.File(path, "r") as file:
+        return int(file["demo"].attrs["num_samples"]), bool(file["demo"].attrs["success"])
+
+
+def merge_episodes(
+    path: Path, parts: Iterable[Path], *, env_args: Mapping[str, Any], collection: Mapping[str, Any]
+) -> None:
+    """Joins episode files into one demonstration file, ``demo_0`` onwards in the order given.
+
+    Equal episodes give equal bytes. A kill leaves either the whole file or none.
+    """
+    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        data = file.create_group("data")
+        total = 0
+        for index, part in enumerate(parts):
+            with h5py.File(part, "r") as source:
+                source.copy("demo", data, name=f"demo_{index}")
+            total += int(data[f"demo_{index}"].attrs["num_samples"])
+        data.attrs["total"] = total
+        data.attrs["env_args"] = json.dumps(env_args, sort_keys=True)
+        data.attrs["collection"] = json.dumps(collection, sort_keys=True)
+
+
+def _fill(group: h5py.Group, episode: Episode) -> None:
+    group.attrs["num_samples"] = len(episode)
+    group.attrs["model_file"] = episode.model_file
+    group.attrs["seed"] = episode.seed
+    group.attrs["operator"] = episode.operator
+    group.attrs["success"] = episode.success
+    for name in ("states", "actions", "executed_actions", "rewards", "dones"):
+        group[name] = getattr(episode, name)
+    for key, value in episode.observations.items():
+        group[f"obs/{key}"] = value
+
+
+class _replacing:
+    """A temporary neighbour of ``path`` that takes its place, durably, when the block ends without an error."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._temporary = path.with_name(path.name + ".tmp")
+
+    def __enter__(self) -> Path:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        return self._temporary
+
+    def __exit__(self, error_type: type | None, *_: object) -> None:
+        if error_type is not None:
+            self._temporary.unlink(missing_ok=True)
+            return
+        with open(self._temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(self._temporary, self._path)
