@@ -59,8 +59,8 @@ def denoise(
     """Denoise a batch of action chunks, skipping what ``mask`` prunes.
 
     For every block ``b`` of every step, per row of the batch: ``d = block_b(x)`` where the mask is False, the
-    latest ``d`` of the reuse rule where it is True; ``x = x + d``. Nothing outlives the call. A row of a batch
-    equals the row alone up to the rounding of matrix products, which depends on the batch size.
+    latest ``d`` of the reuse rule where it is True; ``x = x + d``. Nothing outlives the call. A row of a
+    batch equals the row alone up to the rounding of matrix products, which depends on the batch size.
 
     Args:
         network: the denoiser; gradients flow through it, and to ``noise`` and ``cond``.
