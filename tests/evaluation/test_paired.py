@@ -1,9 +1,11 @@
 import pytest
+import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import check_env_specs
 
 from tests.evaluation.fakes import CHUNK_LENGTH, FLOPS_PER_QUERY, FakeActor, FakeEnv, expected_length
 from torchrl_sparse import keys
+from torchrl_sparse.evaluation.latency import num_threads
 from torchrl_sparse.evaluation.paired import rollout_episodes
 
 SEEDS = [7, 3, 10, 4, 25, 6, 1, 8, 15, 2, 11]
@@ -125,6 +127,12 @@ def test_missing_keys_are_named():
     actor = TensorDictModule(lambda state: state, in_keys=[keys.STATE], out_keys=[keys.ACTION])
     with pytest.raises(KeyError, match=r"'control', 'queried'"):
         rollout_episodes(actor, FakeEnv, [1])
+
+
+def test_the_thread_count_survives():
+    with num_threads(1):
+        rollout_episodes(FakeActor(), FakeEnv, [1, 2], num_envs=2)
+        assert torch.get_num_threads() == 1
 
 
 @pytest.mark.parametrize(

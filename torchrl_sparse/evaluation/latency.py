@@ -119,7 +119,8 @@ def measure_latency(
 
 @contextmanager
 def num_threads(threads: int | None) -> Iterator[None]:
-    """Run a block with ``threads`` intra-op threads of PyTorch; None changes nothing.
+    """Run a block with ``threads`` intra-op threads of PyTorch (None: as many as now); restore them
+    afterwards.
 
     >>> with num_threads(1):
     ...     torch.get_num_threads()

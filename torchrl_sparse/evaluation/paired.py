@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.latency import num_threads
 
 __all__ = ["rollout_episodes"]
 
@@ -26,7 +27,7 @@ _REQUIRED = (keys.EPISODE_SEED, keys.QUERIED, keys.FLOPS, ("next", keys.SUCCESS)
 
 def rollout_episodes(
     actor: TensorDictModuleBase,
-    make_env: Callable[[list[int]], EnvBase],
+    make_env: Callable[..., EnvBase],
     seeds: Sequence[int],
     *,
     num_envs: int = 10,
@@ -44,8 +45,8 @@ def rollout_episodes(
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
             "latency")`` and ``("diffusion", "prune_mask")`` are recorded where it writes them.
-        make_env: makes one environment whose episodes take the given seeds in turn and report them under
-            ``("episode", "seed")``, with ``("next", "success")``.
+        make_env: called as ``make_env(seeds=[...])``; makes one environment whose episodes take these in
+            turn and report them under ``("episode", "seed")``, with ``("next", "success")``.
         seeds: one episode each, all different.
         num_envs: environments stepped as one batch.
         max_steps: truncates an episode, environment steps; None leaves it to the environment's own horizon.
@@ -79,7 +80,11 @@ def rollout_episodes(
     pending = [seed for seed in seeds if seed not in finished]
     if pending:
         count = min(num_envs, len(pending))
-        with closing(_Rollout(actor, make_env, pending, count, max_steps, policy_device)) as rollout:
+        # TorchRL's batched environments raise PyTorch's thread count when they close: put the caller's back.
+        with (
+            num_threads(None),
+            closing(_Rollout(actor, make_env, pending, count, max_steps, policy_device)) as rollout,
+        ):
             for episode in rollout.episodes():
                 finished[episode.seed] = episode
                 if log is not None:
