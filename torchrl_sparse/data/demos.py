@@ -20,12 +20,14 @@ import torch
 from torchrl_sparse import keys
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
-from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task, get_task
 
-_EXPERT_STREAM = 1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
+_EXPERT_STREAM = (
+    1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
+)
 
 
 @dataclass(frozen=True)
@@ -151,11 +153,26 @@ def collect(
         tally = _add(tally, part, kept, collection.keep_failures)
         if on_episode is not None:
             on_episode(tally)
-        _check_yield(tally)
+        if not collection.keep_failures:
+            _check_yield(tally)
     made_in = env_args(get_task(collection.task))
     merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
     shutil.rmtree(parts)
     return tally
+
+
+def read_initial_state(path: str | Path, index: int) -> InitialState:
+    """How one demonstration started: ``env.reset(initial_state=...)`` begins there again.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        KeyError: if the file has no demonstration of that number.
+    """
+    with h5py.File(path, "r") as file:
+        demo = file[f"data/demo_{index}"]
+        return InitialState(
+            str(demo.attrs["model_file"]), np.asarray(demo["states"][0]), int(demo.attrs["seed"])
+        )
 
 
 def env_args(task: Task) -> dict[str, Any]:
@@ -208,9 +225,13 @@ def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:
 
 
 def _same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    different = [f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]]
+    different = [
+        f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]
+    ]
     if different:
-        raise ValueError(f"{where} was collected with other settings ({'; '.join(different)}): move it or choose another file")
+        raise ValueError(
+            f"{where} was collected with other settings ({'; '.join(different)}): move it or choose another file"
+        )
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:

@@ -28,17 +28,24 @@ class Hand:
     Attributes:
         position: f64 [3] of the grip site, m, world frame.
         rotation: f64 [3, 3] of the grip site.
+        velocity: f64 [3] of the grip site, m/s.
         opening: distance between the fingers, m: 0.08 fully open, 0 closed.
     """
 
     position: np.ndarray
     rotation: np.ndarray
+    velocity: np.ndarray
     opening: float
 
     @property
     def yaw(self) -> float:
         """Turn about the vertical relative to `DOWNWARD`, rad in (-pi, pi]."""
         return float(np.arctan2(-self.rotation[0, 0], self.rotation[1, 0]))
+
+    @property
+    def tilt(self) -> float:
+        """Angle to pointing straight down, rad."""
+        return float(np.arccos(np.clip(-self.rotation[2, 2], -1.0, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,8 @@ class Expert(ABC):
     Examples:
         >>> env = RobosuiteEnv("Lift", seeds=[0])
         >>> _ = env.reset()
+        >>> rng = np.random.default_rng(0)
+        >>> style = draw_operator("proficient", rng).draw(rng)
         >>> make_expert("Lift", env.sim_env, style).command().shape
         (7,)
     """
@@ -91,7 +100,12 @@ class Expert(ABC):
         robot = self.sim_env.robots[arm]
         site = robot.eef_site_id["right"]
         left, right = data.qpos[robot._ref_gripper_joint_pos_indexes["right"]]
-        return Hand(data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3).copy(), float(left - right))
+        return Hand(
+            position=data.site_xpos[site].copy(),
+            rotation=data.site_xmat[site].reshape(3, 3).copy(),
+            velocity=data.get_site_xvelp(robot.gripper["right"].important_sites["grip_site"]),
+            opening=float(left - right),
+        )
 
     def body(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Position f64 [3] and rotation f64 [3, 3] of a body."""

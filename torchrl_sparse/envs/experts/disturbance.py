@@ -51,13 +51,17 @@ class Disturbance:
             f64 [7 * arms].
         """
         arms = clean.reshape(-1, POSE_DIM).copy()
-        self._noise = _MEMORY * self._noise + np.sqrt(1 - _MEMORY**2) * self._rng.standard_normal(self._noise.shape)
+        self._noise = _MEMORY * self._noise + np.sqrt(1 - _MEMORY**2) * self._rng.standard_normal(
+            self._noise.shape
+        )
         calm = np.clip(np.linalg.norm(arms[:, :3] - present, axis=-1, keepdims=True) / _CALM, 0.25, 1.0)
         if self._pausing():
             arms[:, :3] = present
         size = self._operator.noise * calm
         arms[:, :3] += size * self._noise[:, :3] + self._bumped()
-        turned = Rotation.from_rotvec(size * _RAD_PER_M * self._noise[:, 3:]) * Rotation.from_rotvec(arms[:, 3:6])
+        turned = Rotation.from_rotvec(size * _RAD_PER_M * self._noise[:, 3:]) * Rotation.from_rotvec(
+            arms[:, 3:6]
+        )
         arms[:, 3:6] = turned.as_rotvec()
         arms[0, 6] = self._slipped(arms[0, 6])
         self._steps += 1

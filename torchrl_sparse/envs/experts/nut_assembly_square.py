@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,18 +11,20 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 
 _HANDLE = np.array([0.056, 0.0, 0.004])  # m, where to grasp, in the nut's frame
 _HANDLE_WIDTH = 0.032  # m
-_HANDLE_YAWS = (np.pi / 2, np.pi, -np.pi / 2)  # on the peg; with the handle away from the robot the arm runs out of reach
-_YAW_LIMITS = (-1.6, 3.4)  # rad, what the last joint reaches, with a margin
-_STRETCH = 1.5  # rad of turning that are worth having the handle towards the robot, within easy reach
+_PLACED_YAW = np.pi  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
+_YAW_LIMITS = (-1.1, 3.4)  # rad, the hand's yaws that the last joint reaches, with a margin
 _PEG_TOP = 0.95  # m
 _ABOVE_PEG = 0.975  # m, the nut's height in travel
 _INSERTED = 0.85  # m, the nut's height aimed at; success is below 0.87
 _FIT = 0.005  # m, misalignment at which the nut may go down; the play is 0.0067
 _LOOSE = 0.012  # m, misalignment that is put up with once the nut is around the peg
+_FORESIGHT = 0.1  # s, how far ahead misalignment is looked at: a nut in motion is not lowered
+_BACK = 0.12  # m short of the peg where turns are finished and a stretched arm recovers
+_JAMMED = 0.15  # rad of tilt at which a nut around the peg is taken off again
 
 
 class NutAssemblySquareExpert(Expert):
-    """Chooses, of two grasps and three turns on the peg, the pair that turns the wrist least."""
+    """Chooses, of the two grasps across the handle, the one that turns the wrist less in all."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -31,7 +32,7 @@ class NutAssemblySquareExpert(Expert):
         handle = nut + rotation @ _HANDLE
         if np.linalg.norm(hand.position - handle) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.004:
             return [self._carry(hand, nut, rotation)]
-        yaw = self._grasp_yaw(_yaw(rotation))
+        yaw = grasp_yaw(_yaw(rotation))
         grasp = handle + self.style.offset * rotation[:, 0]
         if at(hand, grasp, downward(yaw), position=0.01):
             return [Waypoint(grasp, downward(yaw), CLOSED)]
@@ -46,41 +47,53 @@ class NutAssemblySquareExpert(Expert):
     def _peg(self) -> np.ndarray:
         return self.sim_env.sim.data.body_xpos[self.sim_env.peg1_body_id]
 
-    @staticmethod
-    def _grasp_yaw(nut_yaw: float) -> float:
-        """The fingers move along the nut's y axis: hand and nut have the same yaw, or opposite ones."""
-        grasps = [_unwrapped(nut_yaw), _unwrapped(nut_yaw + np.pi)]
-        pairs = [(g, t) for g, t in product(grasps, _turns(nut_yaw)) if _reachable(g) and _reachable(g + t)]
-        return min(pairs, key=lambda pair: abs(pair[0]) + _cost(nut_yaw, pair[1]))[0]
-
     def _carry(self, hand: Hand, nut: np.ndarray, rotation: np.ndarray) -> Waypoint:
         yaw = _yaw(rotation)
-        turns = [turn for turn in _turns(yaw) if _reachable(_unwrapped(hand.yaw) + turn)]
-        turn = min(turns or _turns(yaw), key=lambda turn: _cost(yaw, turn))
-        upright = Rotation.from_euler("z", yaw + _part(turn)).as_matrix()
+        turn = _turn_left(_unwrapped(hand.yaw), yaw)
+        error = self._misalignment(hand, nut) + 0.03 * abs(turn)
+        around = nut[2] < _PEG_TOP - 0.01 and error < 0.03
+        lifted = 1.0 if around else np.clip((nut[2] - 0.93) / 0.04, 0.0, 1.0)
+        goal = nut + lifted * (self._place(hand, nut, turn, around) - nut)
+        goal[2] = self._height(hand, error, around)
+        upright = Rotation.from_euler("z", yaw + lifted * _part(turn)).as_matrix()
         correction = upright @ rotation.T
-        peg = self._peg[:2]
-        error = float(np.linalg.norm(nut[:2] - peg)) + 0.03 * abs(turn)
-        fit = _LOOSE if nut[2] < _PEG_TOP - 0.01 else _FIT
-        height = np.clip(_INSERTED + 20.0 * max(0.0, error - fit), _INSERTED, _ABOVE_PEG)
-        free = np.clip((nut[2] - 0.02 - _PEG_TOP + 0.04) / 0.04, 0.0, 1.0) if error > 0.03 else 1.0
-        goal = np.array([*(nut[:2] + free * (peg - nut[:2])), height])
         return Waypoint(goal + correction @ (hand.position - nut), correction @ hand.rotation, CLOSED)
 
+    def _misalignment(self, hand: Hand, nut: np.ndarray) -> float:
+        """Horizontal distance of the nut to the peg, m, now or in a moment, whichever is larger."""
+        now = nut[:2] - self._peg[:2]
+        return float(max(np.linalg.norm(now), np.linalg.norm(now + _FORESIGHT * hand.velocity[:2])))
 
-def _turns(nut_yaw: float) -> list[float]:
-    """Turns that bring the nut into one of its yaws on the peg, either way round."""
-    turns = [nearest(yaw - nut_yaw, 0.0, 2 * np.pi) for yaw in _HANDLE_YAWS]
-    return [*turns, *(turn - np.sign(turn) * 2 * np.pi for turn in turns)]
+    def _place(self, hand: Hand, nut: np.ndarray, turn: float, around: bool) -> np.ndarray:
+        """Over the peg, or short of it while there is much to turn or the stretched arm tilts the hand."""
+        tilted = hand.tilt > 0.1 and np.linalg.norm(nut[:2] - self._peg[:2]) < 0.08
+        waiting = 0.0 if around else max(np.clip(abs(turn) / 0.5 - 0.2, 0.0, 1.0), float(tilted))
+        return np.array([self._peg[0] - waiting * _BACK, self._peg[1], nut[2]])
+
+    @staticmethod
+    def _height(hand: Hand, error: float, around: bool) -> float:
+        if hand.tilt > _JAMMED:
+            return _ABOVE_PEG
+        over = max(0.0, error - (_LOOSE if around else _FIT))
+        return float(np.clip(_INSERTED + 20.0 * over, _INSERTED, _ABOVE_PEG))
 
 
-def _cost(nut_yaw: float, turn: float) -> float:
-    towards_robot = np.cos(nut_yaw + turn) < -0.5
-    return abs(turn) + (0.0 if towards_robot else _STRETCH)
+def grasp_yaw(nut_yaw: float) -> float:
+    """The hand's yaw for grasping, rad: the fingers move along the nut's y axis, so it is the nut's or the opposite one."""
+    grasps = [_unwrapped(nut_yaw), _unwrapped(nut_yaw + np.pi)]
+    pairs = [(grasp, _turn_left(grasp, nut_yaw)) for grasp in grasps if _reachable(grasp)]
+    return min(pairs, key=lambda pair: abs(pair[0]) + abs(pair[1]))[0]
+
+
+def _turn_left(hand_yaw: float, nut_yaw: float) -> float:
+    """The turn that brings the nut into its yaw on the peg, the way round that keeps the hand within reach, rad."""
+    turn = nearest(_PLACED_YAW - nut_yaw, 0.0, 2 * np.pi)
+    ways = [turn, turn - np.sign(turn) * 2 * np.pi]
+    return min(ways, key=lambda way: (not _reachable(hand_yaw + way), abs(way)))
 
 
 def _part(turn: float) -> float:
-    """The beginning of a turn: of a whole one beyond pi, the shorter way round would be taken, out of the joint's range."""
+    """The beginning of a turn, since the shorter way round would be taken of one beyond pi."""
     return float(np.clip(turn, -1.0, 1.0))
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
@@ -157,14 +157,8 @@ class PolicyTrainer:
 
     def save(self, path: str | Path) -> None:
         """Writes a checkpoint. A kill leaves the old file or the new one, never a part of one."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".tmp")
-        with open(temporary, "wb") as file:
-            torch.save(self._state(), file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with atomic_path(Path(path)) as temporary:
+            torch.save(self._state(), temporary)
 
     def load(self, path: str | Path) -> None:
         """Continues from a checkpoint. Nothing in the file is executed.

@@ -1,0 +1,132 @@
+"""Trains a diffusion policy; interrupt it at any moment and run it again to go on, bit by bit as if it had not stopped.
+
+    python recipes/train_policy.py demos=data/lift_proficient.h5 out=runs/lift max_steps=20000 batch_size=128
+
+``out/policy`` is the policy with averaged weights, for `DiffusionPolicy.from_pretrained`, renewed at each checkpoint.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.record.loggers import Logger, get_logger
+from tqdm import tqdm
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.training import PolicyTrainer, TrainConfig
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+
+@hydra.main(version_base=None, config_path=".", config_name="train_policy")
+def main(config: DictConfig) -> None:
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    trainer = make_trainer(config)
+    out = Path(config.out)
+    if (out / "checkpoint.pt").exists():
+        trainer.load(out / "checkpoint.pt")
+        print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
+    stop = StopSignal()
+    train(trainer, config, make_logger(config), stop)
+    save(trainer, out)
+    how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
+    print(f"{out / 'policy'}: step {trainer.step} of {trainer.config.max_steps}, {how}")
+
+
+def make_trainer(config: DictConfig) -> PolicyTrainer:
+    """Reads the demonstrations and builds an untrained network that fits them."""
+    demos = read_demos(config.demos, get_task(config.task).state_keys)
+    state, action = demos.data[keys.STATE], demos.data[keys.ACTION]
+    normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization).to(config.device)
+    torch.manual_seed(config.seed)
+    network = TransformerForDiffusion(
+        input_dim=action.shape[-1], output_dim=action.shape[-1], cond_dim=state.shape[-1], **config.network
+    ).to(config.device)
+    trainer = PolicyTrainer(network, normalizer, demos, TrainConfig(**config.train))
+    print(
+        f"{config.demos}: {len(demos)} demonstrations, {len(state)} steps, {len(trainer.train_rows)} training windows; "
+        f"{sum(p.numel() for p in network.parameters()):,} parameters"
+    )
+    return trainer
+
+
+def train(trainer: PolicyTrainer, config: DictConfig, logger: Logger, stop: StopSignal) -> None:
+    """Steps until the end or a signal, logging, evaluating and saving on the way."""
+    total, losses, last = trainer.config.max_steps, [], time.perf_counter()
+    with tqdm(total=total, initial=trainer.step, unit="step", mininterval=2) as bar:
+        while trainer.step < total and stop.name is None:
+            losses.append(trainer.train_step())
+            bar.update()
+            if trainer.step % config.log_every == 0:
+                now = time.perf_counter()
+                metrics = {"train/loss": sum(losses) / len(losses), "train/lr": trainer.lr}
+                metrics["train/seconds_per_step"] = (now - last) / len(losses)
+                bar.set_postfix(loss=f"{metrics['train/loss']:.4f}")
+                logger.log_metrics(metrics, step=trainer.step)
+                losses, last = [], now
+            if trainer.step % config.checkpoint_every == 0:
+                save(trainer, Path(config.out))
+                logger.log_metrics({"val/loss": trainer.validate()}, step=trainer.step)
+            if config.eval_every and trainer.step % config.eval_every == 0:
+                evaluate(trainer, config, logger)
+
+
+def save(trainer: PolicyTrainer, out: Path) -> None:
+    trainer.save(out / "checkpoint.pt")
+    DiffusionPolicy(trainer.ema_network(), trainer.normalizer).save_pretrained(out / "policy")
+
+
+def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None:
+    """Logs the success rate of the averaged weights on episodes that no demonstration was made from."""
+    if importlib.util.find_spec("robosuite") is None:
+        return
+    from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.envs.transforms import make_env
+    from torchrl_sparse.evaluation.paired import rollout_episodes
+
+    schedule = NoiseSchedule("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else NoiseSchedule()
+    policy = DiffusionPolicy(trainer.ema_network(), trainer.normalizer, schedule=schedule)
+    episodes = rollout_episodes(
+        ChunkExecutor(policy, trainer.config.n_action_steps),
+        partial(make_env, get_task(config.task).name, n_obs_steps=policy.n_obs_steps),
+        range(config.eval_seed, config.eval_seed + config.eval_episodes),
+        num_envs=min(5, config.eval_episodes),
+        policy_device=config.device,
+    )
+    rate = sum(episode.success for episode in episodes) / len(episodes)
+    tqdm.write(f"step {trainer.step}: success rate {rate:.2f} of {len(episodes)} episodes")
+    logger.log_metrics({"eval/success": rate}, step=trainer.step)
+
+
+def make_logger(config: DictConfig) -> Logger:
+    wandb = {"project": "torchrl_sparse", "mode": config.wandb_mode, "config": OmegaConf.to_container(config, resolve=True)}
+    return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
+
+
+class StopSignal:
+    """Remembers the first SIGINT or SIGTERM, so that the step in progress can be finished and saved; a second one kills."""
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def _note(self, number: int, _frame: object) -> None:
+        self.name = signal.Signals(number).name
+        for each, handler in self._previous.items():
+            signal.signal(each, handler)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""Collecting demonstrations: layout, labels, and survival of a kill at any moment."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from torchrl_sparse import keys
+from torchrl_sparse.data import demos
+from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_initial_state
+from torchrl_sparse.data.hdf5_writer import Episode
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.rotations import pose_to_absolute
+from torchrl_sparse.envs.tasks import get_task
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "collect_demos.py"
+THREE = Collection("Lift", episodes=3, seed=50)
+
+
+@pytest.fixture(scope="module")
+def env():
+    made = RobosuiteEnv("Lift")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def collected(env, tmp_path_factory):
+    path = tmp_path_factory.mktemp("demos") / "lift.h5"
+    return path, collect(path, THREE, env=env)
+
+
+class Interrupted(Exception):
+    pass
+
+
+class FakeExpert:
+    """Quick episodes in place of the simulator's; counts how often each seed was demonstrated."""
+
+    def __init__(self, fails=()):
+        self.seeds, self.fails = [], fails
+
+    def __call__(self, env, seed, quality="proficient"):
+        self.seeds.append(seed)
+        length = 3 + seed % 4
+        arrays = np.random.default_rng(seed).standard_normal((length, 7))
+        flags = np.zeros(length)
+        flags[-1] = success = seed not in self.fails
+        observations = {"object": arrays[:, :2]}
+        return Episode(
+            seed,
+            "fake",
+            success,
+            "<xml/>",
+            arrays,
+            arrays,
+            arrays,
+            flags,
+            flags.astype(np.int64),
+            observations,
+        )
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    expert = FakeExpert(fails={3, 5})
+    monkeypatch.setattr(demos, "demonstrate", expert)
+    monkeypatch.setattr(demos, "RobosuiteEnv", lambda task: None)
+    return expert
+
+
+def test_layout_is_the_documented_one(collected):
+    path, summary = collected
+    with h5py.File(path) as file:
+        data = file["data"]
+        assert sorted(data) == ["demo_0", "demo_1", "demo_2"]
+        assert data.attrs["total"] == sum(demo.attrs["num_samples"] for demo in data.values())
+        args = json.loads(data.attrs["env_args"])
+        assert (args["env_name"], args["env_version"], args["type"]) == ("Lift", "1.5.2", 1)
+        assert args["env_kwargs"]["controller_configs"]["body_parts"]["right"]["input_type"] == "absolute"
+        for index, demo in enumerate(data.values()):
+            steps = demo.attrs["num_samples"]
+            assert (demo.attrs["seed"], demo.attrs["operator"]) == (50 + index, "proficient")
+            assert demo["actions"].shape == demo["executed_actions"].shape == (steps, 7)
+            assert demo["states"].shape == (steps, 32)
+            assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == [0] * (steps - 1) + [1]
+            assert set(demo["obs"]) == set(get_task("Lift").state_keys)
+    assert (summary.attempts, summary.successes, summary.kept) == (3, 3, 3)
+    assert str(summary).startswith("successes/attempts 3/3, kept 3, mean length ")
+
+
+def test_the_reader_reads_it(collected):
+    read = read_demos(collected[0], get_task("Lift").state_keys)
+    assert len(read) == 3
+    assert read.data[keys.STATE].shape[1:] == (19,)
+
+
+def test_labels_are_clean_and_executed_actions_are_not(collected, env):
+    path, _ = collected
+    with h5py.File(path) as file:
+        demo = file["data/demo_0"]
+        clean, executed, hand = (
+            demo["actions"][()],
+            demo["executed_actions"][()],
+            demo["obs/robot0_eef_pos"][()],
+        )
+    offset = np.linalg.norm(executed[:, :3] - clean[:, :3], axis=1)
+    assert (offset > 0).all()
+    assert offset.mean() < 0.03
+    assert (np.linalg.norm(clean[:, :3] - hand, axis=1) < 0.085).all()
+
+
+def test_executed_actions_replay_to_the_same_states(collected, env):
+    path, _ = collected
+    with h5py.File(path) as file:
+        demo = file["data/demo_1"]
+        states, executed = demo["states"][()], demo["executed_actions"][()]
+    td = env.reset(initial_state=read_initial_state(path, 1))
+    for state, command in zip(states, executed, strict=True):
+        np.testing.assert_allclose(env.sim_env.sim.get_state().flatten(), state, atol=1e-5)
+        td[keys.ACTION] = torch.as_tensor(pose_to_absolute(command), dtype=torch.float32)
+        td = env.step(td)["next"]
+    assert td[keys.SUCCESS]
+
+
+def test_an_episode_is_fixed_by_its_seed_alone(collected, env):
+    again = demonstrate(env, seed=50)  # after other episodes in the same environment
+    with h5py.File(collected[0]) as file:
+        np.testing.assert_array_equal(file["data/demo_0/actions"], again.actions)
+        np.testing.assert_array_equal(file["data/demo_0/states"], again.states)
+
+
+def test_kill_9_and_run_again_gives_the_same_bytes(collected, tmp_path):
+    path = tmp_path / "lift.h5"
+    command = [sys.executable, RECIPE, "task=Lift", "episodes=3", "seed=50", f"out={path}"]
+    environment = {**os.environ, "PYTHONPATH": str(RECIPE.parents[1]), "OMP_NUM_THREADS": "1"}
+    running = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    first = tmp_path / "lift.h5.parts" / "0000000050.h5"
+    deadline = time.monotonic() + 120
+    while not first.exists() and time.monotonic() < deadline and running.poll() is None:
+        time.sleep(0.02)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    assert first.exists()
+    assert not path.exists()
+    committed = first.stat().st_mtime_ns
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
+    assert "successes/attempts 3/3" in done.stdout
+    assert first.parent.exists() is False
+    assert committed
+    assert path.read_bytes() == collected[0].read_bytes()
+
+
+def test_resumes_after_every_episode_with_nothing_lost_or_double(fake, tmp_path):
+    whole = tmp_path / "whole.h5"
+    collect(whole, Collection("Lift", episodes=6))
+    assert fake.seeds == [0, 1, 2, 3, 4, 5, 6, 7]  # 3 and 5 fail
+    for stop in range(1, 9):
+        fake.seeds.clear()
+        path = tmp_path / f"stopped_{stop}.h5"
+
+        def interrupt(tally, stop=stop):
+            if tally.attempts == stop:
+                raise Interrupted
+
+        with pytest.raises(Interrupted):
+            collect(path, Collection("Lift", episodes=6), on_episode=interrupt)
+        assert not path.exists()
+        summary = collect(path, Collection("Lift", episodes=6))
+        assert fake.seeds == [0, 1, 2, 3, 4, 5, 6, 7]
+        assert (summary.attempts, summary.successes) == (8, 6)
+        assert path.read_bytes() == whole.read_bytes()
+
+
+def test_half_written_files_are_written_anew(fake, tmp_path):
+    path, parts = tmp_path / "a.h5", tmp_path / "a.h5.parts"
+    whole = tmp_path / "whole.h5"
+    collect(whole, Collection("Lift", episodes=2))
+    parts.mkdir()
+    (parts / "settings.json").write_text(json.dumps(demos.asdict(Collection("Lift", episodes=2))))
+    (parts / "0000000000.h5.tmp").write_bytes(b"cut off")
+    (tmp_path / "a.h5.tmp").write_bytes(b"cut off")
+    collect(path, Collection("Lift", episodes=2))
+    assert path.read_bytes() == whole.read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "whole.h5"]
+
+
+def test_failures_are_kept_when_asked_for(fake, tmp_path):
+    path = tmp_path / "all.h5"
+    summary = collect(path, Collection("Lift", episodes=6, keep_failures=True))
+    assert (summary.attempts, summary.successes, summary.kept) == (6, 4, 6)
+    with h5py.File(path) as file:
+        success = [bool(file[f"data/demo_{i}"].attrs["success"]) for i in range(6)]
+    assert success == [True, True, True, False, True, False]
+
+
+def test_a_finished_file_is_reported_not_made_again(fake, tmp_path):
+    path = tmp_path / "a.h5"
+    first = collect(path, Collection("Lift", episodes=2))
+    fake.seeds.clear()
+    assert collect(path, Collection("Lift", episodes=2)) == first
+    assert fake.seeds == []
+
+
+def test_other_settings_never_mix(fake, tmp_path):
+    finished, stopped = tmp_path / "finished.h5", tmp_path / "stopped.h5"
+    collect(finished, Collection("Lift", episodes=2))
+
+    def interrupt(tally):
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        collect(stopped, Collection("Lift", episodes=2), on_episode=interrupt)
+    for path in (finished, stopped):
+        with pytest.raises(ValueError, match="quality is 'proficient', not 'mixed'"):
+            collect(path, Collection("Lift", episodes=2, quality="mixed"))
+
+
+def test_a_file_of_other_origin_is_refused(tmp_path):
+    path = tmp_path / "human.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("data")
+    with pytest.raises(ValueError, match=r"human\.h5 .*other settings"):
+        collect(path, THREE)
+
+
+def test_an_expert_that_keeps_failing_stops_the_collection(monkeypatch, tmp_path, fake):
+    fake.fails = range(100)
+    with pytest.raises(RuntimeError, match="0/20"):
+        collect(tmp_path / "a.h5", Collection("Lift", episodes=2))
+
+
+@pytest.mark.parametrize(("field", "value"), [("episodes", 0), ("seed", -1)])
+def test_out_of_range_options_are_named(tmp_path, field, value):
+    with pytest.raises(ValueError, match=field):
+        collect(tmp_path / "a.h5", Collection(**{"task": "Lift", "episodes": 1, field: value}))
