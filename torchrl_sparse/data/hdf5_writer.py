@@ -1,20 +1,20 @@
 """Writing demonstrations in robomimic's HDF5 layout, one episode at a time and safely.
 
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 in the file                   shape, type            meaning
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 ``data`` attributes           ``env_args`` json,     how the environment was made; number of samples of all
                               ``total`` int          demonstrations; ``collection`` json, how they were made
 ``data/demo_<i>`` attributes  int, str, bool         ``num_samples``, ``model_file`` (MuJoCo xml), ``seed``,
                                                      ``operator``, ``success``
-``states``                    f64 [T, S]             simulator state before each action; the first restores the
-                                                     episode's start
-``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m; rotation
-                                                     vector, rad; gripper, -1 open to 1 closed
+``states``                    f64 [T, S]             simulator state before each action; the first restores
+                                                     the episode's start
+``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m;
+                                                     rotation vector, rad; gripper, -1 open to 1 closed
 ``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
 ``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
 ``obs/<key>``                 f64 [T, n]             observations before each action
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _fill(group: h5py.Group, episode: Episode) -> None:
 
 
 class _replacing:
-    """A temporary neighbour of ``path`` that takes its place, durably, when the block ends without an error."""
+    """A temporary neighbour of ``path`` that takes its place when the block ends without an error."""
 
     def __init__(self, path: Path):
         self._path = path

@@ -1,7 +1,8 @@
-"""The skeleton of a scripted expert: where the hand is, where it should go next, and one clipped step towards it.
+"""The skeleton of a scripted expert: where the hand is, where it should go, and one clipped step towards it.
 
-An expert decides from what a policy can observe too (poses, finger opening), not from clocks or remembered phases: its labels
-are then a function of the state, and it recovers by itself when something goes wrong. Only the operator's `Style` is hidden.
+An expert decides from what a policy can observe too (poses, finger opening, motion), not from clocks or
+remembered phases: its labels are then a function of the state, and it recovers by itself when something goes
+wrong. Only the operator's `Style` is hidden.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torchrl_sparse.envs.experts.operators import Style
 
 OPEN, CLOSED = -1.0, 1.0
 DOWNWARD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""The grip site of a Panda that points straight down; its fingers move along its x axis, here the world's y axis."""
+"""A Panda's grip site that points straight down; its fingers move along its x axis, here the world's y."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Expert(ABC):
     """A scripted expert for one episode of one robosuite environment.
 
     Args:
-        sim_env: robosuite's environment under absolute world-frame poses, just reset (``RobosuiteEnv(...).sim_env``).
+        sim_env: robosuite's environment under absolute world-frame poses (``RobosuiteEnv(...).sim_env``).
         style: the operator's draw for this episode.
 
     Examples:
@@ -92,7 +93,7 @@ class Expert(ABC):
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
         return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
 
-    # -- what an expert sees -------------------------------------------------------------------------------------------
+    # -- what an expert sees ----------------------------------------------------------------------
 
     def hand(self, arm: int = 0) -> Hand:
         """The hand of one arm."""
@@ -113,10 +114,10 @@ class Expert(ABC):
         index = self.sim_env.sim.model.body_name2id(name)
         return data.body_xpos[index].copy(), data.body_xmat[index].reshape(3, 3).copy()
 
-    # -- skills --------------------------------------------------------------------------------------------------------
+    # -- skills -----------------------------------------------------------------------------------
 
     def above(self, hand: Hand, goal: np.ndarray, clearance: float | None = None) -> np.ndarray:
-        """f64 [3] the next point of a funnel that ends in ``goal``: height and sideways bow shrink with the distance left."""
+        """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left."""
         clearance = self.style.hover if clearance is None else clearance
         away = goal[:2] - hand.position[:2]
         distance = float(np.linalg.norm(away))

@@ -11,7 +11,9 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 
 _HANDLE = np.array([0.056, 0.0, 0.004])  # m, where to grasp, in the nut's frame
 _HANDLE_WIDTH = 0.032  # m
-_PLACED_YAW = np.pi  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
+_PLACED_YAW = (
+    np.pi
+)  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
 _YAW_LIMITS = (-1.1, 3.4)  # rad, the hand's yaws that the last joint reaches, with a margin
 _PEG_TOP = 0.95  # m
 _ABOVE_PEG = 0.975  # m, the nut's height in travel
@@ -79,14 +81,14 @@ class NutAssemblySquareExpert(Expert):
 
 
 def grasp_yaw(nut_yaw: float) -> float:
-    """The hand's yaw for grasping, rad: the fingers move along the nut's y axis, so it is the nut's or the opposite one."""
+    """The hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis."""
     grasps = [_unwrapped(nut_yaw), _unwrapped(nut_yaw + np.pi)]
     pairs = [(grasp, _turn_left(grasp, nut_yaw)) for grasp in grasps if _reachable(grasp)]
     return min(pairs, key=lambda pair: abs(pair[0]) + abs(pair[1]))[0]
 
 
 def _turn_left(hand_yaw: float, nut_yaw: float) -> float:
-    """The turn that brings the nut into its yaw on the peg, the way round that keeps the hand within reach, rad."""
+    """The turn that brings the nut into its yaw on the peg, round the way that the hand can reach, rad."""
     turn = nearest(_PLACED_YAW - nut_yaw, 0.0, 2 * np.pi)
     ways = [turn, turn - np.sign(turn) * 2 * np.pi]
     return min(ways, key=lambda way: (not _reachable(hand_yaw + way), abs(way)))

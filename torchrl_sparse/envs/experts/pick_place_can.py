@@ -46,7 +46,7 @@ class PickPlaceCanExpert(Expert):
         if abs(axis[2]) > 0.7:
             aligned = downward(0.0)
             return can + np.array([0.0, 0.0, 0.012]) + self.style.offset * aligned[:, 1], aligned
-        # The fingers' axis is the world's y axis at yaw 0; across a lying can it is square to the can's own axis.
+        # Fingers move along the world's y axis at yaw 0; across a lying can, square to the can's own axis.
         aligned = downward(nearest(np.arctan2(axis[1], axis[0]), hand.yaw, np.pi))
         return can + self.style.offset * aligned[:, 1], aligned
 
