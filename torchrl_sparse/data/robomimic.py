@@ -66,7 +66,8 @@ class Demonstrations:
         windows = []
         for index in range(len(self)) if episodes is None else episodes:
             first, last = int(self.starts[index]), int(self.starts[index + 1]) - 1
-            begin = torch.arange(first - (n_obs_steps - 1), last + 1 - horizon + n_action_steps)
+            earliest, end = first - (n_obs_steps - 1), last + 1 - horizon + n_action_steps
+            begin = torch.arange(earliest, max(earliest, end))
             windows.append((begin[:, None] + torch.arange(horizon)).clamp(first, last))
         rows = torch.cat(windows) if windows else torch.empty(0, horizon, dtype=torch.int64)
         if not len(rows):
@@ -104,8 +105,8 @@ def read_demos(path: str | Path, state_keys: Sequence[str]) -> Demonstrations:
         ValueError: if the file is truncated or malformed; the message names file, demonstration and dataset.
 
     Examples:
-        >>> demos = read_demos("data/lift.h5", get_task("Lift").state_keys)
-        >>> demos.data["action"].shape[1], len(demos)
+        >>> demos = read_demos("data/lift.h5", get_task("Lift").state_keys)  # doctest: +SKIP
+        >>> demos.data["action"].shape[1], len(demos)  # doctest: +SKIP
         (10, 200)
     """
     path = Path(path)

@@ -11,7 +11,7 @@ SIZES = {"input_dim": 10, "output_dim": 10, "horizon": 6, "n_obs_steps": 2, "con
 
 @pytest.fixture
 def make_network():
-    """A tiny network, the same in every call, whose weights are far enough from zero for every part to matter."""
+    """A tiny network, the same in every call; its weights are large enough for every part to matter."""
 
     def make(**changes) -> TransformerForDiffusion:
         torch.manual_seed(0)
@@ -33,4 +33,6 @@ def demos():
         keys.STATE: torch.randn(steps, 5, generator=generator).cumsum(0) / 10,
         keys.ACTION: torch.rand(steps, 10, generator=generator) * 2 - 1,
     }
-    return Demonstrations(TensorDict(data, [steps]), torch.cat([torch.zeros(1, dtype=torch.int64), lengths.cumsum(0)]))
+    return Demonstrations(
+        TensorDict(data, [steps]), torch.cat([torch.zeros(1, dtype=torch.int64), lengths.cumsum(0)])
+    )

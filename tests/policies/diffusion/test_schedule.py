@@ -81,7 +81,7 @@ def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match=r"in 1\.\.100 .*got 101"):
         NoiseSchedule("ddim", 101)
     schedule, sample = NoiseSchedule(), torch.zeros(SHAPE)
-    with pytest.raises(ValueError, match="k=3 .*needs noise_k"):
+    with pytest.raises(ValueError, match=r"k=3 .*needs noise_k"):
         schedule.step(sample, 3, sample)
     with pytest.raises(IndexError, match=r"0\.\.99, got 100"):
         schedule.step(sample, 100, sample)

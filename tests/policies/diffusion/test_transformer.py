@@ -42,7 +42,9 @@ def test_lift_has_the_published_number_of_parameters():
 
 
 def test_state_dict_has_the_published_names_and_shapes():
-    shapes = {name: tuple(value.shape) for name, value in TransformerForDiffusion(**LIFT).state_dict().items()}
+    shapes = {
+        name: tuple(value.shape) for name, value in TransformerForDiffusion(**LIFT).state_dict().items()
+    }
     expected = {
         "pos_emb": (1, 10, 256),
         "cond_pos_emb": (1, 3, 256),
@@ -59,7 +61,7 @@ def test_state_dict_has_the_published_names_and_shapes():
         "head.weight": (10, 256),
     }
     assert expected.items() <= shapes.items()
-    # Published low-dim policies have 175 tensors: these 158, two masks, three dummies and twelve of the normaliser.
+    # Published low-dim policies have 175: these 158, two masks, three dummies and twelve of the normaliser.
     assert len(shapes) == 158
 
 
