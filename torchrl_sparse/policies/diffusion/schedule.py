@@ -37,6 +37,7 @@ class NoiseSchedule:
         >>> schedule = NoiseSchedule("ddim", num_inference_steps=10)
         >>> schedule.timesteps.tolist()
         [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]
+        >>> import torch
         >>> sample = torch.zeros(1, 10, 7)
         >>> schedule.step(torch.zeros_like(sample), 0, sample).shape
         torch.Size([1, 10, 7])
