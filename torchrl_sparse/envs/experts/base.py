@@ -51,11 +51,19 @@ class Hand:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where a hand should be next: position f64 [3] in m, rotation f64 [3, 3], fingers `OPEN` or `CLOSED`."""
+    """Where a hand should be next.
+
+    Attributes:
+        position: f64 [3] of the grip site, m.
+        rotation: f64 [3, 3] of the grip site.
+        gripper: `OPEN` or `CLOSED`.
+        pace: share of the operator's usual speed.
+    """
 
     position: np.ndarray
     rotation: np.ndarray
     gripper: float
+    pace: float = 1.0
 
 
 class Expert(ABC):
@@ -88,8 +96,9 @@ class Expert(ABC):
         return np.concatenate([self._step_towards(hand, waypoint) for hand, waypoint in pairs])
 
     def _step_towards(self, hand: Hand, waypoint: Waypoint) -> np.ndarray:
-        step = _clip(waypoint.position - hand.position, self.style.reach)
-        turn = _clip(Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec(), self.style.turn)
+        left = Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec()
+        step = _clip(waypoint.position - hand.position, waypoint.pace * self.style.reach)
+        turn = _clip(left, waypoint.pace * self.style.turn)
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
         return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
 
@@ -116,12 +125,21 @@ class Expert(ABC):
 
     # -- skills -----------------------------------------------------------------------------------
 
-    def above(self, hand: Hand, goal: np.ndarray, clearance: float | None = None) -> np.ndarray:
-        """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left."""
+    def above(
+        self, hand: Hand, goal: np.ndarray, *, clearance: float | None = None, turn: float = 0.0
+    ) -> np.ndarray:
+        """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
+
+        Args:
+            hand: where the hand is.
+            goal: f64 [3] where it should go, m.
+            clearance: height of the funnel, m; the operator's ``hover`` by default.
+            turn: rad that the hand still has to turn before it may go down.
+        """
         clearance = self.style.hover if clearance is None else clearance
         away = goal[:2] - hand.position[:2]
         distance = float(np.linalg.norm(away))
-        height = min(clearance, self.style.slope * max(0.0, distance - 0.01))
+        height = min(clearance, self.style.slope * max(0.0, distance + 0.05 * abs(turn) - 0.01))
         sideways = np.array([-away[1], away[0]]) / max(distance, 1e-6)
         bow = self.style.bow * np.clip((distance - 0.03) / 0.05, 0.0, 1.0)
         return goal + np.array([*(bow * sideways), height])
