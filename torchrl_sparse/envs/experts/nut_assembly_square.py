@@ -85,7 +85,7 @@ class NutAssemblySquareExpert(Expert):
 def grasp_yaw(nut_yaw: float, hand_yaw: float) -> float:
     """The hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis.
 
-    Where the nuts lie, the forearm is nearly vertical and yaws far from 0 bring the wrist near its singularity:
+    Where the nuts lie, the forearm is nearly vertical, and yaws far from 0 make the wrist almost singular:
     they cost twice. The hand's present yaw keeps a choice once it is made.
     """
     grasps = [_unwrapped(nut_yaw), _unwrapped(nut_yaw + np.pi)]
