@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name)
     policy = DiffusionPolicy.from_pretrained(config.policy)
-    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps)
+    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
 
     @cache
     def calibration():
@@ -100,6 +100,7 @@ def evaluate(
     mask = policy.plan.mask(policy.plan.spec)
     identity = {
         "task": config.task,
+        "horizon": config.horizon,
         "method": name,
         "policy": policy.fingerprint,
         "sampler": policy.schedule.config,

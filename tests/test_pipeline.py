@@ -9,7 +9,16 @@ from torchrl.collectors import AsyncBatchedCollector, Collector, Evaluator, Mult
 from torchrl.envs import SerialEnv
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_sparse import ChunkExecutor, DiffusionPolicy, NoiseSchedule, Normalizer, Planner, TransformerForDiffusion, keys, make_env
+from torchrl_sparse import (
+    ChunkExecutor,
+    DiffusionPolicy,
+    NoiseSchedule,
+    Normalizer,
+    Planner,
+    TransformerForDiffusion,
+    keys,
+    make_env,
+)
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 
 N_ACTION_STEPS = 4
@@ -94,7 +103,11 @@ def test_collector_of_a_batch_of_environments():
 
 def test_multi_sync_collector():
     collector = MultiSyncCollector(
-        [partial(env, 3), partial(env, 4)], actor(), cat_results="stack", auto_register_policy_transforms=True, **OPTIONS
+        [partial(env, 3), partial(env, 4)],
+        actor(),
+        cat_results="stack",
+        auto_register_policy_transforms=True,
+        **OPTIONS,
     )
     batch = first_batch(collector)
     for steps in batch.reshape(-1, 8):

@@ -29,6 +29,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # some writers make files that only their owner can read
         os.replace(temporary, path)
     except BaseException:
         with suppress(FileNotFoundError):

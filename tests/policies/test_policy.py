@@ -48,7 +48,9 @@ def test_plans_that_prune_nothing_are_bit_exactly_dense(policy, plan):
 def test_rows_with_different_masks_equal_the_rows_alone(policy):
     class Alternate(Planner):
         def masks(self, cond):
-            mask = torch.zeros(len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool)
+            mask = torch.zeros(
+                len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool
+            )
             mask[cond[:, 0, 0] > 0, 1::2] = True
             return mask
 
@@ -97,7 +99,9 @@ def test_keys_are_declared(policy):
 
 
 def test_bad_observations_are_named(policy):
-    with pytest.raises(ValueError, match=r"expected \[\*B, n_obs_steps, state\] = \[\*B, 2, 5\], got \[3, 2, 6\]"):
+    with pytest.raises(
+        ValueError, match=r"expected \[\*B, n_obs_steps, state\] = \[\*B, 2, 5\], got \[3, 2, 6\]"
+    ):
         policy(TensorDict({keys.HISTORY_STATE: torch.zeros(3, 2, 6)}, [3]))
     td = request(3)
     td[keys.HISTORY_STATE][1, 0, 2] = float("nan")

@@ -6,8 +6,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from torchrl_sparse import DiffusionPolicy, keys
 from tests.policies.test_policy import request
+from torchrl_sparse import DiffusionPolicy, keys
 
 
 @pytest.fixture
@@ -44,7 +44,10 @@ TENSOR_FAULTS = {
     "missing": (lambda t: t.pop("network.head.bias"), r"missing \['head.bias'\]"),
     "extra": (lambda t: t.update({"network.more": torch.zeros(1)}), r"unexpected \['more'\]"),
     "foreign": (lambda t: t.update({"optimizer": torch.zeros(1)}), r"got \['optimizer'\]"),
-    "shape": (lambda t: t.update({"network.head.bias": torch.zeros(9)}), r"expected shape \(4,\), got \(9,\)"),
+    "shape": (
+        lambda t: t.update({"network.head.bias": torch.zeros(9)}),
+        r"expected shape \(4,\), got \(9,\)",
+    ),
     "nan": (lambda t: t.update({"network.head.bias": torch.full((4,), float("nan"))}), "finite"),
     "normalizer": (lambda t: t.pop("normalizer.state_scale"), r"missing \['state_scale'\]"),
 }
@@ -59,7 +62,10 @@ def test_wrong_tensors_are_named(folder, fault):
 
 
 CONFIG_FAULTS = {
-    "format": (lambda c: c.update(format="other/1"), "format: expected 'torchrl_sparse.diffusion_policy/1', got 'other/1'"),
+    "format": (
+        lambda c: c.update(format="other/1"),
+        "format: expected 'torchrl_sparse.diffusion_policy/1', got 'other/1'",
+    ),
     "field": (lambda c: c.pop("schedule"), "expected the fields"),
     "unknown argument": (lambda c: c["network"].update(n_experts=3), "n_experts"),
     "size": (lambda c: c["network"].update(n_emb=30), "n_emb must be a multiple of n_head"),

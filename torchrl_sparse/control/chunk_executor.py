@@ -49,7 +49,9 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def in_keys(self):
-        return _unique([keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys])
+        return _unique(
+            [keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys]
+        )
 
     @property
     def out_keys(self):
