@@ -13,7 +13,7 @@ _WALLS = 0.92  # m, the can's height from which it may travel sideways
 _CARRY = 0.13  # m over the place of release
 _PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
 _RELEASE = (
-    0.12  # m over the bin's floor, the can's height when let go; its lower half is then below the walls' top
+    0.12  # m over the bin's floor, the can's height when let go: its lower half is below the walls' top
 )
 
 
