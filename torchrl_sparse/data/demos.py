@@ -24,6 +24,7 @@ from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task, get_task
+from torchrl_sparse.files import atomic_path
 
 _EXPERT_STREAM = (
     1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
@@ -210,9 +211,8 @@ def _claim(parts: Path, settings: Mapping[str, Any]) -> None:
     parts.mkdir(parents=True, exist_ok=True)
     note = parts / "settings.json"
     if not note.exists():
-        temporary = note.with_suffix(".tmp")
-        temporary.write_text(json.dumps(settings, indent=1))
-        temporary.replace(note)
+        with atomic_path(note) as temporary:
+            temporary.write_text(json.dumps(settings, indent=1))
     _same(note, json.loads(note.read_text()), settings)
 
 

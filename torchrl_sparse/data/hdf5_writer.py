@@ -20,7 +20,6 @@ in the file                   shape, type            meaning
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+
+from torchrl_sparse.files import atomic_path
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Episode:
 
 def write_episode(path: Path, episode: Episode) -> None:
     """Writes one episode as a file of its own. A kill leaves either the whole file or none."""
-    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         _fill(file.create_group("demo"), episode)
 
 
@@ -68,7 +69,7 @@ def merge_episodes(
 
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
-    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         data = file.create_group("data")
         total = 0
         for index, part in enumerate(parts):
@@ -90,23 +91,3 @@ def _fill(group: h5py.Group, episode: Episode) -> None:
         group[name] = getattr(episode, name)
     for key, value in episode.observations.items():
         group[f"obs/{key}"] = value
-
-
-class _replacing:
-    """A temporary neighbour of ``path`` that takes its place when the block ends without an error."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._temporary = path.with_name(path.name + ".tmp")
-
-    def __enter__(self) -> Path:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        return self._temporary
-
-    def __exit__(self, error_type: type | None, *_: object) -> None:
-        if error_type is not None:
-            self._temporary.unlink(missing_ok=True)
-            return
-        with open(self._temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(self._temporary, self._path)
