@@ -28,10 +28,13 @@ class ChunkExecutor(TensorDictModuleBase):
         ValueError: if a chunk is shorter than ``n_action_steps``.
 
     Examples:
-        >>> actor = ChunkExecutor(policy, n_action_steps=8)  # doctest: +SKIP
-        >>> rollout = make_env("Lift").rollout(16, actor)  # doctest: +SKIP
-        >>> rollout["control", "queried"].sum()  # doctest: +SKIP
-        tensor(2)
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> policy = TensorDictModule(lambda x: x.new_ones(2, 4, 7), in_keys=["x"], out_keys=[keys.CHUNK])
+        >>> actor = ChunkExecutor(policy, n_action_steps=4)
+        >>> td = actor(TensorDict({"x": torch.zeros(2, 1), "is_init": torch.ones(2, 1, dtype=torch.bool)}, [2]))
+        >>> td["action"].shape, td["control", "queried"].all().item()
+        (torch.Size([2, 7]), True)
     """
 
     def __init__(

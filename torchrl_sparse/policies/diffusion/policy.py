@@ -46,7 +46,9 @@ class DiffusionPolicy(TensorDictSequential):
         schedule: the sampler. Assign another to change it: ``policy.schedule = NoiseSchedule("ddim", 10)``.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> policy.schedule = NoiseSchedule("ddim", 10)
         >>> td = policy(TensorDict({"history": {"state": torch.zeros(4, 2, 19)}}, [4]))
         >>> td["vla_action", "chunk"].shape
         torch.Size([4, 9, 10])
