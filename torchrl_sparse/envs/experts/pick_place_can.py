@@ -12,9 +12,7 @@ _WIDTH = 0.05  # m, the can's diameter
 _WALLS = 0.92  # m, the can's height from which it may travel sideways
 _CARRY = 0.13  # m over the place of release
 _PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
-_RELEASE = (
-    0.12  # m over the bin's floor, the can's height when let go: its lower half is below the walls' top
-)
+_RELEASE = 0.12  # m over the bin's floor, the can's height when let go: half of it below the walls' top
 
 
 class PickPlaceCanExpert(Expert):
