@@ -74,6 +74,8 @@ class Expert(ABC):
         style: the operator's draw for this episode.
 
     Examples:
+        >>> from torchrl_sparse.envs.experts import draw_operator, make_expert
+        >>> from torchrl_sparse.envs.robosuite import RobosuiteEnv
         >>> env = RobosuiteEnv("Lift", seeds=[0])
         >>> _ = env.reset()
         >>> rng = np.random.default_rng(0)
