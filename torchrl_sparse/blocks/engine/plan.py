@@ -1,17 +1,18 @@
 """From a prune mask to a program: what an engine executes for one query, known before its loop starts.
 
-A denoising step of a program is a short list of operations on the residual stream ``x``. Pruned blocks come in runs, and a
-run adds a sum of vectors that are already there, so it is one operation however long it is:
+A denoising step of a program is a short list of operations on the residual stream ``x``. Pruned blocks come in
+runs, and a run adds a sum of vectors that are already there, so it is one operation however long it is:
 
     COMPUTE   first, -     d = block_first(x); latest[first] = d; x = x + d
-    REUSE     first, last  x = x + sum of what the pruned blocks first .. last-1 add (their reuse rule's latest outputs)
-    COLLAPSE  fresh, -     the only operation of a step that computes nothing: eps = head(LN(embed(sample) + c)), where c
-                           is the sum over *all* blocks; fresh = 1 if c must be summed anew, 0 if it is still that of the
-                           latest collapsed step
+    REUSE     first, last  x = x + the sum of what the pruned blocks first .. last-1 add
+    COLLAPSE  fresh, -     the only operation of a step that computes nothing: eps = head(LN(embed(sample) + c)),
+                           c being the sum over *all* blocks; fresh = 1 if c must be summed anew, 0 if it is still
+                           that of the latest collapsed step
 
-Blocks are the columns of the mask, :mod:`torchrl_sparse.blocks.mask` says which. The functions here are pure; engines give
-the operations their arithmetic and look up the reuse rule: with ``"block"``, block b adds ``latest[b]``; with ``"type"`` all
-blocks of a type share one ``latest``, and a run adds it as often as the type occurs in the run (:func:`type_counts`).
+Blocks are the columns of the mask, :mod:`torchrl_sparse.blocks.mask` says which. The functions here are pure;
+engines give the operations their arithmetic and know the reuse rule: with ``"block"``, block b adds
+``latest[b]``; with ``"type"`` all blocks of a type share one ``latest``, and a run adds it as often as the type
+occurs in the run (:func:`type_counts`).
 """
 
 from __future__ import annotations
@@ -21,22 +22,11 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
-__all__ = [
-    "COLLAPSE",
-    "COMPUTE",
-    "REUSE",
-    "Program",
-    "ProgramCache",
-    "build_program",
-    "step_coefficients",
-    "type_counts",
-]
+__all__ = ["COLLAPSE", "COMPUTE", "REUSE", "Program", "ProgramCache", "build_program", "type_counts"]
 
 COMPUTE, REUSE, COLLAPSE = 0, 1, 2
 
@@ -73,7 +63,7 @@ def build_program(mask: Tensor | np.ndarray) -> Program:
             :func:`~torchrl_sparse.blocks.mask.validate_mask`).
 
     Examples:
-        >>> mask = torch.tensor([[0, 0, 0], [1, 1, 0], [1, 1, 1], [1, 1, 1]], dtype=torch.bool)
+        >>> mask = np.array([[0, 0, 0], [1, 1, 0], [1, 1, 1], [1, 1, 1]], dtype=bool)
         >>> program = build_program(mask)
         >>> [program.step(k) for k in range(1, 4)]
         [[(1, 0, 2), (0, 2, 0)], [(2, 1, 0)], [(2, 0, 0)]]
@@ -156,41 +146,3 @@ class ProgramCache:
 
     def __len__(self) -> int:
         return len(self._programs)
-
-
-def step_coefficients(schedule: NoiseSchedule) -> Tensor:
-    """The scheduler as a table: what every denoising step multiplies, f32 [K, 6].
-
-    With the row (b, a, c0, cs, ce, cn) of a step, and ``clip`` the scheduler's ``clip_sample_range``, the next sample is::
-
-        clean = clamp((sample - b * eps) / a, -clip, clip)
-        next  = c0 * clean + cs * sample + ce * eps + cn * noise
-
-    DDPM (arXiv:2006.11239, Eq. 7) has ce = 0, DDIM with eta = 0 (arXiv:2010.02502, Eq. 12) has cs = cn = 0. The coefficients
-    are computed as diffusers does, in float32 and in its order.
-
-    Examples:
-        >>> step_coefficients(NoiseSchedule("ddim", 10)).shape
-        torch.Size([10, 6])
-    """
-    return torch.stack([_coefficients(schedule, int(timestep)) for timestep in schedule.timesteps])
-
-
-def _coefficients(schedule: NoiseSchedule, timestep: int) -> Tensor:
-    scheduler, zero = schedule.scheduler, torch.tensor(0.0)
-    alpha_prod = scheduler.alphas_cumprod[timestep]
-    beta_prod = 1 - alpha_prod
-    head = [beta_prod**0.5, alpha_prod**0.5]
-    if schedule.kind == "ddim":
-        previous = timestep - schedule.num_train_timesteps // schedule.num_inference_steps
-        alpha_prod_prev = (
-            scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.final_alpha_cumprod
-        )
-        return torch.stack([*head, alpha_prod_prev**0.5, zero, (1 - alpha_prod_prev) ** 0.5, zero])
-    previous = scheduler.previous_timestep(timestep)
-    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.one
-    alpha = alpha_prod / alpha_prod_prev
-    clean_coeff = (alpha_prod_prev**0.5 * (1 - alpha)) / beta_prod
-    sample_coeff = alpha**0.5 * (1 - alpha_prod_prev) / beta_prod
-    noise_coeff = scheduler._get_variance(timestep) ** 0.5 if timestep > 0 else zero
-    return torch.stack([*head, clean_coeff, sample_coeff, zero, noise_coeff])
