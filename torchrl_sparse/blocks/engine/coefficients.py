@@ -51,6 +51,17 @@ class StepCoefficients:
         result = result + self.eps_weight[step] * eps
         return result if gaussian is None else result + self.spread[step] * gaussian
 
+    def rows(self) -> list[tuple[float, ...]]:
+        """The five numbers of every step, without ``spread``, as Python floats (float32 values, exactly)."""
+        columns = (
+            self.noise_scale,
+            self.signal_scale,
+            self.clean_weight,
+            self.sample_weight,
+            self.eps_weight,
+        )
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
 
 def step_coefficients(schedule: NoiseSchedule) -> StepCoefficients:
     """Tabulate ``schedule``.
@@ -83,4 +94,6 @@ def step_coefficients(schedule: NoiseSchedule) -> StepCoefficients:
             zeros,
             spread,
         )
-    return StepCoefficients(beta_prod**0.5, alpha_prod**0.5, *weights, clip=scheduler.config.clip_sample_range)
+    return StepCoefficients(
+        beta_prod**0.5, alpha_prod**0.5, *weights, clip=scheduler.config.clip_sample_range
+    )
