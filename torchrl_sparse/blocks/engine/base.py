@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.reference import check_query, denoise
-from torchrl_sparse.blocks.mask import Reuse
+from torchrl_sparse.blocks.engine.costs import time_blocks
+from torchrl_sparse.blocks.engine.reference import denoise
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 
 if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Engine", "ReferenceEngine", "check_query"]
+__all__ = ["Engine", "ReferenceEngine"]
 
 
 class Engine(Protocol):
-    """Runs queries of one network with one schedule; made by :func:`torchrl_sparse.blocks.engine.make_engine`.
+    """Runs queries of one network with one schedule; made by
+    :func:`torchrl_sparse.blocks.engine.make_engine`.
 
-    All but the reference tabulate the weights when they are made: an engine answers for the network as it was then.
+    An engine answers for the weights that its network has when it is asked.
 
     Attributes:
         name: ``"reference"``, ``"torch"`` or ``"native"``.
@@ -32,7 +35,8 @@ class Engine(Protocol):
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
     ) -> Tensor:
-        """Normalised actions f32 [B, H, A], as :func:`torchrl_sparse.blocks.engine.reference.denoise` defines them.
+        """Normalised actions f32 [B, H, A], as :func:`torchrl_sparse.blocks.engine.reference.denoise` defines
+        them.
 
         Args:
             noise: f32 [B, K, H, A], standard normal.
@@ -43,6 +47,10 @@ class Engine(Protocol):
         Raises:
             ValueError: naming what was expected and what came.
         """
+        ...
+
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """Measured seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``, batch 1."""
         ...
 
 
@@ -65,3 +73,16 @@ class ReferenceEngine:
     ) -> Tensor:
         """See :meth:`Engine.denoise`; gradients flow."""
         return denoise(self._network, self._schedule, noise, cond, mask, reuse=reuse)
+
+    @torch.no_grad()
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """See :meth:`Engine.block_seconds`."""
+        network, like = self._network, self._network.pos_emb
+        x = network.embed(like.new_zeros(1, network.horizon, network.input_dim))
+        memory = network.memory(0, like.new_zeros(1, network.n_obs_steps, network.cond_dim))
+
+        def walk(kind: int) -> None:
+            for block in range(kind, network.num_blocks, len(BLOCK_TYPES)):
+                network.block(block, x, memory)
+
+        return time_blocks(walk, network.n_layer, repeats, like.device)

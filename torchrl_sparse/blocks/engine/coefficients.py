@@ -1,4 +1,4 @@
-"""The scheduler as five numbers for each denoising step, so that an engine needs no scheduler inside its loop.
+"""The scheduler as five numbers for each denoising step, for loops without a scheduler.
 
 With ``clip`` to [-1, 1], both samplers are one update, in diffusers' order of operations::
 
@@ -30,7 +30,8 @@ class StepCoefficients:
     Attributes:
         noise_scale: sqrt(1 - abar_t).
         signal_scale: sqrt(abar_t).
-        clean_weight, sample_weight, eps_weight: of the clipped prediction, of the sample, of the predicted noise.
+        clean_weight, sample_weight, eps_weight: of the clipped prediction, of the sample, of the predicted
+            noise.
         spread: standard deviation of the noise that is added; 0 in the last step.
         clip: largest absolute value of a clean action.
     """
@@ -44,23 +45,23 @@ class StepCoefficients:
     clip: float
 
     def update(self, step: int, sample: Tensor, eps: Tensor, gaussian: Tensor | None) -> Tensor:
-        """The sample after denoising step ``step``, as ``NoiseSchedule.step`` computes it (any shape, all alike)."""
+        """The sample after denoising step ``step``, to the last bit that of ``NoiseSchedule.step``.
+
+        Args:
+            step: in execution order.
+            sample, eps: of one shape.
+            gaussian: of the same shape; not read by DDIM, None in the last step.
+        """
         clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
         clean = clean.clamp(-self.clip, self.clip)
         result = self.clean_weight[step] * clean + self.sample_weight[step] * sample
         result = result + self.eps_weight[step] * eps
         return result if gaussian is None else result + self.spread[step] * gaussian
 
-    def rows(self) -> list[tuple[float, ...]]:
-        """The five numbers of every step, without ``spread``, as Python floats (float32 values, exactly)."""
-        columns = (
-            self.noise_scale,
-            self.signal_scale,
-            self.clean_weight,
-            self.sample_weight,
-            self.eps_weight,
-        )
-        return list(zip(*(column.tolist() for column in columns), strict=True))
+    def columns(self) -> tuple[list[float], ...]:
+        """The first five fields as Python floats, which hold their float32 values exactly."""
+        fields = (self.noise_scale, self.signal_scale, self.clean_weight, self.sample_weight, self.eps_weight)
+        return tuple(field.tolist() for field in fields)
 
 
 def step_coefficients(schedule: NoiseSchedule) -> StepCoefficients:
@@ -69,7 +70,7 @@ def step_coefficients(schedule: NoiseSchedule) -> StepCoefficients:
     Examples:
         >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
         >>> coefficients = step_coefficients(NoiseSchedule("ddim", 10))
-        >>> coefficients.clean_weight[-1].item(), coefficients.eps_weight[-1].item()  # ends on the clean actions
+        >>> coefficients.clean_weight[-1].item(), coefficients.eps_weight[-1].item()
         (1.0, 0.0)
     """
     scheduler = schedule.scheduler

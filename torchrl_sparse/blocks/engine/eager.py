@@ -1,7 +1,8 @@
 """The eager baseline: a query as the published implementation of Diffusion Policy runs it.
 
-``torch.nn.TransformerDecoder`` and a diffusers scheduler that draws its own noise, step by step (arXiv:2303.04137,
-``DiffusionTransformerLowdimPolicy``). Speed-ups are quoted against it; nothing else uses it.
+``torch.nn.TransformerDecoder`` and a diffusers scheduler that draws its own noise, step by step
+(arXiv:2303.04137, ``DiffusionTransformerLowdimPolicy``). Speed-ups are quoted against it; nothing else uses
+it.
 """
 
 from __future__ import annotations
@@ -69,8 +70,9 @@ class EagerBaseline:
         Args:
             sample: initial noise f32 [B, H, A].
             cond: encoded observations f32 [B, To, D].
-            mask: bool [K, 3L], one for the whole batch, True = pruned, row 0 all False: blocks are skipped by an ``if`` around each
-                and reuse their own latest output, as caching methods are commonly published. None runs the decoder.
+            mask: bool [K, 3L], one for the whole batch, True = pruned, row 0 all False: blocks are skipped by
+                an ``if`` around each and reuse their own latest output, as caching methods are commonly
+                published. None runs the decoder.
             generator: of the noise that the scheduler adds.
         """
         extra = {} if self._is_ddim() else {"generator": generator}

@@ -1,13 +1,15 @@
 """Exact algebra that takes work out of the denoising loop.
 
-Cross-attention reads only 1 + To memory tokens, so its big matrices can be multiplied into those tokens before the loop. With
-``q = W_q x + b_q``, ``k_s = W_k m_s + b_k`` and ``v_s = W_v m_s + b_v``, head h scores token s with::
+Cross-attention reads only 1 + To memory tokens, so its big matrices can be multiplied into those tokens
+before the loop. With ``q = W_q x + b_q``, ``k_s = W_k m_s + b_k`` and ``v_s = W_v m_s + b_v``, head h scores
+token s with::
 
     q_h · k_hs / sqrt(d_h) = x · (W_qh' k_hs) / sqrt(d_h) + b_qh · k_hs / sqrt(d_h) = x · key_hs + bias_hs
 
-and the block adds ``b_o + sum_hs p_hs W_oh v_hs = b_o + sum_hs p_hs value_hs``: what is left inside the loop are two products
-with n_head * (1 + To) vectors, instead of two with d x d matrices. The time token of a denoising step depends on nothing else
-(without condition layers the condition encoder works token by token), so it is encoded and folded once per network.
+and the block adds ``b_o + sum_hs p_hs W_oh v_hs = b_o + sum_hs p_hs value_hs``: what is left inside the loop
+are two products with n_head * (1 + To) vectors, instead of two with d x d matrices. The time token of a
+denoising step depends on nothing else (without condition layers the condition encoder works token by token),
+so it is encoded and folded once per network.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.blocks.engine.linear import make_linear
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["ConditionEncoder", "CrossAttentionFold", "FoldedMemory"]
@@ -58,25 +61,23 @@ class CrossAttentionFold:
         bias = torch.stack([a.in_proj_bias for a in attention]).detach()
         output = torch.stack([a.out_proj.weight for a in attention]).detach()
         by_head = (len(attention), heads, size, width)
-        w_query, w_key, w_value = weight.chunk(3, dim=1)
-        b_query, b_key, b_value = bias.chunk(3, dim=1)
         # Scores are scaled by 1 / sqrt(d_h); scaling the query side scales keys and biases alike.
-        self._query = (w_query * size**-0.5).reshape(by_head)
-        self._query_bias = (b_query * size**-0.5).reshape(*by_head[:3], 1)
-        self._key, self._key_bias = w_key.reshape(by_head), b_key.reshape(*by_head[:2], 1, size)
-        self._value, self._value_bias = w_value.reshape(by_head), b_value.reshape(*by_head[:2], 1, size)
+        self._query = (weight[:, :width] * size**-0.5).reshape(by_head)
+        self._query_bias = (bias[:, :width] * size**-0.5).reshape(*by_head[:3], 1)
+        self._project = make_linear(weight[:, width:].flatten(0, 1), bias[:, width:].flatten())
         self._output = output.reshape(len(attention), width, heads, size).permute(0, 2, 3, 1).contiguous()
 
     def __call__(self, tokens: Tensor) -> FoldedMemory:
         """Fold encoded memory ``tokens`` [N, d]."""
-        key = tokens @ self._key.mT + self._key_bias  # [L, n_head, N, d_h]
-        value = tokens @ self._value.mT + self._value_bias
+        layers, heads, size, _ = self._query.shape
+        projected = self._project(tokens).view(-1, layers, 2, heads, size)
+        key, value = projected.permute(2, 1, 3, 0, 4)  # [L, n_head, N, d_h] each
         vectors = torch.stack([key @ self._query, value @ self._output], dim=1)
         return FoldedMemory(vectors.transpose(2, 3), (key @ self._query_bias).squeeze(-1).transpose(1, 2))
 
 
 class ConditionEncoder:
-    """Memory tokens of all denoising steps of a query, each encoded once; a snapshot of the network's weights.
+    """Memory tokens of all denoising steps, each encoded once; a snapshot of the network's weights.
 
     Args:
         network: the denoiser.
@@ -100,7 +101,7 @@ class ConditionEncoder:
         return self._encoder(self._time)
 
     def observation_tokens(self, cond: Tensor) -> Tensor:
-        """The encoded observation tokens [B, To, d] of a separable encoder, for ``cond`` [B, To, cond_dim]."""
+        """The encoded observation tokens [B, To, d] of a separable encoder; ``cond`` is [B, To, cond_dim]."""
         return self._encoder(self._observations(cond))
 
     def memory(self, cond: Tensor) -> Tensor:

@@ -146,8 +146,8 @@ def check_query(
     scheduler: NoiseSchedule,
     noise: Tensor,
     cond: Tensor,
-    mask: Tensor | None,
-    reuse: str,
+    mask: Tensor | None = None,
+    reuse: str = "block",
 ) -> None:
     """Refuse what no engine can run; the arguments are those of :func:`denoise`.
 

@@ -13,42 +13,15 @@ from torch.nn import functional as F
 
 from torchrl_sparse.blocks.engine.coefficients import step_coefficients
 from torchrl_sparse.blocks.engine.folding import ConditionEncoder, CrossAttentionFold
+from torchrl_sparse.blocks.engine.linear import make_linear, transposed
 from torchrl_sparse.blocks.engine.plan import type_counts
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["CrossAttention", "FeedForward", "SelfAttention", "Tables", "can_pack", "make_linear", "make_norm"]
+__all__ = ["CrossAttention", "FeedForward", "SelfAttention", "Tables"]
 
 
-def make_linear(weight: Tensor, bias: Tensor, gelu: bool = False) -> Callable[[Tensor], Tensor]:
-    """``x [N, in] -> [N, out]``, with GELU behind it if asked for.
-
-    Ten rows leave PyTorch's general matrix product at a half of the speed that the weights could be read with. oneDNN's product
-    on weights that were laid out for it in advance (what Inductor emits for a CPU) gets closer.
-    """
-    weight, bias = weight.detach(), bias.detach().clone()
-    if can_pack(weight):
-        packed = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous())
-        product = torch.ops.mkldnn._linear_pointwise.default
-        activation, algorithm = ("gelu", "none") if gelu else ("none", "")
-        return lambda x: product(x, packed, bias, activation, [], algorithm)
-    transposed = _transposed(weight)
-    if gelu:
-        return lambda x: F.gelu(torch.addmm(bias, x, transposed))
-    return lambda x: torch.addmm(bias, x, transposed)
-
-
-def can_pack(weight: Tensor) -> bool:
-    """Whether a product with ``weight`` can run on oneDNN's own layout: float32, on a CPU, in a build with oneDNN."""
-    available = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
-    return available and weight.device.type == "cpu" and weight.dtype == torch.float32
-
-
-def _transposed(weight: Tensor) -> Tensor:
-    return weight.t().clone(memory_format=torch.contiguous_format)
-
-
-def make_norm(norm: nn.LayerNorm) -> Callable[[Tensor], Tensor]:
+def _make_norm(norm: nn.LayerNorm) -> Callable[[Tensor], Tensor]:
     """The layer norm ``norm`` as a function, without a module around it."""
     shape, eps = norm.normalized_shape, norm.eps
     weight, bias = norm.weight.detach().clone(), norm.bias.detach().clone()
@@ -66,7 +39,7 @@ class SelfAttention:
     def __init__(self, network: TransformerForDiffusion, index: int) -> None:
         layer = network.decoder.layers[index]
         attention = layer.self_attn
-        self._norm = make_norm(layer.norm1)
+        self._norm = _make_norm(layer.norm1)
         self._project = make_linear(attention.in_proj_weight, attention.in_proj_bias)
         self._output = make_linear(attention.out_proj.weight, attention.out_proj.bias)
         self._shape = (-1, network.horizon, 3, network.n_head, network.n_emb // network.n_head)
@@ -89,7 +62,7 @@ class CrossAttention:
 
     def __init__(self, network: TransformerForDiffusion, index: int) -> None:
         layer = network.decoder.layers[index]
-        self._norm = make_norm(layer.norm2)
+        self._norm = _make_norm(layer.norm2)
         self._bias = layer.multihead_attn.out_proj.bias.detach().clone()
         self._tokens = (network.horizon, network.n_emb)
         self._scores = (network.horizon, 1 + network.n_obs_steps, network.n_head)
@@ -119,7 +92,7 @@ class FeedForward:
 
     def __init__(self, network: TransformerForDiffusion, index: int) -> None:
         layer = network.decoder.layers[index]
-        self._norm = make_norm(layer.norm3)
+        self._norm = _make_norm(layer.norm3)
         self._inner = make_linear(layer.linear1.weight, layer.linear1.bias, gelu=True)
         self._outer = make_linear(layer.linear2.weight, layer.linear2.bias)
 
@@ -139,13 +112,14 @@ class Tables:
     def __init__(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> None:
         self.device = network.pos_emb.device
         self.horizon, self.width = network.horizon, network.n_emb
+        self.cond_shape = (network.n_obs_steps, network.cond_dim)
         self.num_layers, self.num_blocks, self.num_heads = network.n_layer, network.num_blocks, network.n_head
         kinds = (SelfAttention, CrossAttention, FeedForward)
         self.blocks = [kinds[b % 3](network, b // 3) for b in range(network.num_blocks)]
-        self.norm = make_norm(network.ln_f)
-        self.stem_weight = _transposed(network.input_emb.weight)
+        self.norm = _make_norm(network.ln_f)
+        self.stem_weight = transposed(network.input_emb.weight)
         self.stem_bias = network.input_emb.bias + network.pos_emb[0]
-        self.head_weight = _transposed(network.head.weight)
+        self.head_weight = transposed(network.head.weight)
         self.head_bias = network.head.bias.clone()
         self.memory_mask = None if network.memory_mask is None else network.memory_mask.clone()
         self.fold = CrossAttentionFold(network)
@@ -153,7 +127,9 @@ class Tables:
         self.time = self.fold(self.encoder.time_tokens()) if self.encoder.separable else None
         coefficients = step_coefficients(schedule)
         self.clip, self.spread = coefficients.clip, coefficients.spread.to(self.stem_weight)
-        self.updates = coefficients.rows()
+        rows = zip(*coefficients.columns(), strict=True)
+        # A division by a Python number would first make a tensor of it, in every step.
+        self.updates = [(a, torch.tensor(b).to(self.spread), c, d, e) for a, b, c, d, e in rows]
         self.counts = _count_table(self.num_blocks, self.stem_weight)
 
 

@@ -1,22 +1,27 @@
 """The PyTorch engine: the reference's results in a fraction of its time, on a CPU or a GPU.
 
-What does not change within a query is done before its loop: time tokens are encoded and folded once per network, observations
-once per query, cross-attention reads folded memory (:mod:`torchrl_sparse.blocks.engine.folding`), the scheduler is a table,
-and a mask becomes a program (:mod:`torchrl_sparse.blocks.engine.plan`), built once per distinct mask.
+What does not change within a query is done before its loop: time tokens are encoded and folded once per
+network, observations once per query, cross-attention reads folded memory
+(:mod:`torchrl_sparse.blocks.engine.folding`), the scheduler is a table, and a mask becomes a program
+(:mod:`torchrl_sparse.blocks.engine.plan`), built once per distinct mask.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_sparse.blocks.engine.costs import time_blocks
 from torchrl_sparse.blocks.engine.graphs import GraphedQuery
+from torchrl_sparse.blocks.engine.linear import can_pack
 from torchrl_sparse.blocks.engine.reference import check_query
-from torchrl_sparse.blocks.engine.torch_blocks import Tables, can_pack
-from torchrl_sparse.blocks.engine.torch_loop import build_loop, run_loop
+from torchrl_sparse.blocks.engine.torch_blocks import Tables
+from torchrl_sparse.blocks.engine.torch_loop import build_loop, make_walk, run_loop
+from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse
 
 if TYPE_CHECKING:
@@ -27,10 +32,14 @@ __all__ = ["TorchEngine"]
 
 
 class TorchEngine:
-    """Runs programs in PyTorch; a snapshot of the network's weights. Safe to share between threads.
+    """Runs programs in PyTorch. Not differentiable; safe to share between threads.
 
-    Rows of a batch that compute a block are gathered, the block runs on them alone, its results are scattered; where every row
-    agrees, as with one mask for all, nothing is. On a CUDA device a dense query replays one CUDA graph.
+    The engine tabulates the network's weights, and does so again when it finds them changed
+    (:class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). Dropout is never applied.
+
+    Rows of a batch that compute a block are gathered, the block runs on them alone, its results are
+    scattered; where every row agrees, as with one mask for all, nothing is. On a CUDA device a dense query
+    replays one CUDA graph.
 
     Args:
         network: the denoiser, on any device; float32 is what it is made for, float64 works.
@@ -53,17 +62,17 @@ class TorchEngine:
 
     name = "torch"
 
-    @torch.inference_mode()
     def __init__(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> None:
         self._network, self._schedule = network, schedule
-        self.tables = Tables(network, schedule)
-        self._graphs = GraphedQuery(self._dense) if self.tables.device.type == "cuda" else None
+        self._watch = WeightWatch(network)
+        self._known: tuple = (None, None, None)
+        self._current()
 
     @property
     def detail(self) -> str:
-        device = self.tables.device.type
-        packed = can_pack(self.tables.stem_weight)
-        return f"{device}, {'oneDNN on packed weights' if packed else 'general matrix products'}"
+        weight = self._network.head.weight
+        packed = "oneDNN on packed weights" if can_pack(weight) else "general matrix products"
+        return f"{weight.device.type}, {packed}"
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
@@ -74,14 +83,32 @@ class TorchEngine:
             actions = self._denoise(noise, cond, mask, reuse)
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
+    @torch.inference_mode()
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """See :meth:`torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
+        tables = self._current()[0]
+        return time_blocks(make_walk(tables), tables.num_layers, repeats, tables.device)
+
+    def _current(self) -> tuple[Tables, GraphedQuery | None]:
+        """Tables of the present weights, and the CUDA graphs made with them."""
+        state = self._watch.state()
+        known, tables, graphs = self._known  # read and replaced in one go: other threads may do the same
+        if known != state:
+            with torch.inference_mode():
+                tables = Tables(self._network, self._schedule)
+            graphs = GraphedQuery(partial(self._dense, tables)) if tables.device.type == "cuda" else None
+            self._known = state, tables, graphs
+        return tables, graphs
+
     def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
+        tables, graphs = self._current()
         host = None if mask is None else mask.cpu().numpy()
         if host is None or not host.any():
-            return self._dense(noise, cond) if self._graphs is None else self._graphs(noise, cond)
+            return self._dense(tables, noise, cond) if graphs is None else graphs(noise, cond)
         if (host == host[0]).all():
             host = host[:1]
-        return run_loop(self.tables, build_loop(host, self.tables.device), noise, cond, reuse)
+        return run_loop(tables, build_loop(host, tables.device), noise, cond, reuse)
 
-    def _dense(self, noise: Tensor, cond: Tensor) -> Tensor:
+    def _dense(self, tables: Tables, noise: Tensor, cond: Tensor) -> Tensor:
         nothing = np.zeros((1, self._schedule.num_inference_steps, self._network.num_blocks), bool)
-        return run_loop(self.tables, build_loop(nothing, self.tables.device), noise, cond, reuse=None)
+        return run_loop(tables, build_loop(nothing, tables.device), noise, cond, "block")

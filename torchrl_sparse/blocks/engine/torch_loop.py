@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 if TYPE_CHECKING:
     from torchrl_sparse.blocks.engine.torch_blocks import Tables
 
-__all__ = ["Loop", "build_loop", "run_loop"]
+__all__ = ["Loop", "build_loop", "make_walk", "run_loop"]
 
 _CA = BLOCK_TYPES.index("CA")
 
@@ -28,8 +29,8 @@ class Loop:
 
     Attributes:
         steps: for each denoising step its operations (operation, first, last, rows), see
-            :mod:`torchrl_sparse.blocks.engine.plan`; ``rows`` i64 names the rows of the batch that compute a block, None means
-            all.
+            :mod:`torchrl_sparse.blocks.engine.plan`; ``rows`` i64 names the rows of the batch that compute a
+            block, None means all.
         attends: for each denoising step, whether it computes cross-attention anywhere.
         dense: nothing is ever reused.
     """
@@ -76,6 +77,19 @@ def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.de
 def run_loop(tables: Tables, loop: Loop, noise: Tensor, cond: Tensor, reuse: Reuse) -> Tensor:
     """Actions [B, H, A] of one query; all its memory is allocated here, not in its steps."""
     return _Query(tables, loop, noise, cond, reuse).run()
+
+
+def make_walk(tables: Tables) -> Callable[[int], None]:
+    """A function to be timed, which runs the SA (0), CA (1) or FFN (2) blocks of all layers, batch 1."""
+    memory = _Memory(tables, tables.stem_weight.new_zeros(1, *tables.cond_shape))
+    memory.set_step(0)
+    x = tables.stem_bias
+
+    def walk(kind: int) -> None:
+        for layer, block in enumerate(tables.blocks[kind :: len(BLOCK_TYPES)]):
+            block(x, *(memory.by_layer[layer] if kind == _CA else ()))
+
+    return walk
 
 
 class _Memory:
@@ -185,7 +199,7 @@ class _Query:
         return self._slots[block % len(self._slots)]
 
     def _add_reused(self, x: Tensor, first: int, last: int) -> None:
-        """Add to ``x`` what the pruned blocks ``first .. last-1`` add, as one product of a matrix and a vector."""
+        """Add to ``x`` what the pruned blocks ``first .. last-1`` add: one matrix times one vector."""
         if self._by_type:
             x.view(-1).addmv_(self._latest.mT, self._tables.counts[first][last])
         else:
@@ -195,18 +209,16 @@ class _Query:
         """Take the scheduler's step, in place (:meth:`StepCoefficients.update` says what it computes)."""
         noise_scale, signal_scale, clean_weight, sample_weight, eps_weight = self._tables.updates[step]
         sample, clip = self._sample, self._tables.clip
-        clean = (
-            torch.sub(sample, eps, alpha=noise_scale, out=self._clean).div_(signal_scale).clamp_(-clip, clip)
-        )
-        sample.mul_(sample_weight).add_(clean, alpha=clean_weight)
+        clean = torch.sub(sample, eps, alpha=noise_scale, out=self._clean)
+        clean.div_(signal_scale).clamp_(-clip, clip)
+        torch.add(self._gaussians[step], sample, alpha=sample_weight, out=sample)
+        sample.add_(clean, alpha=clean_weight)
         if eps_weight:
             sample.add_(eps, alpha=eps_weight)
-        if step < len(self._gaussians):
-            sample.add_(self._gaussians[step])
 
 
 def _scaled_gaussians(noise: Tensor, spread: Tensor) -> tuple[Tensor, ...]:
-    """What each step but the last adds, [B * H, A]; nothing for a sampler that adds no noise."""
-    if not spread.any():
-        return ()
-    return (noise[:, 1:].transpose(0, 1).flatten(1, 2) * spread[:-1, None, None]).unbind(0)
+    """What each of the K steps adds, [B * H, A]."""
+    # The last step's spread is 0, and there is no gaussian for it: any will do.
+    scaled = noise.roll(-1, dims=1) * spread[:, None, None]
+    return scaled.transpose(0, 1).flatten(1, 2).unbind(0)
