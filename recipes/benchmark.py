@@ -7,6 +7,7 @@ Kill it and run it again to go on: finished episodes are read from OUT/episodes.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -48,7 +49,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name)
     policy = DiffusionPolicy.from_pretrained(config.policy)
-    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps)
+    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
 
     @cache
     def calibration():
@@ -96,10 +97,14 @@ def evaluate(
     name: str, policy: DiffusionPolicy, environment: Callable[..., EnvBase], seeds: range, config: DictConfig
 ) -> list[EpisodeResult]:
     """Closed-loop episodes of one method, read from its log as far as they are there."""
+    mask = policy.plan.mask(policy.plan.spec)
     identity = {
+        "task": config.task,
+        "horizon": config.horizon,
         "method": name,
         "policy": policy.fingerprint,
-        "num_updates": config.num_updates,
+        "sampler": policy.schedule.config,
+        "mask": hashlib.sha256(mask.numpy().tobytes()).hexdigest()[:16],
         "n_action_steps": config.n_action_steps,
     }
     with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
@@ -186,19 +191,21 @@ def film(
 
 
 def follow(name: str, actor: ChunkExecutor, env: EnvBase) -> tuple[list, list[Caption]]:
+    """Frames of one episode, the last one after its last step, and what to write under them."""
     frames, captions = [], []
-    latency = None
 
     def watch(env: EnvBase, step: TensorDictBase) -> None:
-        nonlocal latency
-        queried = bool(step[keys.QUERIED])
-        latency = float(step[keys.LATENCY]) if queried else latency
         frames.append(env.base_env.render("agentview", 320, 320))
-        captions.append(Caption(name, len(captions), queried, latency, bool(step["next", keys.SUCCESS])))
+        queried = bool(step[keys.QUERIED])
+        latency = float(step[keys.LATENCY]) if queried else captions[-1].latency
+        captions.append(Caption(name, len(captions), queried, latency, bool(step[keys.SUCCESS])))
 
     env.base_env.reset()
     env.base_env.render("agentview", 320, 320)  # fails here, before any query, where there is no GL library
-    env.rollout(env.base_env.horizon, actor, callback=watch)
+    steps = env.rollout(env.base_env.horizon, actor, callback=watch)
+    frames.append(env.base_env.render("agentview", 320, 320))
+    solved = bool(steps["next", keys.SUCCESS][-1])
+    captions.append(Caption(name, len(captions), False, captions[-1].latency, solved))
     return frames, captions
 
 

@@ -1,6 +1,6 @@
 """Computes the BAC schedules of a trained policy from one dense query.
 
-    python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
+python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
 """
 
 from __future__ import annotations

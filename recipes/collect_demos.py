@@ -1,10 +1,10 @@
 """Collects scripted demonstrations; kill it at any moment and run it again to go on.
 
-    python recipes/collect_demos.py task=Lift episodes=200 quality=proficient seed=0 out=data/lift_proficient.h5
+    python recipes/collect_demos.py task=Lift episodes=200 quality=proficient out=data/lift_proficient.h5
 
 The last line tells how many of the attempted episodes succeeded. To measure an expert on unseen seeds:
 
-    python recipes/collect_demos.py task=Lift episodes=100 seed=10000 keep_failures=true out=data/lift_unseen.h5
+    python recipes/collect_demos.py task=Lift episodes=100 seed=10000 keep_failures=true out=data/unseen.h5
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Trains a diffusion policy; interrupt it at any moment and run it again to go on, bit by bit as if it had not stopped.
+"""Trains a diffusion policy. Stop it at any moment; the same command goes on, equal to the last bit.
 
     python recipes/train_policy.py demos=data/lift_proficient.h5 out=runs/lift max_steps=20000 batch_size=128
 
-``out/policy`` is the policy with averaged weights, for `DiffusionPolicy.from_pretrained`, renewed at each checkpoint.
+``out/policy``, renewed at each checkpoint, is the policy with averaged weights for
+`DiffusionPolicy.from_pretrained`.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     ).to(config.device)
     trainer = PolicyTrainer(network, normalizer, demos, TrainConfig(**config.train))
     print(
-        f"{config.demos}: {len(demos)} demonstrations, {len(state)} steps, {len(trainer.train_rows)} training windows; "
+        f"{config.demos}: {len(demos)} demonstrations, {len(state)} steps, "
+        f"{len(trainer.train_rows)} training windows; "
         f"{sum(p.numel() for p in network.parameters()):,} parameters"
     )
     return trainer
@@ -111,16 +113,22 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None
 
 
 def make_logger(config: DictConfig) -> Logger:
-    wandb = {"project": "torchrl_sparse", "mode": config.wandb_mode, "config": OmegaConf.to_container(config, resolve=True)}
+    wandb = {
+        "project": "torchrl_sparse",
+        "mode": config.wandb_mode,
+        "config": OmegaConf.to_container(config, resolve=True),
+    }
     return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
 
 
 class StopSignal:
-    """Remembers the first SIGINT or SIGTERM, so that the step in progress can be finished and saved; a second one kills."""
+    """Remembers SIGINT or SIGTERM so that the step in progress is finished and saved; a second one kills."""
 
     def __init__(self) -> None:
         self.name: str | None = None
-        self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._previous = {
+            number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)
+        }
 
     def _note(self, number: int, _frame: object) -> None:
         self.name = signal.Signals(number).name

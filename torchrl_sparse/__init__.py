@@ -1,7 +1,7 @@
 """Sparse, fast robot policies as TensorDictModules for TorchRL.
 
-Importing the package is light: each name below is imported from its module when it is first used, so that what needs a simulator
-costs nothing to those who do not.
+Importing the package is light: each name below is imported from its module when it is first used, so that what
+needs a simulator costs nothing to those who do not.
 """
 
 from importlib import import_module
@@ -32,6 +32,7 @@ _HOME = {
 __all__ = [*_HOME]
 
 if TYPE_CHECKING:
+    from torchrl_sparse.blocks.bac import BAC
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform

@@ -10,7 +10,8 @@ __all__ = ["atomic_path"]
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path beside ``path``, moved onto it when the block ends well and removed when it raises.
+    """A temporary path beside ``path``, moved onto it when the block ends well and removed when it raises; what a kill
+    leaves of it is overwritten by the next try.
 
     The folder is made if it is missing. The temporary file keeps the suffix, since writers choose a format
     by it.
@@ -24,11 +25,12 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # some writers make files that only their owner can read
         os.replace(temporary, path)
     except BaseException:
         with suppress(FileNotFoundError):

@@ -187,8 +187,8 @@ def test_half_written_files_are_written_anew(fake, tmp_path):
     collect(whole, Collection("Lift", episodes=2))
     parts.mkdir()
     (parts / "settings.json").write_text(json.dumps(demos.asdict(Collection("Lift", episodes=2))))
-    (parts / "0000000000.h5.tmp").write_bytes(b"cut off")
-    (tmp_path / "a.h5.tmp").write_bytes(b"cut off")
+    (parts / ".0000000000.tmp.h5").write_bytes(b"cut off")
+    (tmp_path / ".a.tmp.h5").write_bytes(b"cut off")
     collect(path, Collection("Lift", episodes=2))
     assert path.read_bytes() == whole.read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "whole.h5"]

@@ -10,7 +10,9 @@ from torchrl_sparse.envs.robosuite import RobosuiteEnv
 
 @pytest.fixture(scope="module")
 def env():
-    env = RobosuiteEnv("Lift", camera="agentview", wrist_camera="robot0_eye_in_hand", image_size=48, seeds=[0])
+    env = RobosuiteEnv(
+        "Lift", camera="agentview", wrist_camera="robot0_eye_in_hand", image_size=48, seeds=[0]
+    )
     try:
         env.reset()
     except RuntimeError as error:
@@ -43,5 +45,5 @@ def test_image_is_upright_and_follows_the_scene(env):
 
 
 def test_unknown_camera_is_named(env):
-    with pytest.raises(ValueError, match="camera: expected one of .*agentview.*got 'drone'"):
+    with pytest.raises(ValueError, match=r"camera: expected one of .*agentview.*got 'drone'"):
         env.render("drone")

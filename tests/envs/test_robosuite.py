@@ -100,7 +100,7 @@ def test_success_terminates_and_does_not_truncate():
     pose[2] += 0.3
     sim.data.set_joint_qpos(env.sim_env.cube.joints[0], pose)
     td = env.step(td.set("action", torch.zeros(7)))["next"]
-    assert td["success"] and td["terminated"] and td["done"]
+    assert all(td[key].item() for key in ("success", "terminated", "done"))
     assert not td["truncated"]
     assert td["reward"] == 1.0
 
@@ -117,7 +117,9 @@ def test_absolute_action_reaches_the_commanded_pose():
 
 def test_velocity_from_poses_agrees_with_the_simulator():
     simulated = RobosuiteEnv("Lift", action_mode="delta", seeds=[2])
-    derived = TransformedEnv(RobosuiteEnv("Lift", action_mode="delta", seeds=[2]), EndEffectorVelocity(TASKS["Lift"]))
+    derived = TransformedEnv(
+        RobosuiteEnv("Lift", action_mode="delta", seeds=[2]), EndEffectorVelocity(TASKS["Lift"])
+    )
     check_env_specs(derived)
     a, b = simulated.reset(), derived.reset()
     assert torch.equal(b[keys.EEF_VEL], torch.zeros(6))
@@ -146,7 +148,7 @@ def test_batched_environments_equal_single_ones(batched):
     for row, seed in enumerate((8, 9)):
         alone = make_env("Lift", action_mode="delta", seeds=[seed])
         single = alone.rollout(3, policy=lambda td: td.set("action", torch.full((7,), 0.2)))
-        assert torch.equal(together[row]["next", *keys.STATE], single["next", *keys.STATE])
+        assert torch.equal(together[row]["next"][keys.STATE], single["next"][keys.STATE])
 
 
 def test_instruction_is_written_when_asked_for():
@@ -156,7 +158,7 @@ def test_instruction_is_written_when_asked_for():
 
 
 def test_bad_input_is_named(lift):
-    with pytest.raises(ValueError, match="expected one of Lift, PickPlaceCan.*got 'Fly'"):
+    with pytest.raises(ValueError, match=r"expected one of Lift, PickPlaceCan.*got 'Fly'"):
         get_task("Fly")
     assert get_task("can") is get_task("PickPlaceCan")
     with pytest.raises(ValueError, match="action_mode: expected 'absolute' or 'delta', got 'joint'"):

@@ -19,14 +19,18 @@ def test_rot6d_is_the_first_two_rows():
 
 
 def test_round_trip_is_the_same_rotation_also_at_pi():
-    rotations = Rotation.concatenate([Rotation.random(50, random_state=0), Rotation.from_rotvec([[np.pi, 0, 0]])])
+    rotations = Rotation.concatenate(
+        [Rotation.random(50, random_state=0), Rotation.from_rotvec([[np.pi, 0, 0]])]
+    )
     back = Rotation.from_rotvec(rot6d_to_rotvec(rotvec_to_rot6d(rotations.as_rotvec())))
     assert (rotations.inv() * back).magnitude().max() < 1e-6
 
 
 def test_any_two_independent_rows_become_a_rotation():
     matrices = rot6d_to_matrix(np.random.default_rng(0).normal(size=(20, 6)))
-    np.testing.assert_allclose(matrices @ matrices.swapaxes(-1, -2), np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-9)
+    np.testing.assert_allclose(
+        matrices @ matrices.swapaxes(-1, -2), np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-9
+    )
     np.testing.assert_allclose(np.linalg.det(matrices), 1.0)
 
 
@@ -41,7 +45,9 @@ def test_actions_of_two_arms_round_trip():
     pose = rng.normal(size=(5, 14))
     absolute = pose_to_absolute(pose)
     assert absolute.shape == (5, 20)
-    np.testing.assert_array_equal(absolute[:, [0, 1, 2, 9, 10, 11, 12, 19]], pose[:, [0, 1, 2, 6, 7, 8, 9, 13]])
+    np.testing.assert_array_equal(
+        absolute[:, [0, 1, 2, 9, 10, 11, 12, 19]], pose[:, [0, 1, 2, 6, 7, 8, 9, 13]]
+    )
     np.testing.assert_allclose(pose_to_absolute(absolute_to_pose(absolute)), absolute, atol=1e-9)
 
 

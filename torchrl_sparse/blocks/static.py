@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -41,6 +40,7 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
+from torchrl_sparse.files import atomic_path
 
 __all__ = ["Schedule", "StaticSchedule"]
 
@@ -121,17 +121,9 @@ class Schedule:
         Raises:
             TypeError: if ``settings`` holds something that JSON cannot.
         """
-        path = Path(path)
         text = self._to_json()
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner can read.
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Schedule:
@@ -195,13 +187,10 @@ class StaticSchedule(StaticPlanner):
         Raises:
             ValueError: if the schedule was made for another number of steps or layers, or for another policy.
         """
-        for name, label in (
-            ("num_inference_steps", "num_inference_steps"),
-            ("num_layers", "num_layers"),
-            ("policy", "policy fingerprint"),
-        ):
+        for name in ("num_inference_steps", "num_layers", "policy"):
             made_for, asked = getattr(self.schedule, name), getattr(spec, name)
             if made_for != asked:
+                label = "policy fingerprint" if name == "policy" else name
                 raise ValueError(
                     f"schedule {self.schedule.method!r}: made for {label} {made_for!r}, got {asked!r}"
                 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -49,7 +49,9 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def in_keys(self):
-        return _unique([keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys])
+        return _unique(
+            [keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys]
+        )
 
     @property
     def out_keys(self):
@@ -64,39 +66,37 @@ class ChunkExecutor(TensorDictModuleBase):
         if due.any():
             self._query(tensordict, due)
         self._clear_costs(tensordict, ~due)
-        age = torch.zeros_like(due, dtype=torch.int64)
-        if keys.AGE in tensordict.keys(True):
-            age = torch.where(due, age, tensordict.get(keys.AGE) + 1)
+        age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.QUERIED, due)
         return tensordict.set(keys.ACTION, _take(tensordict.get(keys.CHUNK), age))
 
+    def _age(self, tensordict: TensorDictBase) -> Tensor:
+        """i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
+        return _stored(tensordict, keys.AGE, torch.tensor([self.n_action_steps], device=tensordict.device))
+
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """bool [*B, 1]: samples without an action to serve."""
-        is_init = tensordict.get(keys.IS_INIT)
-        age = tensordict.get(keys.AGE, None)
-        if age is None:
-            return torch.ones_like(is_init)
-        due = is_init | (age + 1 >= self.n_action_steps)
+        due = tensordict.get(keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
         replan = tensordict.get(keys.REPLAN, None)
         return due if replan is None else due | replan
 
     def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
         """Runs the policy on the due samples alone and writes what it returns into their rows."""
-        rows = tensordict.reshape(-1)
+        batch = tensordict.batch_size
         index = due.reshape(-1).nonzero().squeeze(-1)
-        answer = self.policy(rows[index].select(*self.policy.in_keys, strict=False))
-        chunk = answer.get(keys.CHUNK)
-        if chunk.shape[-2] < self.n_action_steps:
+        request = tensordict.select(*self.policy.in_keys, strict=False).reshape(-1)[index]
+        answer = self.policy(request)
+        length = answer.get(keys.CHUNK).shape[-2]
+        if length < self.n_action_steps:
             raise ValueError(
-                f"{keys.CHUNK}: expected at least n_action_steps={self.n_action_steps} actions, got {chunk.shape[-2]}"
+                f"{keys.CHUNK}: expected at least n_action_steps={self.n_action_steps} actions, got {length}"
             )
         for key in self.policy.out_keys:
             value = answer.get(key)
-            whole = tensordict.get(key, None)
-            whole = value.new_zeros(*rows.batch_size, *value.shape[1:]) if whole is None else whole.reshape(-1, *value.shape[1:])
-            whole = whole.index_copy(0, index, value)
-            tensordict.set(key, whole.reshape(*tensordict.batch_size, *value.shape[1:]))
+            shape = value.shape[1:]
+            whole = _stored(tensordict, key, value.new_zeros(shape)).reshape(-1, *shape)
+            tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
 
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
         for key in (keys.FLOPS, keys.LATENCY):
@@ -108,6 +108,21 @@ def _take(chunk: Tensor, age: Tensor) -> Tensor:
     """The action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
     index = age[..., None].expand(*age.shape, chunk.shape[-1])
     return chunk.gather(-2, index).squeeze(-2)
+
+
+def _stored(tensordict: TensorDictBase, key: NestedKey, default: Tensor) -> Tensor:
+    """What an earlier call wrote, [*B, *default.shape]; ``default`` for samples that were never called before.
+
+    An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
+    although some of its rows have it.
+    """
+    value = tensordict.get(key, None)
+    if value is not None:
+        return value
+    if isinstance(tensordict, LazyStackedTensorDict):
+        rows = [_stored(row, key, default) for row in tensordict.tensordicts]
+        return torch.stack(rows, tensordict.stack_dim)
+    return default.expand(*tensordict.batch_size, *default.shape)
 
 
 def _unique(nested_keys: list) -> list:

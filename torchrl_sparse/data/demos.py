@@ -1,7 +1,7 @@
 """Collecting scripted demonstrations: run experts, keep what succeeded, survive being killed.
 
-The demonstrations are scripted, never human. Episode ``i`` is fixed by ``seed + i`` alone, so a file can be made again, and
-continued after a kill, to the same bytes on the same machine.
+The demonstrations are scripted, never human. Episode ``i`` is fixed by ``seed + i`` alone, so a file can be
+made again, and continued after a kill, to the same bytes on the same machine.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task, get_task
+from torchrl_sparse.files import atomic_path
 
 _EXPERT_STREAM = (
     1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
@@ -51,7 +52,7 @@ class Collection:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a collection went: episodes attempted, how many succeeded, how many are kept, and their mean number of steps."""
+    """How a collection went: episodes attempted, successes among them, episodes kept and their mean steps."""
 
     attempts: int
     successes: int
@@ -123,8 +124,8 @@ def collect(
 ) -> Summary:
     """Collects demonstrations into ``path``, going on where a killed run stopped.
 
-    Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the end. Calling
-    again after that only reports.
+    Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the
+    end. Calling again after that only reports.
 
     Args:
         path: the HDF5 file to make; layout in `torchrl_sparse.data.hdf5_writer`.
@@ -206,13 +207,12 @@ def _check_yield(tally: Summary) -> None:
 
 
 def _claim(parts: Path, settings: Mapping[str, Any]) -> None:
-    """Starts or goes on with a folder of finished episodes; they must have been made with the same settings."""
+    """Starts or goes on with a folder of finished episodes, made with the same settings."""
     parts.mkdir(parents=True, exist_ok=True)
     note = parts / "settings.json"
     if not note.exists():
-        temporary = note.with_suffix(".tmp")
-        temporary.write_text(json.dumps(settings, indent=1))
-        temporary.replace(note)
+        with atomic_path(note) as temporary:
+            temporary.write_text(json.dumps(settings, indent=1))
     _same(note, json.loads(note.read_text()), settings)
 
 
@@ -230,7 +230,8 @@ def _same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> No
     ]
     if different:
         raise ValueError(
-            f"{where} was collected with other settings ({'; '.join(different)}): move it or choose another file"
+            f"{where} was collected with other settings ({'; '.join(different)}): "
+            "move it or choose another file"
         )
 
 

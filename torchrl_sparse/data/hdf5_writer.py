@@ -1,26 +1,25 @@
 """Writing demonstrations in robomimic's HDF5 layout, one episode at a time and safely.
 
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 in the file                   shape, type            meaning
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 ``data`` attributes           ``env_args`` json,     how the environment was made; number of samples of all
                               ``total`` int          demonstrations; ``collection`` json, how they were made
 ``data/demo_<i>`` attributes  int, str, bool         ``num_samples``, ``model_file`` (MuJoCo xml), ``seed``,
                                                      ``operator``, ``success``
-``states``                    f64 [T, S]             simulator state before each action; the first restores the
-                                                     episode's start
-``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m; rotation
-                                                     vector, rad; gripper, -1 open to 1 closed
+``states``                    f64 [T, S]             simulator state before each action; the first restores
+                                                     the episode's start
+``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m;
+                                                     rotation vector, rad; gripper, -1 open to 1 closed
 ``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
 ``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
 ``obs/<key>``                 f64 [T, n]             observations before each action
-============================  =====================  ==========================================================
+============================  =====================  =========================================================
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+
+from torchrl_sparse.files import atomic_path
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Episode:
 
 def write_episode(path: Path, episode: Episode) -> None:
     """Writes one episode as a file of its own. A kill leaves either the whole file or none."""
-    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         _fill(file.create_group("demo"), episode)
 
 
@@ -68,7 +69,7 @@ def merge_episodes(
 
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
-    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         data = file.create_group("data")
         total = 0
         for index, part in enumerate(parts):
@@ -90,23 +91,3 @@ def _fill(group: h5py.Group, episode: Episode) -> None:
         group[name] = getattr(episode, name)
     for key, value in episode.observations.items():
         group[f"obs/{key}"] = value
-
-
-class _replacing:
-    """A temporary neighbour of ``path`` that takes its place, durably, when the block ends without an error."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._temporary = path.with_name(path.name + ".tmp")
-
-    def __enter__(self) -> Path:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        return self._temporary
-
-    def __exit__(self, error_type: type | None, *_: object) -> None:
-        if error_type is not None:
-            self._temporary.unlink(missing_ok=True)
-            return
-        with open(self._temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(self._temporary, self._path)

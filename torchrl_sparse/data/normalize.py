@@ -1,8 +1,8 @@
-"""Affine maps between environment units and the range in which the policy works, as published for Diffusion Policy.
+"""Affine maps between environment units and those of the policy, as published for Diffusion Policy.
 
-Absolute-pose actions (arXiv:2303.04137, robomimic tasks): positions are range-normalised to [-1, 1] per dimension, the 6-D
-rotation and the gripper, already in that range, are kept. Low-dimensional states: one scale for all dimensions, no offset, so
-that the largest magnitude becomes 1.
+Absolute-pose actions (arXiv:2303.04137, robomimic tasks): positions are range-normalised to [-1, 1] per
+dimension, the 6-D rotation and the gripper, already in that range, are kept. Low-dimensional states: one
+scale for all dimensions, no offset, so that the largest magnitude becomes 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Normalizer"]
 _ARM_DIM = 10
 _POSITION = slice(0, 3)
 _MIN_RANGE = 1e-4
-"""Dimensions that vary less than this are centred and not stretched: dividing by their range would amplify noise."""
+"""Dimensions that vary less are centred and not stretched: dividing by their range would amplify noise."""
 
 
 class Normalizer(nn.Module):
@@ -28,7 +28,8 @@ class Normalizer(nn.Module):
         action_scale, action_offset: f32 [A].
 
     Raises:
-        ValueError: if a scale and its offset differ in shape, are not vectors, or are not finite, or if a scale has a zero.
+        ValueError: if a scale and its offset differ in shape, are not vectors, or are not finite, or if a
+            scale has a zero.
 
     Examples:
         >>> state = torch.tensor([[0.5, -2.0], [1.0, 1.0]])
@@ -53,14 +54,17 @@ class Normalizer(nn.Module):
         self.register_buffer("action_offset", action_offset.float())
 
     @classmethod
-    def fit(cls, state: Tensor, action: Tensor, *, state_mode: Literal["global", "range"] = "global") -> Normalizer:
+    def fit(
+        cls, state: Tensor, action: Tensor, *, state_mode: Literal["global", "range"] = "global"
+    ) -> Normalizer:
         """Normaliser of a data set.
 
         Args:
             state: [N, Ds].
             action: [N, 10 * arms], absolute poses.
-            state_mode: ``"global"`` is the published choice, one scale for all dimensions; ``"range"`` maps each dimension to
-                [-1, 1], which short trainings need: in metres, objects move by a few hundredths.
+            state_mode: ``"global"`` is the published choice, one scale for all dimensions; ``"range"`` maps
+                each dimension to [-1, 1], which short trainings need: in metres, objects move by a few
+                hundredths.
 
         Raises:
             ValueError: if the shapes do not fit, a value is not finite or ``state_mode`` is unknown.
@@ -107,7 +111,9 @@ def _range_map(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def _check_data(state: Tensor, action: Tensor) -> None:
     if state.ndim != 2 or action.ndim != 2 or len(state) != len(action) or not len(state):
-        raise ValueError(f"expected state [N, Ds] and action [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}")
+        raise ValueError(
+            f"expected state [N, Ds] and action [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}"
+        )
     if action.shape[1] % _ARM_DIM:
         raise ValueError(f"action: expected {_ARM_DIM} numbers per arm, got a last axis of {action.shape[1]}")
     for name, value in (("state", state), ("action", action)):
@@ -118,7 +124,8 @@ def _check_data(state: Tensor, action: Tensor) -> None:
 def _check_pair(name: str, scale: Tensor, offset: Tensor) -> None:
     if scale.ndim != 1 or scale.shape != offset.shape:
         raise ValueError(
-            f"{name}_scale and {name}_offset must be vectors of one size, got {list(scale.shape)} and {list(offset.shape)}"
+            f"{name}_scale and {name}_offset must be vectors of one size, "
+            f"got {list(scale.shape)} and {list(offset.shape)}"
         )
     if not (scale.isfinite().all() and offset.isfinite().all() and (scale != 0).all()):
         raise ValueError(f"{name}_scale and {name}_offset must be finite and the scale without zeros")

@@ -24,11 +24,15 @@ def import_robosuite():
     try:
         import robosuite
     except ImportError as error:
-        raise ImportError("robosuite environments need `pip install 'robosuite==1.5.2' 'mujoco<3.10'`") from error
+        raise ImportError(
+            "robosuite environments need `pip install 'robosuite==1.5.2' 'mujoco<3.10'`"
+        ) from error
     return robosuite
 
 
-def make_simulator(task: Task, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20) -> Any:
+def make_simulator(
+    task: Task, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
+) -> Any:
     """A state-only robosuite environment of Pandas under OSC_POSE.
 
     Args:

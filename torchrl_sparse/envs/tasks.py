@@ -55,7 +55,9 @@ TASKS = {
         Task("Lift", "lift", 1, 10, 400, "lift the red cube"),
         Task("PickPlaceCan", "can", 1, 14, 400, "put the can into its bin"),
         Task("NutAssemblySquare", "square", 1, 14, 400, "put the square nut on the square peg"),
-        Task("TwoArmTransport", "transport", 2, 41, 700, "hand the hammer over and put it into the target bin"),
+        Task(
+            "TwoArmTransport", "transport", 2, 41, 700, "hand the hammer over and put it into the target bin"
+        ),
         Task("ToolHang", "tool_hang", 1, 44, 700, "assemble the frame and hang the tool on it"),
     )
 }

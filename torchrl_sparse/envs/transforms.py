@@ -66,7 +66,10 @@ class EndEffectorVelocity(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before, after = tensordict.get(keys.STATE), next_tensordict.get(keys.STATE)
         twists = [
-            torch.cat([after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat])], -1)
+            torch.cat(
+                [after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat])],
+                -1,
+            )
             for pos, quat in self._poses
         ]
         return next_tensordict.set(keys.EEF_VEL, torch.cat(twists, -1) * self.control_freq)

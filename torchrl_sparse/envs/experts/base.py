@@ -1,7 +1,8 @@
-"""The skeleton of a scripted expert: where the hand is, where it should go next, and one clipped step towards it.
+"""The skeleton of a scripted expert: where the hand is, where it should go, and one clipped step towards it.
 
-An expert decides from what a policy can observe too (poses, finger opening), not from clocks or remembered phases: its labels
-are then a function of the state, and it recovers by itself when something goes wrong. Only the operator's `Style` is hidden.
+An expert decides from what a policy can observe too (poses, finger opening, motion), not from clocks or
+remembered phases: its labels are then a function of the state, and it recovers by itself when something goes
+wrong. Only the operator's `Style` is hidden.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torchrl_sparse.envs.experts.operators import Style
 
 OPEN, CLOSED = -1.0, 1.0
 DOWNWARD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""The grip site of a Panda that points straight down; its fingers move along its x axis, here the world's y axis."""
+"""A Panda's grip site that points straight down; its fingers move along its x axis, here the world's y."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +51,26 @@ class Hand:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where a hand should be next: position f64 [3] in m, rotation f64 [3, 3], fingers `OPEN` or `CLOSED`."""
+    """Where a hand should be next.
+
+    Attributes:
+        position: f64 [3] of the grip site, m.
+        rotation: f64 [3, 3] of the grip site.
+        gripper: `OPEN` or `CLOSED`.
+        pace: share of the operator's usual speed.
+    """
 
     position: np.ndarray
     rotation: np.ndarray
     gripper: float
+    pace: float = 1.0
 
 
 class Expert(ABC):
     """A scripted expert for one episode of one robosuite environment.
 
     Args:
-        sim_env: robosuite's environment under absolute world-frame poses, just reset (``RobosuiteEnv(...).sim_env``).
+        sim_env: robosuite's environment under absolute world-frame poses (``RobosuiteEnv(...).sim_env``).
         style: the operator's draw for this episode.
 
     Examples:
@@ -87,12 +96,13 @@ class Expert(ABC):
         return np.concatenate([self._step_towards(hand, waypoint) for hand, waypoint in pairs])
 
     def _step_towards(self, hand: Hand, waypoint: Waypoint) -> np.ndarray:
-        step = _clip(waypoint.position - hand.position, self.style.reach)
-        turn = _clip(Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec(), self.style.turn)
+        left = Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec()
+        step = _clip(waypoint.position - hand.position, waypoint.pace * self.style.reach)
+        turn = _clip(left, waypoint.pace * self.style.turn)
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
         return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
 
-    # -- what an expert sees -------------------------------------------------------------------------------------------
+    # -- what an expert sees ----------------------------------------------------------------------
 
     def hand(self, arm: int = 0) -> Hand:
         """The hand of one arm."""
@@ -113,14 +123,23 @@ class Expert(ABC):
         index = self.sim_env.sim.model.body_name2id(name)
         return data.body_xpos[index].copy(), data.body_xmat[index].reshape(3, 3).copy()
 
-    # -- skills --------------------------------------------------------------------------------------------------------
+    # -- skills -----------------------------------------------------------------------------------
 
-    def above(self, hand: Hand, goal: np.ndarray, clearance: float | None = None) -> np.ndarray:
-        """f64 [3] the next point of a funnel that ends in ``goal``: height and sideways bow shrink with the distance left."""
+    def above(
+        self, hand: Hand, goal: np.ndarray, *, clearance: float | None = None, turn: float = 0.0
+    ) -> np.ndarray:
+        """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
+
+        Args:
+            hand: where the hand is.
+            goal: f64 [3] where it should go, m.
+            clearance: height of the funnel, m; the operator's ``hover`` by default.
+            turn: rad that the hand still has to turn before it may go down.
+        """
         clearance = self.style.hover if clearance is None else clearance
         away = goal[:2] - hand.position[:2]
         distance = float(np.linalg.norm(away))
-        height = min(clearance, self.style.slope * max(0.0, distance - 0.01))
+        height = min(clearance, self.style.slope * max(0.0, distance + 0.05 * abs(turn) - 0.01))
         sideways = np.array([-away[1], away[0]]) / max(distance, 1e-6)
         bow = self.style.bow * np.clip((distance - 0.03) / 0.05, 0.0, 1.0)
         return goal + np.array([*(bow * sideways), height])

@@ -1,4 +1,4 @@
-"""What the operator's hand does besides what it was meant to: noise, pauses, bumps and slips on executed actions."""
+"""What the operator's hand does besides what was meant: noise, pauses, bumps and slips when executing."""
 
 from __future__ import annotations
 

@@ -11,8 +11,10 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 
 _HANDLE = np.array([0.056, 0.0, 0.004])  # m, where to grasp, in the nut's frame
 _HANDLE_WIDTH = 0.032  # m
-_PLACED_YAW = np.pi  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
-_YAW_LIMITS = (-1.1, 3.4)  # rad, the hand's yaws that the last joint reaches, with a margin
+_PLACED_YAW = (
+    np.pi
+)  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
+_YAW_LIMITS = (-1.5, 3.4)  # rad, the hand's yaws that the last joint reaches, with a margin
 _PEG_TOP = 0.95  # m
 _ABOVE_PEG = 0.975  # m, the nut's height in travel
 _INSERTED = 0.85  # m, the nut's height aimed at; success is below 0.87
@@ -32,12 +34,14 @@ class NutAssemblySquareExpert(Expert):
         handle = nut + rotation @ _HANDLE
         if np.linalg.norm(hand.position - handle) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.004:
             return [self._carry(hand, nut, rotation)]
-        yaw = grasp_yaw(_yaw(rotation))
+        yaw = grasp_yaw(_yaw(rotation), hand.yaw)
         grasp = handle + self.style.offset * rotation[:, 0]
         if at(hand, grasp, downward(yaw), position=0.01):
             return [Waypoint(grasp, downward(yaw), CLOSED)]
         left = yaw - _unwrapped(hand.yaw)
-        return [Waypoint(self.above(hand, grasp), downward(hand.yaw + _part(left)), OPEN)]
+        return [
+            Waypoint(self.above(hand, grasp, turn=left), downward(hand.yaw + _part(left)), OPEN, pace=0.7)
+        ]
 
     @property
     def _nut(self):
@@ -48,16 +52,16 @@ class NutAssemblySquareExpert(Expert):
         return self.sim_env.sim.data.body_xpos[self.sim_env.peg1_body_id]
 
     def _carry(self, hand: Hand, nut: np.ndarray, rotation: np.ndarray) -> Waypoint:
-        yaw = _yaw(rotation)
-        turn = _turn_left(_unwrapped(hand.yaw), yaw)
+        turn = _turn_left(_unwrapped(hand.yaw), _yaw(rotation))
         error = self._misalignment(hand, nut) + 0.03 * abs(turn)
         around = nut[2] < _PEG_TOP - 0.01 and error < 0.03
         lifted = 1.0 if around else np.clip((nut[2] - 0.93) / 0.04, 0.0, 1.0)
         goal = nut + lifted * (self._place(hand, nut, turn, around) - nut)
         goal[2] = self._height(hand, error, around)
-        upright = Rotation.from_euler("z", yaw + lifted * _part(turn)).as_matrix()
-        correction = upright @ rotation.T
-        return Waypoint(goal + correction @ (hand.position - nut), correction @ hand.rotation, CLOSED)
+        turned = lifted * _part(turn)
+        grip = Rotation.from_euler("z", turned).apply(hand.position - nut)
+        pace = 0.4 if error < 0.08 else 0.7
+        return Waypoint(goal + grip, downward(hand.yaw + turned), CLOSED, pace)
 
     def _misalignment(self, hand: Hand, nut: np.ndarray) -> float:
         """Horizontal distance of the nut to the peg, m, now or in a moment, whichever is larger."""
@@ -78,15 +82,23 @@ class NutAssemblySquareExpert(Expert):
         return float(np.clip(_INSERTED + 20.0 * over, _INSERTED, _ABOVE_PEG))
 
 
-def grasp_yaw(nut_yaw: float) -> float:
-    """The hand's yaw for grasping, rad: the fingers move along the nut's y axis, so it is the nut's or the opposite one."""
+def grasp_yaw(nut_yaw: float, hand_yaw: float) -> float:
+    """The hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis.
+
+    Where the nuts lie, the forearm is nearly vertical, and yaws far from 0 make the wrist almost singular:
+    they cost twice. The hand's present yaw keeps a choice once it is made.
+    """
     grasps = [_unwrapped(nut_yaw), _unwrapped(nut_yaw + np.pi)]
-    pairs = [(grasp, _turn_left(grasp, nut_yaw)) for grasp in grasps if _reachable(grasp)]
-    return min(pairs, key=lambda pair: abs(pair[0]) + abs(pair[1]))[0]
+    costs = {
+        abs(grasp) + abs(grasp - _unwrapped(hand_yaw)) + abs(_turn_left(grasp, nut_yaw)): grasp
+        for grasp in grasps
+        if _reachable(grasp)
+    }
+    return costs[min(costs)]
 
 
 def _turn_left(hand_yaw: float, nut_yaw: float) -> float:
-    """The turn that brings the nut into its yaw on the peg, the way round that keeps the hand within reach, rad."""
+    """The turn that brings the nut into its yaw on the peg, round the way that the hand can reach, rad."""
     turn = nearest(_PLACED_YAW - nut_yaw, 0.0, 2 * np.pi)
     ways = [turn, turn - np.sign(turn) * 2 * np.pi]
     return min(ways, key=lambda way: (not _reachable(hand_yaw + way), abs(way)))

@@ -1,7 +1,7 @@
 """Who demonstrates: the skill of a scripted operator, and how one episode of it is drawn.
 
-``proficient`` is one consistent skilled operator, ``mixed`` six of three skills: scripted counterparts of the proficient-human
-and multi-human data of robomimic (arXiv:2108.03298). No human took part in either.
+``proficient`` is one consistent skilled operator, ``mixed`` six of three skills: scripted counterparts of the
+proficient-human and multi-human data of robomimic (arXiv:2108.03298). No human took part in either.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Operator:
         reach: how far ahead of the hand a target lies, m. It sets the speed: about six times it a second.
         turn: the same for rotations, rad.
         hover: height over a goal at which it is approached, m.
-        slope: metres of height for each metre of horizontal distance left to the goal, on top of ``hover``'s limit.
+        slope: metres of height, up to ``hover``, for each metre of horizontal distance left to the goal.
         bow: sideways offset of a path while the goal is far, m; its sign is drawn too.
         offset: distance of the chosen grasp from the ideal one, m.
         noise: standard deviation of the noise on executed positions, m, far from the goal.

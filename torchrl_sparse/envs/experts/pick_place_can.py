@@ -13,7 +13,7 @@ _WALLS = 0.92  # m, the can's height from which it may travel sideways
 _CARRY = 0.13  # m over the place of release
 _PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
 _RELEASE = (
-    0.12  # m over the bin's floor, the can's height when let go; its lower half is then below the walls' top
+    0.12  # m over the bin's floor, the can's height when let go: its lower half is below the walls' top
 )
 
 
@@ -46,7 +46,7 @@ class PickPlaceCanExpert(Expert):
         if abs(axis[2]) > 0.7:
             aligned = downward(0.0)
             return can + np.array([0.0, 0.0, 0.012]) + self.style.offset * aligned[:, 1], aligned
-        # The fingers' axis is the world's y axis at yaw 0; across a lying can it is square to the can's own axis.
+        # Fingers move along the world's y axis at yaw 0; across a lying can, square to the can's own axis.
         aligned = downward(nearest(np.arctan2(axis[1], axis[0]), hand.yaw, np.pi))
         return can + self.style.offset * aligned[:, 1], aligned
 

@@ -67,7 +67,9 @@ def read_pretrained(path: Path) -> tuple[TransformerForDiffusion, Normalizer, di
     _check_tensors(where, _NETWORK, network_tensors, expected_network)
     _check_tensors(where, _NORMALIZER, normalizer_tensors, expected_normalizer)
     if tensors:
-        raise ValueError(f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}")
+        raise ValueError(
+            f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
+        )
     network.load_state_dict({name: value.float() for name, value in network_tensors.items()})
     return network.eval(), Normalizer(**normalizer_tensors), config["schedule"]
 
@@ -108,6 +110,8 @@ def _check_tensors(path: Path, prefix: str, found: dict[str, Tensor], expected: 
         raise ValueError(f"{path}: tensors under {prefix!r}: missing {missing}, unexpected {extra}")
     for name, shape in expected.items():
         if tuple(found[name].shape) != shape:
-            raise ValueError(f"{path}: {prefix}{name}: expected shape {shape}, got {tuple(found[name].shape)}")
+            raise ValueError(
+                f"{path}: {prefix}{name}: expected shape {shape}, got {tuple(found[name].shape)}"
+            )
         if not torch.isfinite(found[name]).all():
             raise ValueError(f"{path}: {prefix}{name}: expected finite numbers, got NaN or infinity")

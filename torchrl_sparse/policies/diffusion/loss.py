@@ -1,4 +1,4 @@
-"""Training objective of Diffusion Policy: predict the noise of a noised action chunk (arXiv:2303.04137, Eq. 5)."""
+"""Training objective of Diffusion Policy (arXiv:2303.04137, Eq. 5): predict the noise of a noised chunk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ __all__ = ["DiffusionLoss", "noise_prediction_loss"]
 
 
 def noise_prediction_loss(
-    network: TransformerForDiffusion, schedule: NoiseSchedule, action: Tensor, cond: Tensor, noise: Tensor, timestep: Tensor
+    network: TransformerForDiffusion,
+    schedule: NoiseSchedule,
+    action: Tensor,
+    cond: Tensor,
+    noise: Tensor,
+    timestep: Tensor,
 ) -> Tensor:
     """Mean squared error between ``noise`` and the network's prediction of it, a scalar.
 
@@ -35,8 +40,8 @@ def noise_prediction_loss(
 class DiffusionLoss(LossModule):
     """Chunked noise-prediction loss.
 
-    Reads ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A], both in environment units; writes ``"loss"``. Timestep
-    and noise are drawn from torch's global generator.
+    Reads ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A], both in environment units; writes
+    ``"loss"``. Timestep and noise are drawn from torch's global generator.
 
     Args:
         network: the network to train; its parameters are the loss module's.
@@ -44,7 +49,9 @@ class DiffusionLoss(LossModule):
         schedule: gives the noise levels; DDPM with 100 by default.
 
     Examples:
-        >>> network = TransformerForDiffusion(input_dim=10, output_dim=10, horizon=4, n_obs_steps=2, cond_dim=3, n_layer=1)
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=10, output_dim=10, horizon=4, n_obs_steps=2, cond_dim=3, n_layer=1
+        ... )
         >>> normalizer = Normalizer(torch.ones(3), torch.zeros(3), torch.ones(10), torch.zeros(10))
         >>> loss = DiffusionLoss(network, normalizer)
         >>> batch = {("history", "state"): torch.zeros(5, 2, 3), "action": torch.zeros(5, 4, 10)}
@@ -69,7 +76,13 @@ class DiffusionLoss(LossModule):
         Raises:
             ValueError: if the chunk does not have the network's horizon and action size.
         """
-        action = self.normalizer.normalize_action(tensordict.get(keys.ACTION))
+        action = tensordict.get(keys.ACTION)
+        chunk = (self.network.horizon, self.network.input_dim)
+        if action.ndim != 3 or tuple(action.shape[1:]) != chunk:
+            raise ValueError(
+                f"{keys.ACTION}: expected shape [B, {chunk[0]}, {chunk[1]}], got {list(action.shape)}"
+            )
+        action = self.normalizer.normalize_action(action)
         cond = self.normalizer.normalize_state(tensordict.get(keys.HISTORY_STATE))
         timestep = torch.randint(self.schedule.num_train_timesteps, (len(action),), device=action.device)
         noise = torch.randn_like(action)

@@ -225,7 +225,9 @@ class ObservationEncoder(TensorDictModuleBase):
             )
         if not state.isfinite().all():
             bad = (~state.isfinite()).nonzero()[0].tolist()
-            raise ValueError(f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}")
+            raise ValueError(
+                f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
+            )
 
     @staticmethod
     def _seed(tensordict: TensorDictBase) -> Tensor:

@@ -1,15 +1,14 @@
 """Denoising schedules: diffusers' DDPM and DDIM schedulers with every noise tensor handed in from outside.
 
-Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta schedule
-(arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0) samples the same network
-in any smaller number of steps.
+Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta
+schedule (arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0)
+samples the same network in any smaller number of steps.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-import torch
 from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
@@ -19,8 +18,8 @@ __all__ = ["NoiseSchedule"]
 class NoiseSchedule:
     """The denoising steps of one query, in execution order, and the noising of training.
 
-    Scheduler steps of diffusers draw their own noise; here the caller passes it, so that two methods can share all noise of a
-    query. The arithmetic is the scheduler's own.
+    Scheduler steps of diffusers draw their own noise; here the caller passes it, so that two methods can
+    share all noise of a query. The arithmetic is the scheduler's own.
 
     Args:
         kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
@@ -38,6 +37,7 @@ class NoiseSchedule:
         >>> schedule = NoiseSchedule("ddim", num_inference_steps=10)
         >>> schedule.timesteps.tolist()
         [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]
+        >>> import torch
         >>> sample = torch.zeros(1, 10, 7)
         >>> schedule.step(torch.zeros_like(sample), 0, sample).shape
         torch.Size([1, 10, 7])
@@ -53,7 +53,8 @@ class NoiseSchedule:
             raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
         if not 1 <= num_inference_steps <= num_train_timesteps:
             raise ValueError(
-                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), got {num_inference_steps}"
+                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
+                f"got {num_inference_steps}"
             )
         self.kind = kind
         self.num_inference_steps = num_inference_steps
@@ -87,8 +88,8 @@ class NoiseSchedule:
             eps: predicted noise [B, H, A].
             k: index of the denoising step in execution order, 0 .. K-1.
             sample: the sample that ``eps`` was predicted for, [B, H, A].
-            noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by DDIM nor by the last
-                step.
+            noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by
+                DDIM nor by the last step.
 
         Raises:
             IndexError: if ``k`` is not in 0..K-1.
@@ -123,8 +124,8 @@ class NoiseSchedule:
 def _ddpm_step(scheduler: DDPMScheduler, eps: Tensor, timestep: int, sample: Tensor, noise: Tensor) -> Tensor:
     """``DDPMScheduler.step`` (arXiv:2006.11239, Eq. 7) with the variance noise handed in.
 
-    diffusers draws the noise inside its step and offers no way to pass it; its expressions are repeated in their order, so that
-    results are equal to the last bit.
+    diffusers draws the noise inside its step and offers no way to pass it; its expressions are repeated in
+    their order, so that results are equal to the last bit.
     """
     previous = scheduler.previous_timestep(timestep)
     alpha_prod = scheduler.alphas_cumprod[timestep]

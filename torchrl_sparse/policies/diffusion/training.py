@@ -1,13 +1,15 @@
-"""Training a diffusion policy: one resumable object that knows weights, their average, the optimiser and the step.
+"""Training a diffusion policy: weights, their average, the optimiser and the step in one resumable object.
 
-Everything random in step s (which windows, timesteps, noise, dropout) follows from ``(seed, s)``; a training that is stopped
-and resumed therefore continues bit by bit as if it had not been.
+Everything random in step s (which windows, timesteps, noise, dropout) follows from ``(seed, s)``; a training
+that is stopped and resumed therefore continues bit by bit as if it had not been.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +31,7 @@ __all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How to train; the defaults are those published for robomimic's low-dimensional tasks (arXiv:2303.04137, Table VII).
+    """How to train; defaults as published for low-dimensional robomimic (arXiv:2303.04137, Table VII).
 
     Attributes:
         max_steps: optimiser steps; the cosine schedule ends there.
@@ -61,7 +63,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.max_steps < 1 or self.batch_size < 1:
             raise ValueError(
-                f"expected max_steps and batch_size >= 1, got max_steps={self.max_steps}, batch_size={self.batch_size}"
+                f"expected max_steps and batch_size >= 1, "
+                f"got max_steps={self.max_steps}, batch_size={self.batch_size}"
             )
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
@@ -87,7 +90,11 @@ class PolicyTrainer:
     """
 
     def __init__(
-        self, network: TransformerForDiffusion, normalizer: Normalizer, demos: Demonstrations, config: TrainConfig
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        demos: Demonstrations,
+        config: TrainConfig,
     ) -> None:
         self.network, self.normalizer, self.demos, self.config = network, normalizer, demos, config
         self.loss = DiffusionLoss(network, normalizer, NoiseSchedule())
@@ -140,7 +147,7 @@ class PolicyTrainer:
 
     @torch.no_grad()
     def validate(self, max_windows: int = 512) -> float:
-        """Loss of the averaged weights on the held-out episodes, on noise that is the same in every call; nan without any."""
+        """Loss of the averaged weights on held-out episodes and fixed noise; nan if none is held out."""
         if self.val_rows is None:
             return float("nan")
         self.network.eval()
@@ -164,7 +171,8 @@ class PolicyTrainer:
         """Continues from a checkpoint. Nothing in the file is executed.
 
         Raises:
-            ValueError: if it is no checkpoint of this class, or was made with another network, data set or configuration.
+            ValueError: if it is no checkpoint of this class, or was made with another network, data set or
+                configuration.
         """
         state = _read_checkpoint(path)
         for name in ("config", "network_config", "data"):
@@ -172,6 +180,7 @@ class PolicyTrainer:
                 raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
         self.network.load_state_dict(state["network"])
         self._ema.load_state_dict(state["ema"])
+        self._ema.to(next(self.network.parameters()).device)
         self._optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
         self._set_schedule()
@@ -182,8 +191,14 @@ class PolicyTrainer:
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             return self.loss(batch.to(device)).get("loss")
 
-    def _averaged_weights(self) -> _Swap:
-        return _Swap(self._ema, self.network)
+    @contextmanager
+    def _averaged_weights(self) -> Iterator[None]:
+        self._ema.store(self.network.parameters())
+        self._ema.copy_to(self.network.parameters())
+        try:
+            yield
+        finally:
+            self._ema.restore(self.network.parameters())
 
     def _set_schedule(self) -> None:
         for group in self._optimizer.param_groups:
@@ -197,7 +212,10 @@ class PolicyTrainer:
         return {
             "config": asdict(self.config),
             "network_config": dict(self.network.config),
-            "data": {"windows": rows, "checksum": sum(float(v.double().sum()) for v in data.values(True, True))},
+            "data": {
+                "windows": rows,
+                "checksum": sum(float(v.double().sum()) for v in data.values(True, True)),
+            },
         }
 
     def _state(self) -> dict[str, Any]:
@@ -208,20 +226,6 @@ class PolicyTrainer:
             "ema": self._ema.state_dict(),
             "optimizer": self._optimizer.state_dict(),
         }
-
-
-class _Swap:
-    """Averaged weights in the network while the block runs."""
-
-    def __init__(self, ema: EMAModel, network: torch.nn.Module) -> None:
-        self._ema, self._network = ema, network
-
-    def __enter__(self) -> None:
-        self._ema.store(self._network.parameters())
-        self._ema.copy_to(self._network.parameters())
-
-    def __exit__(self, *_: object) -> None:
-        self._ema.restore(self._network.parameters())
 
 
 def step_seed(seed: int, step: int) -> int:
@@ -237,9 +241,10 @@ def step_seed(seed: int, step: int) -> int:
 
 
 def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Tensor:
-    """Windows of step ``step``, i64 [batch_size]: every epoch is a permutation of all windows that follows from (seed, epoch).
+    """Windows of step ``step``, i64 [batch_size].
 
-    Batches run on over the end of an epoch, so that every window is used equally often.
+    Every epoch is a permutation of all windows that follows from (seed, epoch). Batches run on over the end
+    of an epoch, so that every window is used equally often.
 
     Examples:
         >>> torch.cat([batch_indices(6, 3, step, seed=0) for step in range(2)]).sort().values.tolist()
@@ -262,7 +267,9 @@ def _read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise
     except Exception as error:
         # torch reports damaged and unsafe files through many exception types.
-        raise ValueError(f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}") from error
+        raise ValueError(
+            f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
+        ) from error
     expected = {"config", "network_config", "data", "step", "network", "ema", "optimizer"}
     if not isinstance(state, dict) or set(state) != expected:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__

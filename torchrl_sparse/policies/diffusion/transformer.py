@@ -1,14 +1,15 @@
 """The denoising transformer of Diffusion Policy (arXiv:2303.04137, "DP-T"), opened up block by block.
 
-The network predicts the noise of an action chunk from the noisy chunk, the diffusion timestep and the last observations.
-Its trunk is a pre-norm decoder; every layer holds three *blocks*, in this order::
+The network predicts the noise of an action chunk from the noisy chunk, the diffusion timestep and the last
+observations. Its trunk is a pre-norm decoder; every layer holds three *blocks*, in this order::
 
     x = x + SA(LN1(x))              self-attention over the chunk (causal)
     x = x + CA(LN2(x), memory)      cross-attention to [timestep, observations]
     x = x + FFN(LN3(x))             feed-forward, hidden size 4 * n_emb
 
-Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods skip, so the forward pass is written as a loop
-over :meth:`TransformerForDiffusion.block`. Parameter names equal those of the published checkpoints (without ``model.``).
+Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods skip, so the forward pass is
+written as a loop over :meth:`TransformerForDiffusion.block`. Parameter names equal those of the published
+checkpoints (without ``model.``).
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ from torch import Tensor, nn
 __all__ = ["TransformerForDiffusion", "optimizer_groups"]
 
 _INIT_STD = 0.02
+_SIZES = ("input_dim", "output_dim", "horizon", "n_obs_steps", "cond_dim", "n_layer", "n_head", "n_emb")
 
 
 class SinusoidalPosEmb(nn.Module):
-    """Sine-cosine embedding of a diffusion timestep: ``[sin(t f_i) | cos(t f_i)]``, ``f_i = 10000^(-i / (dim/2 - 1))``.
+    """Embeds a timestep t as ``[sin(t f_i) | cos(t f_i)]`` with ``f_i = 10000 ** (-i / (dim / 2 - 1))``.
 
     Args:
         dim: size of the embedding, even and at least 4.
@@ -50,7 +52,7 @@ class SinusoidalPosEmb(nn.Module):
 
 
 class TransformerForDiffusion(nn.Module):
-    """Noise predictor ``eps(sample, timestep, cond)`` of Diffusion Policy (arXiv:2303.04137, §IV-A and Table VII).
+    """Noise predictor ``eps(sample, timestep, cond)`` of Diffusion Policy (arXiv:2303.04137, Table VII).
 
     Args:
         input_dim: size of a noisy action.
@@ -63,15 +65,19 @@ class TransformerForDiffusion(nn.Module):
         n_emb: width.
         p_drop_emb: dropout on the embeddings.
         p_drop_attn: dropout in and after every block.
-        causal_attn: action t attends to actions <= t and to memory tokens <= t + 1. Memory token 0 is the timestep, so that
-            action 0 does not see the second observation: this is how the published models are trained.
-        n_cond_layers: 0 makes the condition encoder a token-wise MLP (all published models), more a transformer encoder.
+        causal_attn: action t attends to actions <= t and to memory tokens <= t + 1. Memory token 0 is the
+            timestep, so that action 0 does not see the second observation: this is how the published models
+            are trained.
+        n_cond_layers: 0 makes the condition encoder a token-wise MLP (all published models), more a
+            transformer encoder.
 
     Raises:
         ValueError: if a size is not positive or ``n_emb`` is not a multiple of ``n_head``.
 
     Examples:
-        >>> network = TransformerForDiffusion(input_dim=10, output_dim=10, horizon=10, n_obs_steps=2, cond_dim=19)
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=10, output_dim=10, horizon=10, n_obs_steps=2, cond_dim=19
+        ... )
         >>> sum(p.numel() for p in network.parameters()), network.num_blocks
         (8967434, 24)
         >>> network(torch.zeros(3, 10, 10), 99, torch.zeros(3, 2, 19)).shape
@@ -166,11 +172,18 @@ class TransformerForDiffusion(nn.Module):
         return self.drop(self.input_emb(sample) + self.pos_emb)
 
     def memory(self, timestep: int | Tensor, cond: Tensor) -> Tensor:
-        """Condition tokens [B, 1 + To, n_emb] of ``timestep`` (int, 0-d or [B]) and observations ``cond`` [B, To, cond_dim]."""
+        """Condition tokens, [B, 1 + To, n_emb].
+
+        Args:
+            timestep: a number, or i64 [B].
+            cond: encoded observations [B, To, cond_dim].
+        """
         self._check("cond", cond, (self.n_obs_steps, self.cond_dim))
         timestep = torch.as_tensor(timestep, device=cond.device)
         if timestep.shape not in ((), (1,), (cond.shape[0],)):
-            raise ValueError(f"timestep must be a number or have shape [{cond.shape[0]}], got {list(timestep.shape)}")
+            raise ValueError(
+                f"timestep must be a number or have shape [{cond.shape[0]}], got {list(timestep.shape)}"
+            )
         time_token = self.time_emb(timestep.expand(cond.shape[0])).to(cond.dtype)[:, None]
         tokens = torch.cat((time_token, self.cond_obs_emb(cond)), dim=1)
         return self.encoder(self.drop(tokens + self.cond_pos_emb))
@@ -184,9 +197,8 @@ class TransformerForDiffusion(nn.Module):
             memory: condition tokens of :meth:`memory`; only CA reads them.
 
         Examples:
-            >>> net = TransformerForDiffusion(
-            ...     input_dim=2, output_dim=2, horizon=4, n_obs_steps=2, cond_dim=3, n_layer=1, n_head=2, n_emb=8
-            ... ).eval()
+            >>> sizes = dict(input_dim=2, output_dim=2, horizon=4, n_obs_steps=2, cond_dim=3)
+            >>> net = TransformerForDiffusion(**sizes, n_layer=1, n_head=2, n_emb=8).eval()
             >>> x, memory = net.embed(torch.ones(1, 4, 2)), net.memory(0, torch.ones(1, 2, 3))
             >>> for index in range(net.num_blocks):
             ...     x = x + net.block(index, x, memory)
@@ -211,7 +223,13 @@ class TransformerForDiffusion(nn.Module):
         return self.head(self.ln_f(x))
 
     def forward(self, sample: Tensor, timestep: int | Tensor, cond: Tensor) -> Tensor:
-        """Predicted noise [B, H, output_dim] of ``sample`` [B, H, input_dim] at ``timestep`` given ``cond`` [B, To, cond_dim]."""
+        """Predicted noise, [B, H, output_dim].
+
+        Args:
+            sample: noisy actions [B, H, input_dim].
+            timestep: a number, or i64 [B].
+            cond: encoded observations [B, To, cond_dim].
+        """
         x = self.embed(sample)
         memory = self.memory(timestep, cond)
         for index in range(self.num_blocks):
@@ -221,11 +239,13 @@ class TransformerForDiffusion(nn.Module):
     @staticmethod
     def _check(name: str, value: Tensor, trailing: tuple[int, int]) -> None:
         if value.ndim != 3 or tuple(value.shape[1:]) != trailing:
-            raise ValueError(f"{name} must have shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}")
+            raise ValueError(
+                f"{name} must have shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
+            )
 
 
 def optimizer_groups(network: nn.Module, weight_decay: float) -> list[dict]:
-    """Parameter groups for AdamW as published: decay on Linear and attention weights, none on biases, norms, positions.
+    """Parameter groups for AdamW as published: only Linear and attention weights decay.
 
     Args:
         network: any module.
@@ -262,10 +282,12 @@ def _causal_masks(horizon: int, num_memory: int) -> tuple[Tensor, Tensor]:
 
 
 def _check_config(config: dict) -> None:
-    for name in ("input_dim", "output_dim", "horizon", "n_obs_steps", "cond_dim", "n_layer", "n_head", "n_emb"):
+    for name in _SIZES:
         if config[name] < 1:
             raise ValueError(f"{name} must be at least 1, got {config[name]}")
     if config["n_emb"] % config["n_head"]:
-        raise ValueError(f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}")
+        raise ValueError(
+            f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"
+        )
     if config["n_cond_layers"] < 0:
         raise ValueError(f"n_cond_layers must be >= 0, got {config['n_cond_layers']}")
