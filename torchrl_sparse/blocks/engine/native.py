@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.packing import Model, PackedNetwork
 from torchrl_sparse.blocks.engine.plan import Program, ProgramCache
 from torchrl_sparse.blocks.engine.reference import check_query
+from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ class NativeEngine:
         self._level = _level(instruction_set)
         self._programs = ProgramCache()
         self._dense = np.zeros((schedule.num_inference_steps, network.num_blocks), bool)
-        self._parameters = list(network.parameters())
+        self._watch = WeightWatch(network)
         self._packed = (None, None)
         self._current()
 
@@ -223,7 +224,7 @@ class NativeEngine:
 
     def _current(self) -> PackedNetwork:
         """The packed weights, packed anew if the network has changed."""
-        version = [(parameter.data_ptr(), parameter._version) for parameter in self._parameters]
+        version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
         if known != version:
             packed = PackedNetwork(self.network, self.schedule, getattr(torch, self.weights))

@@ -75,7 +75,10 @@ def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.de
 
 
 def run_loop(tables: Tables, loop: Loop, noise: Tensor, cond: Tensor, reuse: Reuse) -> Tensor:
-    """Actions [B, H, A] of one query; all its memory is allocated here, not in its steps."""
+    """Actions [B, H, A] of one query.
+
+    Buffers are allocated once per query; in its steps only PyTorch's operators allocate, what they return.
+    """
     return _Query(tables, loop, noise, cond, reuse).run()
 
 
