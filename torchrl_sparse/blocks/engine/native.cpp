@@ -64,6 +64,7 @@ namespace {
 enum Op { COMPUTE, REUSE, COLLAPSE };
 enum Epilogue { STORE, GELU, MISH };
 constexpr int PANEL = 32;
+constexpr int AHEAD = 128;  // rows of a panel between the weights that are fetched and those that are used
 using half = uint16_t;
 
 constexpr int padded(int n) { return (n + PANEL - 1) / PANEL * PANEL; }
@@ -103,10 +104,12 @@ struct Buffers {
 
 #define VECTOR 4
 #define LEVEL portable
+#define REGISTERS 16
 #define MAX_ROWS 6
 #include "native.cpp"
 #undef VECTOR
 #undef LEVEL
+#undef REGISTERS
 #undef MAX_ROWS
 
 #if defined(__x86_64__)
@@ -118,10 +121,12 @@ struct Buffers {
 #endif
 #define VECTOR 8
 #define LEVEL avx2
+#define REGISTERS 16
 #define MAX_ROWS 6  // 6 rows x 2 vectors of sums, 2 of weights, 1 of activations: 15 of 16 registers
 #include "native.cpp"
 #undef VECTOR
 #undef LEVEL
+#undef REGISTERS
 #undef MAX_ROWS
 #if defined(__clang__)
 #pragma clang attribute pop
@@ -133,10 +138,12 @@ struct Buffers {
 #endif
 #define VECTOR 16
 #define LEVEL avx512
-#define MAX_ROWS 14  // 14 x 2 sums, 2 of weights, 1 of activations: 31 of 32 registers
+#define REGISTERS 32
+#define MAX_ROWS 16  // the longest published horizon: every weight is read once
 #include "native.cpp"
 #undef VECTOR
 #undef LEVEL
+#undef REGISTERS
 #undef MAX_ROWS
 #if defined(__clang__)
 #pragma clang attribute pop
@@ -193,7 +200,7 @@ typedef float Unaligned __attribute__((vector_size(4 * VECTOR), aligned(4), may_
 
 INLINE V load(const float* p) { return *(const Unaligned*)p; }
 INLINE void store(float* p, V v) { *(Unaligned*)p = v; }
-INLINE V splat(float f) { return V{} + f; }
+INLINE V splat(float f) { return f - V{}; }  // not V{} + f, which is not f if f is -0 and so costs an addition
 
 INLINE V load(const half* p) {
 #if VECTOR == 16
@@ -259,31 +266,33 @@ INLINE V mish(V x) {
     return x * (n / (n + 2.f));
 }
 
-// y[row] = bias[row] + x[row] * panel, for MR rows and the 32 columns of a panel, in strips of two vectors.
+// y[row] = bias[row] + x[row] * panel, for MR rows and the 32 columns of a panel, in strips of as many vectors as there are
+// registers for. The processor does not fetch fast enough by itself what comes next: panels lie one behind the other.
 template <int MR, class T>
-void tile(const float* x, int ldx, const T* panel, int rows, const float* bias, int ld_bias, float* y, int ldy) {
-    for (int strip = 0; strip < PANEL; strip += 2 * VECTOR) {
+void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const float* bias, ptrdiff_t ld_bias, float* y,
+          ptrdiff_t ldy) {
+    constexpr int N = 2 * MR + 3 <= REGISTERS ? 2 : 1;
+    for (int strip = 0; strip < PANEL; strip += N * VECTOR) {
+        const float* x = input;
         const T* w = panel + strip;
-        V a[MR][2];
+        V sums[MR][N], weights[N];
 #pragma GCC unroll 16
-        for (int m = 0; m < MR; m++) {
-            a[m][0] = load(bias + m * ld_bias + strip);
-            a[m][1] = load(bias + m * ld_bias + strip + VECTOR);
-        }
-        for (int k = 0; k < rows; k++, w += PANEL) {
-            const V w0 = load(w), w1 = load(w + VECTOR);
+        for (int m = 0; m < MR; m++)
+            for (int n = 0; n < N; n++) sums[m][n] = load(bias + m * ld_bias + strip + n * VECTOR);
+        for (int k = 0; k < rows; k++, w += PANEL, x++) {
+            for (int n = 0; n < N; n++) {
+                __builtin_prefetch(w + AHEAD * PANEL + n * VECTOR, 0, 2);
+                weights[n] = load(w + n * VECTOR);
+            }
 #pragma GCC unroll 16
             for (int m = 0; m < MR; m++) {
-                const V f = splat(x[m * ldx + k]);
-                a[m][0] += w0 * f;
-                a[m][1] += w1 * f;
+                const V f = splat(x[m * ldx]);
+                for (int n = 0; n < N; n++) sums[m][n] += weights[n] * f;
             }
         }
 #pragma GCC unroll 16
-        for (int m = 0; m < MR; m++) {
-            store(y + m * ldy + strip, a[m][0]);
-            store(y + m * ldy + strip + VECTOR, a[m][1]);
-        }
+        for (int m = 0; m < MR; m++)
+            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, sums[m][n]);
     }
 }
 
