@@ -13,7 +13,7 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.evaluation.engine_cases import EngineCase, make_network
+from torchrl_sparse.evaluation.engine_cases import EngineCase, Variant, make_network
 from torchrl_sparse.evaluation.engine_report import (
     format_engine_table,
     plot_engine_times,
@@ -50,6 +50,8 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
     compiled = config.compile and not config.quick and entry.get("compile", False)
     case = EngineCase(network, entry.batch, num_steps=QUICK_STEPS if config.quick else 100, compiled=compiled)
     variants = case.variants()
+    if compiled:
+        drop_uncompilable(variants)
     repeats = 1 if config.quick else entry.repeats
     with tqdm(total=repeats, unit="round", desc=name) as bar:
         latency = measure_latency(
@@ -59,6 +61,15 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
             on_round=lambda done, total: bar.update(done - bar.n),
         )
     return shape_results(case, variants, latency, config.threads)
+
+
+def drop_uncompilable(variants: dict[str, Variant]) -> None:
+    """Compile what is to be compiled; without a compiler, a line that says so takes its place."""
+    try:
+        variants["eager-compiled dense"].call()
+    except RuntimeError as error:
+        del variants["eager-compiled dense"]
+        print(f"no eager-compiled: {str(error).splitlines()[0]}")
 
 
 if __name__ == "__main__":

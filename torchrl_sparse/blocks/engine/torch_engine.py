@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.costs import time_blocks
-from torchrl_sparse.blocks.engine.graphs import GraphedQuery
+from torchrl_sparse.blocks.engine.graphs import GraphCache
 from torchrl_sparse.blocks.engine.linear import can_pack
 from torchrl_sparse.blocks.engine.reference import check_query
 from torchrl_sparse.blocks.engine.torch_blocks import Tables
@@ -38,8 +38,8 @@ class TorchEngine:
     (:class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). Dropout is never applied.
 
     Rows of a batch that compute a block are gathered, the block runs on them alone, its results are
-    scattered; where every row agrees, as with one mask for all, nothing is. On a CUDA device a dense query
-    replays one CUDA graph.
+    scattered; where every row agrees, as with one mask for all, nothing is. On a CUDA device a query
+    whose masks came before replays a CUDA graph of its own.
 
     Args:
         network: the denoiser, on any device; float32 is what it is made for, float64 works.
@@ -89,26 +89,28 @@ class TorchEngine:
         tables = self._current()[0]
         return time_blocks(make_walk(tables), tables.num_layers, repeats, tables.device)
 
-    def _current(self) -> tuple[Tables, GraphedQuery | None]:
+    def _current(self) -> tuple[Tables, GraphCache | None]:
         """Tables of the present weights, and the CUDA graphs made with them."""
         state = self._watch.state()
         known, tables, graphs = self._known  # read and replaced in one go: other threads may do the same
         if known != state:
             with torch.inference_mode():
                 tables = Tables(self._network, self._schedule)
-            graphs = GraphedQuery(partial(self._dense, tables)) if tables.device.type == "cuda" else None
+            graphs = GraphCache() if tables.device.type == "cuda" else None
             self._known = state, tables, graphs
         return tables, graphs
 
     def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
         tables, graphs = self._current()
-        host = None if mask is None else mask.cpu().numpy()
-        if host is None or not host.any():
-            return self._dense(tables, noise, cond) if graphs is None else graphs(noise, cond)
-        if (host == host[0]).all():
-            host = host[:1]
-        return run_loop(tables, build_loop(host, tables.device), noise, cond, reuse)
+        loop = build_loop(self._host_masks(mask), tables.device)
+        if graphs is None:
+            return run_loop(tables, loop, noise, cond, reuse)
+        query = partial(run_loop, tables, loop, reuse=reuse)
+        return graphs((loop, reuse, noise.shape), query, noise, cond)
 
-    def _dense(self, tables: Tables, noise: Tensor, cond: Tensor) -> Tensor:
-        nothing = np.zeros((1, self._schedule.num_inference_steps, self._network.num_blocks), bool)
-        return run_loop(tables, build_loop(nothing, tables.device), noise, cond, "block")
+    def _host_masks(self, mask: Tensor | None) -> np.ndarray:
+        """The masks on the host, a single one if that is that of all rows."""
+        if mask is None:
+            return np.zeros((1, self._schedule.num_inference_steps, self._network.num_blocks), bool)
+        host = mask.cpu().numpy()
+        return host[:1] if (host == host[0]).all() else host

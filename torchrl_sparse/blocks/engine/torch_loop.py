@@ -23,9 +23,9 @@ __all__ = ["Loop", "build_loop", "make_walk", "run_loop"]
 _CA = BLOCK_TYPES.index("CA")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Loop:
-    """The program of a batch.
+    """The program of a batch; compares by identity.
 
     Attributes:
         steps: for each denoising step its operations (operation, first, last, rows), see
