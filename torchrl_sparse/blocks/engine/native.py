@@ -1,8 +1,9 @@
 """The native engine: one call of compiled code for each action chunk, on the CPU.
 
-``native.cpp`` holds the loop, :mod:`~torchrl_sparse.blocks.engine.packing` prepares the weights and tables that it reads,
-:mod:`~torchrl_sparse.blocks.engine.plan` the program that it executes. It is built when the package is installed, as a plain
-shared library that knows nothing of Python or PyTorch, and is called through ctypes, which releases the interpreter's lock.
+``native.cpp`` holds the loop, :mod:`~torchrl_sparse.blocks.engine.packing` prepares the weights and tables that
+it reads, :mod:`~torchrl_sparse.blocks.engine.plan` the program that it executes. It is built when the package is
+installed, as a plain shared library that knows nothing of Python or PyTorch, and is called through ctypes, which
+releases the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import importlib.machinery
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from ctypes import POINTER, c_int32, c_int64, c_void_p
 from functools import lru_cache
@@ -42,15 +44,18 @@ class _Program(ctypes.Structure):
 
 @lru_cache(maxsize=1)
 def _library() -> ctypes.CDLL | str:
-    """The compiled library, or why there is none."""
-    suffixes = importlib.machinery.EXTENSION_SUFFIXES
-    paths = [Path(__file__).with_name("_native" + suffix) for suffix in suffixes]
+    """The compiled library, or why there is none; then it also warns, once in a process."""
+    library = _load(Path(__file__).parent)
+    if isinstance(library, str):
+        warnings.warn(f"torchrl_sparse runs without its native engine: {library}", stacklevel=2)
+    return library
+
+
+def _load(folder: Path) -> ctypes.CDLL | str:
+    paths = [folder / f"_native{suffix}" for suffix in importlib.machinery.EXTENSION_SUFFIXES]
     path = next((path for path in paths if path.exists()), None)
     if path is None:
-        return (
-            f"{paths[0].name} was not built; install a C++17 compiler (g++ or clang++) and then the package "
-            "again to get it"
-        )
+        return f"{paths[0].name} was not built (install a C++17 compiler, g++ or clang++, then this package again)"
     try:
         return _declare(ctypes.CDLL(str(path)))
     except (OSError, AttributeError) as error:
@@ -85,8 +90,8 @@ def native_available() -> tuple[bool, str]:
 def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
     """Whether the native engine can run ``network`` on this machine, and if not, why.
 
-    It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0, as all
-    published models have), a noise vector as large as an action, and at most 63 observation steps.
+    It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0,
+    as all published models have), a noise vector as large as an action, and at most 63 observation steps.
     """
     available, reason = native_available()
     if not available:
@@ -108,15 +113,15 @@ def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
 class NativeEngine:
     """Runs queries in compiled code. Not differentiable.
 
-    The engine answers for the weights that the network has: it notices in-place changes (optimisers, ``load_state_dict``) and
-    moved storage, and then packs again; a parameter that is replaced by another object it does not see.
-    A row of a batch is computed exactly as it would be alone. Rows are spread over ``threads`` threads, a query is never
-    split. Calls from several threads may overlap.
+    The weights are packed when the engine is made, and again when the network's have changed (see
+    :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). A row of a batch is computed exactly as it would be
+    alone. Rows are spread over ``threads`` threads, a query is never split. Calls from several threads may overlap.
 
     Args:
         network: the denoiser, in eval mode; see :func:`native_supports`.
         schedule: the sampler.
-        weights: ``"float32"``, or ``"float16"`` for half the memory traffic at an error of about 1e-3 of the action range.
+        weights: ``"float32"``, or ``"float16"`` for half the memory and its traffic at an error of about 1e-3 of the
+            action range.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
         threads: for the rows of a batch; None takes ``torch.get_num_threads()`` at each call.
 
@@ -170,7 +175,9 @@ class NativeEngine:
         return f"{INSTRUCTION_SETS[self._level - 1]}, {self.weights} weights"
 
     @torch.no_grad()
-    def denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block") -> Tensor:
+    def denoise(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+    ) -> Tensor:
         """Normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
         Raises:
@@ -199,11 +206,15 @@ class NativeEngine:
         return actions
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
-        """Seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``: the best of ``repeats`` walks over all
-        layers, so that weights come from where they come from in a query."""
+        """Seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``.
+
+        The best of ``repeats`` walks over all layers, so that weights come from where they do in a query.
+        """
         packed = self._current()
         scratch = self._scratch(packed, len(BLOCK_TYPES)).zero_()
-        return {name: self._time_block(packed, kind, repeats, scratch) for kind, name in enumerate(BLOCK_TYPES)}
+        return {
+            name: self._time_block(packed, kind, repeats, scratch) for kind, name in enumerate(BLOCK_TYPES)
+        }
 
     def _time_block(self, packed: PackedNetwork, kind: int, repeats: int, scratch: Tensor) -> float:
         best = float("inf")
@@ -236,7 +247,9 @@ class NativeEngine:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
         for name, tensor in (("noise", noise), ("cond", cond)):
             if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-                raise ValueError(f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}")
+                raise ValueError(
+                    f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}"
+                )
 
 
 def _level(instruction_set: str | None) -> int:
@@ -244,5 +257,7 @@ def _level(instruction_set: str | None) -> int:
     if instruction_set is None:
         return len(available)
     if instruction_set not in available:
-        raise ValueError(f"instruction_set: expected one of {list(available)} on this CPU, got {instruction_set!r}")
+        raise ValueError(
+            f"instruction_set: expected one of {list(available)} on this CPU, got {instruction_set!r}"
+        )
     return available.index(instruction_set) + 1

@@ -17,7 +17,9 @@ A matrix [columns, rows] of PyTorch becomes panels of 32 columns, [panel, row, 3
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import mmap
 from ctypes import POINTER, c_float, c_int32, c_void_p
 from typing import TYPE_CHECKING
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["Model", "PackedNetwork", "pack_panels"]
 
 PANEL = 32
+_CACHE_LINE = 64
 
 
 class _Matrix(ctypes.Structure):
@@ -50,7 +53,18 @@ class _Layer(ctypes.Structure):
 class Model(ctypes.Structure):
     """``struct Model`` of native.cpp."""
 
-    _SIZES = ("horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps", "causal", "half")
+    _SIZES = (
+        "horizon",
+        "width",
+        "layers",
+        "heads",
+        "obs_steps",
+        "action_dim",
+        "cond_dim",
+        "steps",
+        "causal",
+        "half",
+    )
     _fields_ = [
         *((name, c_int32) for name in _SIZES),
         ("clip", c_float),
@@ -81,8 +95,41 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     weight = functional.pad(weight, (0, 0, 0, -columns % PANEL))
     packed = weight.view(-1, PANEL, rows).transpose(1, 2).to(dtype).contiguous()
     if not packed.isfinite().all():
-        raise ValueError(f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}")
+        raise ValueError(
+            f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
+        )
     return packed
+
+
+class _Arena:
+    """Memory for constants, in large pages where the system has them: weights are streamed, and with small pages the
+    processor spends a tenth of that time on looking up addresses."""
+
+    _BLOCK = 32 << 20
+
+    def __init__(self) -> None:
+        self._blocks: list[Tensor] = []
+        self._used = self._size = 0
+
+    def keep(self, tensor: Tensor) -> int:
+        """Copy ``tensor`` and return the address of the copy, on a cache line."""
+        tensor = tensor.contiguous().view(-1).view(torch.uint8)
+        if self._used + tensor.numel() > self._size:
+            self._size = max(self._BLOCK, tensor.numel())
+            self._used = 0
+            self._blocks.append(torch.frombuffer(_pages(self._size), dtype=torch.uint8))
+        place = self._blocks[-1][self._used : self._used + tensor.numel()].copy_(tensor)
+        self._used += -(-tensor.numel() // _CACHE_LINE) * _CACHE_LINE
+        return place.data_ptr()
+
+
+def _pages(size: int) -> mmap.mmap:
+    memory = mmap.mmap(-1, size)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        # A kernel without large pages refuses, and nothing is lost.
+        with contextlib.suppress(OSError):
+            memory.madvise(mmap.MADV_HUGEPAGE)
+    return memory
 
 
 class PackedNetwork:
@@ -97,9 +144,11 @@ class PackedNetwork:
         model: the structure that native.cpp reads.
     """
 
-    def __init__(self, network: TransformerForDiffusion, schedule: NoiseSchedule, weights: torch.dtype) -> None:
+    def __init__(
+        self, network: TransformerForDiffusion, schedule: NoiseSchedule, weights: torch.dtype
+    ) -> None:
         self._weights = weights
-        self._kept: list[object] = []
+        self._arena = _Arena()
         self._heads = network.n_head
         self._head_size = network.n_emb // network.n_head
         self._width = -(-network.n_emb // PANEL) * PANEL
@@ -116,7 +165,7 @@ class PackedNetwork:
         valid[: network.n_emb] = 1  # the zeros behind it serve as a bias
         columns = ("noise_scale", "signal_scale", "clean_weight", "sample_weight", "eps_weight", "spread")
         layer_array = (_Layer * len(layers))(*layers)
-        self._kept.append(layer_array)
+        self._layers = layer_array  # the structure only points to it
         return Model(
             horizon=network.horizon,
             width=network.n_emb,
@@ -153,12 +202,16 @@ class PackedNetwork:
         query, query_bias = self._per_head(query), self._per_head(query_bias)
         return _Layer(
             qkv=self._matrix(self._padded_heads(qkv), self._padded_heads(bias)),
-            out=self._matrix(self._per_head(attention.out_proj.weight.T).flatten(0, 1).T, attention.out_proj.bias),
+            out=self._matrix(
+                self._per_head(attention.out_proj.weight.T).flatten(0, 1).T, attention.out_proj.bias
+            ),
             up=self._matrix(*_after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
             down=self._matrix(layer.linear2.weight, layer.linear2.bias),
             kv=self._matrix(*(self._padded_heads(tensor) for tensor in key_value)),
             fold_q=self._keep(torch.stack([pack_panels(head.T, self._weights) for head in query])),
-            fold_o=self._keep(torch.stack([pack_panels(head.T, self._weights) for head in self._per_head(out.T)])),
+            fold_o=self._keep(
+                torch.stack([pack_panels(head.T, self._weights) for head in self._per_head(out.T)])
+            ),
             query_bias=self._keep(query_bias),
             cross_bias=self._keep(self._padded_width(layer.multihead_attn.out_proj.bias)),
         )
@@ -172,14 +225,21 @@ class PackedNetwork:
         tables = {"time_key": [], "time_value": [], "time_bias": []}
         for layer in network.decoder.layers:
             weight, bias = (tensor.unflatten(0, (3, -1))[1:] for tensor in _in_proj(layer.multihead_attn))
-            key, value = (torch.einsum("nod,kd->nko", weight, token) + bias[:, None]).unflatten(2, (self._heads, -1))
+            key, value = (torch.einsum("nod,kd->nko", weight, token) + bias[:, None]).unflatten(
+                2, (self._heads, -1)
+            )
             query, query_bias, out = _cross_matrices(layer)
             query, out = query.unflatten(0, (self._heads, -1)), out.unflatten(1, (self._heads, -1))
             tables["time_key"].append(torch.einsum("khc,hcd->khd", key, query))
             tables["time_value"].append(torch.einsum("khc,dhc->khd", value, out))
-            tables["time_bias"].append(torch.einsum("khc,hc->kh", key, query_bias.unflatten(0, (self._heads, -1))))
+            tables["time_bias"].append(
+                torch.einsum("khc,hc->kh", key, query_bias.unflatten(0, (self._heads, -1)))
+            )
         stacked = {name: torch.stack(layers, dim=1) for name, layers in tables.items()}
-        return {name: table if name == "time_bias" else self._padded_width(table) for name, table in stacked.items()}
+        return {
+            name: table if name == "time_bias" else self._padded_width(table)
+            for name, table in stacked.items()
+        }
 
     # -- padding -----------------------------------------------------------------------------------------------
 
@@ -191,7 +251,9 @@ class PackedNetwork:
     def _padded_heads(self, parts: Tensor) -> Tensor:
         """[n, heads * size, ...] as [n * part, ...]: padded heads, and every part padded to whole panels."""
         flat = [self._per_head(part).flatten(0, 1) for part in parts]
-        return torch.cat([functional.pad(part, (0, 0) * (part.ndim - 1) + (0, -len(part) % PANEL)) for part in flat])
+        return torch.cat(
+            [functional.pad(part, (0, 0) * (part.ndim - 1) + (0, -len(part) % PANEL)) for part in flat]
+        )
 
     def _padded_width(self, tensor: Tensor) -> Tensor:
         return functional.pad(tensor, (0, self._width - tensor.shape[-1]))
@@ -204,12 +266,8 @@ class PackedNetwork:
         return _Matrix(self._keep(packed), self._keep(bias), weight.shape[1], len(packed) * PANEL)
 
     def _keep(self, tensor: Tensor) -> int:
-        """Address of ``tensor`` as f32, or as it is if it has been packed."""
-        if tensor.dtype != torch.float16:
-            tensor = tensor.float()
-        tensor = tensor.clone(memory_format=torch.contiguous_format)
-        self._kept.append(tensor)
-        return tensor.data_ptr()
+        """Address of a copy of ``tensor`` as f32, or as it is if it has been packed."""
+        return self._arena.keep(tensor if tensor.dtype == torch.float16 else tensor.float())
 
 
 def _after_norm(norm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
