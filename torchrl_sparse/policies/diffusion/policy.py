@@ -244,7 +244,11 @@ class ActionDenoiser(TensorDictModuleBase):
     out_keys = [keys.CHUNK, keys.FLOPS]
 
     def __init__(
-        self, network: TransformerForDiffusion, normalizer: Normalizer, schedule: NoiseSchedule, engine: EngineName
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        schedule: NoiseSchedule,
+        engine: EngineName,
     ):
         super().__init__()
         self.network = network
