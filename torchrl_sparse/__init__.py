@@ -24,6 +24,7 @@ _HOME = {
     "Schedule": "blocks.static",
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
+    "make_engine": "blocks.engine.factory",
     "ChunkExecutor": "control.chunk_executor",
     "rollout_episodes": "evaluation.paired",
     "measure_latency": "evaluation.latency",
@@ -33,6 +34,7 @@ __all__ = [*_HOME]
 
 if TYPE_CHECKING:
     from torchrl_sparse.blocks.bac import BAC
+    from torchrl_sparse.blocks.engine.factory import make_engine
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform

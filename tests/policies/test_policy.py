@@ -20,6 +20,7 @@ def request(*batch, seed=0):
 
 
 def test_dense_chunk_is_the_textbook_loop(policy):
+    policy.engine = "reference"
     td = policy(request(3))
     cond = policy.normalizer.normalize_state(request(3)[keys.HISTORY_STATE])
     noise = policy.sample_noise(td[keys.SEED].squeeze(-1))

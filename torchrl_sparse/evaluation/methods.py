@@ -59,7 +59,9 @@ def make_method(
         plan = Uniform(interval=-(-policy.num_inference_steps // num_updates))
     elif name in SCHEDULES:
         plan = _bac(name, policy, num_updates, schedules, calibration)
-    return DiffusionPolicy(policy.network, policy.normalizer, schedule=schedule, plan=plan)
+    return DiffusionPolicy(
+        policy.network, policy.normalizer, schedule=schedule, plan=plan, engine=policy.engine
+    )
 
 
 def _bac(name, policy, num_updates, schedules, calibration) -> Planner:

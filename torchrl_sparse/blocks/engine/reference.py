@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["FeatureRecorder", "denoise"]
+__all__ = ["FeatureRecorder", "check_query", "denoise"]
 
 
 class FeatureRecorder:
@@ -94,8 +94,7 @@ def denoise(
         >>> denoise(network, NoiseSchedule("ddim", 10), noise, cond, mask).shape
         torch.Size([3, 4, 7])
     """
-    _check_inputs(network, scheduler, noise, cond, mask)
-    check_reuse(reuse)
+    check_query(network, scheduler, noise, cond, mask, reuse)
     plan = _Plan(mask)
     latest: list[Tensor | None] = [None] * (network.num_blocks if reuse == "block" else len(BLOCK_TYPES))
     sample = noise[:, 0]
@@ -142,7 +141,19 @@ class _Plan:
         return self._computed[:, step, block].nonzero().flatten().to(self._device)
 
 
-def _check_inputs(network, scheduler, noise: Tensor, cond: Tensor, mask: Tensor | None) -> None:
+def check_query(
+    network: TransformerForDiffusion,
+    scheduler: NoiseSchedule,
+    noise: Tensor,
+    cond: Tensor,
+    mask: Tensor | None = None,
+    reuse: str = "block",
+) -> None:
+    """Refuse what no engine can run; the arguments are those of :func:`denoise`.
+
+    Raises:
+        ValueError: naming what was expected and what came.
+    """
     num_steps, batch = scheduler.num_inference_steps, len(cond)
     for name, tensor, expected in (
         ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
@@ -152,3 +163,4 @@ def _check_inputs(network, scheduler, noise: Tensor, cond: Tensor, mask: Tensor 
             raise ValueError(f"{name}: expected shape {list(expected)}, got {list(tensor.shape)}")
     if mask is not None:
         validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
+    check_reuse(reuse)

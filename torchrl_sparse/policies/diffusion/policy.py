@@ -18,6 +18,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
+from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
@@ -40,6 +42,10 @@ class DiffusionPolicy(TensorDictSequential):
         normalizer: of states and actions.
         schedule: sampler; DDPM with all training steps by default.
         plan: what to skip; nothing by default.
+        engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
+            fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the
+            same mask and seed. In training mode, and where the condition requires gradients, the differentiable
+            reference runs whatever is chosen.
 
     Attributes:
         plan: the planner. Assign another to change the method: ``policy.plan = planner``.
@@ -61,12 +67,13 @@ class DiffusionPolicy(TensorDictSequential):
         *,
         schedule: NoiseSchedule | None = None,
         plan: Planner | None = None,
+        engine: EngineName = "auto",
     ):
         schedule = NoiseSchedule() if schedule is None else schedule
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer),
             plan=Dense(),
-            denoise=ActionDenoiser(network, normalizer, schedule),
+            denoise=ActionDenoiser(network, normalizer, schedule, engine),
         )
         super().__init__(stages)
         self._fingerprint: str | None = None
@@ -140,6 +147,29 @@ class DiffusionPolicy(TensorDictSequential):
             self._fingerprint = digest.hexdigest()[:16]
         return self._fingerprint
 
+    @property
+    def engine(self) -> EngineName:
+        """The chosen engine; assign another name to change it."""
+        return self.module["denoise"].engine.name
+
+    @engine.setter
+    def engine(self, name: EngineName) -> None:
+        self.module["denoise"].engine = EngineSlot(name)
+
+    def engine_info(self) -> str:
+        """Which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
+        ``"auto"`` had to do without the native one, also why.
+
+        Raises:
+            ValueError: if the chosen engine cannot run this network here.
+        """
+        return self.module["denoise"].engine.describe(self.network, self.schedule)
+
+    def block_costs(self) -> dict[str, BlockCost]:
+        """Seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
+        slot = self.module["denoise"].engine
+        return engine_block_costs(slot.get(self.network, self.schedule), self.network)
+
     # -- running it ----------------------------------------------------------------------------------------------------
 
     def sample_noise(self, seed: Tensor) -> Tensor:
@@ -162,14 +192,14 @@ class DiffusionPolicy(TensorDictSequential):
         )
 
     @classmethod
-    def from_pretrained(cls, path: str | Path) -> DiffusionPolicy:
-        """Reads what `save_pretrained` wrote. Nothing in the files is executed.
+    def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
+        """Reads what `save_pretrained` wrote, to run in ``engine``. Nothing in the files is executed.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
         network, normalizer, schedule = read_pretrained(Path(path))
-        return cls(network, normalizer, schedule=NoiseSchedule(**schedule))
+        return cls(network, normalizer, schedule=NoiseSchedule(**schedule), engine=engine)
 
 
 class ObservationEncoder(TensorDictModuleBase):
@@ -215,12 +245,19 @@ class ActionDenoiser(TensorDictModuleBase):
     in_keys = [keys.COND, keys.SEED, keys.PRUNE_MASK]
     out_keys = [keys.CHUNK, keys.FLOPS]
 
-    def __init__(self, network: TransformerForDiffusion, normalizer: Normalizer, schedule: NoiseSchedule):
+    def __init__(
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        schedule: NoiseSchedule,
+        engine: EngineName,
+    ):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
         self.schedule = schedule
         self.reuse = "block"
+        self.engine = EngineSlot(engine)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
@@ -228,10 +265,15 @@ class ActionDenoiser(TensorDictModuleBase):
         mask = tensordict.get(keys.PRUNE_MASK).reshape(cond.shape[0], -1, self.network.num_blocks)
         shape = (self.network.horizon, self.network.input_dim)
         noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.schedule.num_inference_steps, shape)
-        actions = denoise(self.network, self.schedule, noise, cond, mask, reuse=self.reuse)
+        actions = self._denoise(noise, cond, mask)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         return tensordict.set(keys.FLOPS, query_flops(self.network, mask).reshape(*batch, 1))
+
+    def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor) -> Tensor:
+        if self.network.training or cond.requires_grad:
+            return denoise(self.network, self.schedule, noise, cond, mask, reuse=self.reuse)
+        return self.engine.get(self.network, self.schedule).denoise(noise, cond, mask, self.reuse)
 
 
 def _synchronised_clock(device: torch.device) -> float:

@@ -1,0 +1,76 @@
+"""Benchmarks the engines: what a query costs in the published implementation, and in ours, dense and pruned.
+
+    python recipes/benchmark_engine.py out=outputs/engine threads=1
+
+Writes OUT/engine.json, a table and a bar chart per case. Times are medians, all variants of a case interleaved in one process.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from torchrl_sparse.evaluation.engine_cases import EngineCase, Variant, make_network
+from torchrl_sparse.evaluation.engine_report import (
+    format_engine_table,
+    plot_engine_times,
+    save_engine_results,
+    shape_results,
+)
+from torchrl_sparse.evaluation.latency import describe_machine, measure_latency, num_threads
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+QUICK_STEPS = 20
+
+
+@hydra.main(version_base=None, config_path=".", config_name="benchmark_engine")
+def main(config: DictConfig) -> None:
+    out = Path(config.out)
+    results = {"schema": 1, "machine": describe_machine(threads=config.threads), "shapes": {}}
+    for entry in config.cases:
+        name = f"{entry.shape}_b{entry.batch}"
+        with num_threads(config.threads):
+            results["shapes"][name] = run_case(name, entry, config)
+        # After each case, so that a run that is stopped leaves what it has.
+        save_engine_results(results, out / "engine.json")
+        shape = results["shapes"][name]
+        plot_engine_times(name, shape, results["machine"], out / f"engine_{name}.png")
+        print(f"\n{format_engine_table(name, shape)}\n")
+    print(f"files are in {out}")
+
+
+def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
+    network = make_network(entry.shape, quick=config.quick)
+    if entry.shape == "low_dim" and config.policy is not None:
+        network = DiffusionPolicy.from_pretrained(config.policy).network
+    # Compiling takes minutes and changes nothing with the batch, so one case shows it.
+    compiled = config.compile and not config.quick and entry.get("compile", False)
+    case = EngineCase(network, entry.batch, num_steps=QUICK_STEPS if config.quick else 100, compiled=compiled)
+    variants = case.variants()
+    if compiled:
+        drop_uncompilable(variants)
+    repeats = 1 if config.quick else entry.repeats
+    with tqdm(total=repeats, unit="round", desc=name) as bar:
+        latency = measure_latency(
+            {variant: case_variant.call for variant, case_variant in variants.items()},
+            repeats=repeats,
+            warmup=1 if config.quick else config.warmup,
+            on_round=lambda done, total: bar.update(done - bar.n),
+        )
+    return shape_results(case, variants, latency, config.threads)
+
+
+def drop_uncompilable(variants: dict[str, Variant]) -> None:
+    """Compile what is to be compiled; without a compiler, a line that says so takes its place."""
+    try:
+        variants["eager-compiled dense"].call()
+    except RuntimeError as error:
+        del variants["eager-compiled dense"]
+        print(f"no eager-compiled: {str(error).splitlines()[0]}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,17 @@
+"""Builds the native engine. Everything else about the package is in pyproject.toml.
+
+The extension is optional: without a C++ compiler the package installs all the same and runs on its PyTorch engine. It is a
+plain shared library without Python's or PyTorch's headers. Instruction sets are chosen at run time, so there is no -march.
+"""
+
+from setuptools import Extension, setup
+
+NATIVE = Extension(
+    "torchrl_sparse.blocks.engine._native",
+    sources=["torchrl_sparse/blocks/engine/native.cpp"],
+    # A product may be fused with a sum; nothing else that changes results is allowed.
+    extra_compile_args=["-std=c++17", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fvisibility=default"],
+    optional=True,
+)
+
+setup(ext_modules=[NATIVE])

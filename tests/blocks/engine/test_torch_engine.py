@@ -1,0 +1,195 @@
+"""The PyTorch engine against the reference: same noise, same mask, same actions."""
+
+import copy
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from torchrl_sparse.blocks.engine import TorchEngine, denoise
+from torchrl_sparse.blocks.engine.coefficients import step_coefficients
+from torchrl_sparse.blocks.engine.graphs import GraphCache
+from torchrl_sparse.blocks.engine.linear import make_linear
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+SHAPES = {
+    "small": {"horizon": 6, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32},
+    "block push": {"horizon": 5, "n_obs_steps": 3, "cond_dim": 16, "n_layer": 2, "n_emb": 64},
+    "long, many heads": {"horizon": 16, "n_obs_steps": 4, "cond_dim": 3, "n_layer": 1, "n_emb": 48, "n_head": 8},
+    "one observation": {"horizon": 3, "n_obs_steps": 1, "cond_dim": 2, "n_layer": 3, "n_emb": 16, "n_head": 1},
+    "not causal": {"horizon": 4, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32, "causal_attn": False},
+    "condition layers": {"horizon": 4, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32, "n_cond_layers": 1},
+}  # fmt: skip
+SCHEDULES = [("ddpm", 12), ("ddpm", 1), ("ddim", 10)]
+
+
+def make_network(shape, std=0.2):
+    """Float64 and large weights: any difference but rounding is seen, and rounding stays far below 1e-9."""
+    torch.manual_seed(0)
+    network = TransformerForDiffusion(input_dim=4, output_dim=4, p_drop_attn=0.1, **SHAPES[shape])
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=std)
+    return network.eval().requires_grad_(False).double()
+
+
+def make_query(network, schedule, batch, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(batch, schedule.num_inference_steps, network.horizon, 4, generator=generator)
+    cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)
+    return noise.to(network.pos_emb), cond.to(network.pos_emb)
+
+
+def make_masks(network, schedule, batch, rate, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    size = (batch, schedule.num_inference_steps, network.num_blocks)
+    masks = torch.rand(size, generator=generator) < rate
+    masks[:, 0] = False
+    return masks
+
+
+def largest_error(engine, network, schedule, query, masks=None, reuse="block"):
+    expected = denoise(network, schedule, *query, masks, reuse=reuse)
+    return (engine.denoise(*query, masks, reuse) - expected).abs().max()
+
+
+@pytest.mark.parametrize(("kind", "steps"), SCHEDULES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_equals_the_reference_for_random_masks(shape, kind, steps):
+    network, schedule = make_network(shape), NoiseSchedule(kind, steps)
+    engine = TorchEngine(network, schedule)
+    for seed, (batch, rate) in enumerate([(1, 0.0), (1, 0.5), (1, 0.91), (4, 0.3), (4, 0.8), (3, 1.0)]):
+        query = make_query(network, schedule, batch, seed)
+        masks = make_masks(network, schedule, batch, rate, seed)
+        same = masks[:1].repeat(batch, 1, 1)
+        for reuse in ("block", "type"):
+            assert largest_error(engine, network, schedule, query, masks, reuse) < 1e-9
+            assert largest_error(engine, network, schedule, query, same, reuse) < 1e-9
+        assert largest_error(engine, network, schedule, query) < 1e-9
+
+
+def test_rows_that_compute_nothing_ride_along_with_rows_that_do():
+    network, schedule = make_network("small"), NoiseSchedule("ddpm", 8)
+    masks = torch.zeros(3, 8, 6, dtype=torch.bool)
+    masks[0, 1:], masks[1, 1::2], masks[2, 4:6] = True, True, True
+    engine, query = TorchEngine(network, schedule), make_query(network, schedule, 3)
+    for reuse in ("block", "type"):
+        assert largest_error(engine, network, schedule, query, masks, reuse) < 1e-9
+
+
+@pytest.mark.parametrize("reuse", ["block", "type"])
+def test_published_shape_in_float32(reuse):
+    """100 steps at the published initialisation: the whole chain within 1e-5 of the reference."""
+    torch.manual_seed(0)
+    sizes = {"input_dim": 10, "output_dim": 10, "horizon": 10, "n_obs_steps": 2, "cond_dim": 19}
+    network, schedule = (
+        TransformerForDiffusion(**sizes, n_layer=2).eval().requires_grad_(False),
+        NoiseSchedule(),
+    )
+    noise, cond = torch.randn(2, 100, 10, 10), torch.randn(2, 2, 19)
+    masks = make_masks(network, schedule, 2, 0.8)
+    engine = TorchEngine(network, schedule)
+    assert largest_error(engine, network, schedule, (noise, cond), masks, reuse) < 1e-5
+    assert torch.equal(engine.denoise(noise, cond, masks, reuse), engine.denoise(noise, cond, masks, reuse))
+
+
+def test_threads_share_an_engine():
+    network, schedule = make_network("small"), NoiseSchedule("ddpm", 8)
+    engine = TorchEngine(network, schedule)
+    queries = [make_query(network, schedule, batch, batch) for batch in (1, 2, 3, 1, 2, 3)]
+    alone = [engine.denoise(*query) for query in queries]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(lambda query: engine.denoise(*query), queries))
+    assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
+
+
+@pytest.mark.parametrize("change", ["in place", "through .data", "state dict", "dtype"])
+def test_changed_weights_are_noticed(change):
+    network, schedule = make_network("small"), NoiseSchedule("ddim", 5)
+    engine, query = TorchEngine(network, schedule), make_query(network, schedule, 2)
+    before = engine.denoise(*query)
+    if change == "in place":
+        network.decoder.layers[1].linear1.weight[3, 5] += 1.0
+    elif change == "through .data":
+        for parameter in network.parameters():
+            parameter.data.copy_(1.1 * parameter)
+    elif change == "state dict":
+        other = copy.deepcopy(network)
+        torch.nn.init.normal_(other.head.weight)
+        network.load_state_dict(other.state_dict())
+    else:
+        network.float()
+        query = make_query(network, schedule, 2)
+    assert largest_error(engine, network, schedule, query) < (1e-4 if change == "dtype" else 1e-9)
+    assert change == "dtype" or (engine.denoise(*query) - before).abs().max() > 1e-6
+
+
+def test_results_are_ordinary_tensors_of_their_own():
+    network, schedule = make_network("small"), NoiseSchedule("ddim", 5)
+    engine, query = TorchEngine(network, schedule), make_query(network, schedule, 1)
+    first = engine.denoise(*query)
+    kept = first.clone()
+    engine.denoise(*make_query(network, schedule, 1, seed=1))
+    assert torch.equal(first, kept)
+    assert not first.is_inference()
+
+
+def test_wrong_input_is_refused():
+    network, schedule = make_network("small"), NoiseSchedule("ddim", 5)
+    engine, (noise, cond) = TorchEngine(network, schedule), make_query(network, schedule, 2)
+    with pytest.raises(ValueError, match=r"noise: expected shape \[2, 5, 6, 4\], got \[2, 4, 6, 4\]"):
+        engine.denoise(noise[:, 1:], cond)
+    with pytest.raises(ValueError, match="to prune nothing, got True"):
+        engine.denoise(noise, cond, torch.ones(2, 5, 6, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r'reuse: expected "block" or "type", got \'single\''):
+        engine.denoise(noise, cond, reuse="single")
+
+
+@pytest.mark.parametrize(
+    ("kind", "steps"), [("ddpm", 100), ("ddpm", 16), ("ddpm", 1), ("ddim", 100), ("ddim", 7)]
+)
+def test_tabulated_scheduler_equals_diffusers_to_the_last_bit(kind, steps):
+    schedule = NoiseSchedule(kind, steps)
+    coefficients = step_coefficients(schedule)
+    for step in range(steps):
+        sample, eps, gaussian = 3 * torch.randn(3, 1, 6, 4)
+        gaussian = None if step == steps - 1 else gaussian
+        expected = schedule.step(eps, step, sample, gaussian)
+        assert torch.equal(coefficients.update(step, sample, eps, gaussian), expected)
+
+
+@pytest.mark.parametrize("gelu", [False, True])
+def test_packed_products_take_any_number_of_rows(gelu):
+    weight, bias = torch.randn(24, 16), torch.randn(24)
+    packed, general = make_linear(weight, bias, gelu), make_linear(weight.double(), bias.double(), gelu)
+    for rows in (1, 10, 160):
+        x = torch.randn(rows, 16)
+        torch.testing.assert_close(packed(x).double(), general(x.double()), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("rate", [0.0, 0.7])
+def test_cuda_equals_the_reference(rate):
+    network, schedule = make_network("small").cuda(), NoiseSchedule("ddpm", 12)
+    engine = TorchEngine(network, schedule)
+    for seed in (0, 0, 0):  # run, captured, replayed
+        query = make_query(network, schedule, 3, seed)
+        masks = make_masks(network, schedule, 3, rate, seed).cuda()
+        assert largest_error(engine, network, schedule, query, masks) < 1e-9
+
+
+def test_only_what_comes_again_is_captured():
+    captured = []
+
+    def capture(query, noise, cond):
+        captured.append(query)
+        return query
+
+    cache = GraphCache(capture)
+    one, two = torch.ones(1), torch.full((1,), 2.0)
+    assert cache("dense", torch.add, one, two) == 3
+    assert cache("masked", torch.sub, one, two) == -1
+    assert captured == []
+    assert cache("dense", torch.add, two, two) == 4
+    assert cache("dense", torch.add, one, one) == 2
+    assert captured == [torch.add]

@@ -1,0 +1,99 @@
+"""The eager baseline: a query as the published implementation of Diffusion Policy runs it.
+
+``torch.nn.TransformerDecoder`` and a diffusers scheduler that draws its own noise, step by step
+(arXiv:2303.04137, ``DiffusionTransformerLowdimPolicy``). Speed-ups are quoted against it; nothing else uses
+it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["EagerBaseline", "published_forward"]
+
+
+def published_forward(
+    network: TransformerForDiffusion, sample: Tensor, timestep: Tensor, cond: Tensor
+) -> Tensor:
+    """Predicted noise [B, H, A], through PyTorch's own decoder module."""
+    memory = network.memory(timestep, cond)
+    x = network.decoder(
+        tgt=network.embed(sample), memory=memory, tgt_mask=network.mask, memory_mask=network.memory_mask
+    )
+    return network.head_out(x)
+
+
+class EagerBaseline:
+    """Denoises with the modules and the scheduler of the published implementation.
+
+    Args:
+        network: the denoiser, in eval mode.
+        schedule: the sampler.
+        compiled: put :func:`published_forward` through ``torch.compile``.
+
+    Examples:
+        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
+        ... ).eval()
+        >>> eager = EagerBaseline(network, NoiseSchedule("ddim", 10))
+        >>> eager.denoise(torch.randn(1, 4, 7), torch.randn(1, 2, 5)).shape
+        torch.Size([1, 4, 7])
+    """
+
+    def __init__(
+        self, network: TransformerForDiffusion, schedule: NoiseSchedule, *, compiled: bool = False
+    ) -> None:
+        self._network, self._scheduler = network, schedule.scheduler
+        self._timesteps = schedule.timesteps
+        self._forward = torch.compile(published_forward) if compiled else published_forward
+
+    @torch.no_grad()
+    def denoise(
+        self,
+        sample: Tensor,
+        cond: Tensor,
+        mask: Tensor | None = None,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Normalised actions [B, H, A].
+
+        Args:
+            sample: initial noise f32 [B, H, A].
+            cond: encoded observations f32 [B, To, D].
+            mask: bool [K, 3L], one for the whole batch, True = pruned, row 0 all False: blocks are skipped by
+                an ``if`` around each and reuse their own latest output, as caching methods are commonly
+                published. None runs the decoder.
+            generator: of the noise that the scheduler adds.
+        """
+        extra = {} if self._is_ddim() else {"generator": generator}
+        computed = None if mask is None else (~mask).tolist()
+        latest: list[Tensor | None] = [None] * self._network.num_blocks
+        for step, timestep in enumerate(self._timesteps):
+            if computed is None:
+                eps = self._forward(self._network, sample, timestep, cond)
+            else:
+                eps = self._skipping_forward(sample, timestep, cond, computed[step], latest)
+            sample = self._scheduler.step(eps, timestep, sample, **extra).prev_sample
+        return sample
+
+    def _is_ddim(self) -> bool:
+        return type(self._scheduler).__name__ == "DDIMScheduler"
+
+    def _skipping_forward(self, sample, timestep, cond, computed: list[bool], latest: list) -> Tensor:
+        network = self._network
+        x, memory = network.embed(sample), network.memory(timestep, cond)
+        for block in range(network.num_blocks):
+            if computed[block]:
+                latest[block] = network.block(block, x, memory)
+            x = x + latest[block]
+        return network.head_out(x)

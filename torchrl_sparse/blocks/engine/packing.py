@@ -1,0 +1,288 @@
+"""The weights of a denoiser as the native engine reads them: folded, tabulated and packed.
+
+Everything here is exact algebra on the network of :mod:`torchrl_sparse.policies.diffusion.transformer`, done once
+and in float64, so that the only rounding it adds is that of the result:
+
+* LayerNorm's gain and shift go into the projection that follows: ``W (g * n + s) + b = (W g) n + (W s + b)``;
+  1/sqrt(head size) goes into the queries.
+* Cross-attention knows its 1 + To memory tokens beforehand. Of each head, the score ``q . k`` of a token is
+  ``n . (Wq^T k) + bq . k`` and its contribution is ``Wo v``: two vectors of the network's width per head and
+  token, and neither the query nor the output projection is left. Those of the time token are tabulated here for
+  all denoising steps; those of the observations are computed within every query.
+* Position embeddings are biases of the layers before them, one row for each token.
+
+A matrix [columns, rows] of PyTorch becomes panels of 32 columns, [panel, row, 32]; heads are padded to multiples of
+16. ``native.cpp`` declares the same structures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+from ctypes import POINTER, c_float, c_int32, c_void_p
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torchrl_sparse.blocks.engine.coefficients import step_coefficients
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["Model", "PackedNetwork", "pack_panels"]
+
+PANEL = 32
+_CACHE_LINE = 64
+
+
+class _Matrix(ctypes.Structure):
+    _fields_ = [("weight", c_void_p), ("bias", c_void_p), ("rows", c_int32), ("columns", c_int32)]
+
+
+class _Layer(ctypes.Structure):
+    _fields_ = [
+        *((name, _Matrix) for name in ("qkv", "out", "up", "down", "kv")),
+        *((name, c_void_p) for name in ("fold_q", "fold_o", "query_bias", "cross_bias")),
+    ]
+
+
+class Model(ctypes.Structure):
+    """``struct Model`` of native.cpp."""
+
+    _SIZES = (
+        "horizon",
+        "width",
+        "layers",
+        "heads",
+        "obs_steps",
+        "action_dim",
+        "cond_dim",
+        "steps",
+        "causal",
+        "half",
+    )
+    _fields_ = [
+        *((name, c_int32) for name in _SIZES),
+        ("clip", c_float),
+        ("layer", POINTER(_Layer)),
+        *((name, _Matrix) for name in ("embed", "head", "cond", "encode_up", "encode_down")),
+        *((name, c_void_p) for name in ("time_key", "time_value", "time_bias", "coefficients", "valid")),
+    ]
+
+
+def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Panels of a matrix.
+
+    Args:
+        weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
+        dtype: torch.float32 or torch.float16.
+
+    Returns:
+        [ceil(columns / 32), rows, 32], zero where there is no column.
+
+    Raises:
+        ValueError: if a weight is too large for ``dtype``.
+
+    Examples:
+        >>> pack_panels(torch.ones(40, 7)).shape
+        torch.Size([2, 7, 32])
+    """
+    columns, rows = weight.shape
+    weight = functional.pad(weight, (0, 0, 0, -columns % PANEL))
+    packed = weight.view(-1, PANEL, rows).transpose(1, 2).to(dtype).contiguous()
+    if not packed.isfinite().all():
+        raise ValueError(
+            f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
+        )
+    return packed
+
+
+class _Arena:
+    """Memory for constants, in large pages where the system has them: weights are streamed, and with small pages the
+    processor spends a tenth of that time on looking up addresses."""
+
+    _BLOCK = 32 << 20
+
+    def __init__(self) -> None:
+        self._blocks: list[Tensor] = []
+        self._used = self._size = 0
+
+    def keep(self, tensor: Tensor) -> int:
+        """Copy ``tensor`` and return the address of the copy, on a cache line."""
+        tensor = tensor.contiguous().view(-1).view(torch.uint8)
+        if self._used + tensor.numel() > self._size:
+            self._size = max(self._BLOCK, tensor.numel())
+            self._used = 0
+            self._blocks.append(torch.frombuffer(_pages(self._size), dtype=torch.uint8))
+        place = self._blocks[-1][self._used : self._used + tensor.numel()].copy_(tensor)
+        self._used += -(-tensor.numel() // _CACHE_LINE) * _CACHE_LINE
+        return place.data_ptr()
+
+
+def _pages(size: int) -> mmap.mmap:
+    memory = mmap.mmap(-1, size)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        # A kernel without large pages refuses, and nothing is lost.
+        with contextlib.suppress(OSError):
+            memory.madvise(mmap.MADV_HUGEPAGE)
+    return memory
+
+
+class PackedNetwork:
+    """What the native engine computes with; owns the memory that ``model`` points into.
+
+    Args:
+        network: the denoiser, on the CPU, with n_cond_layers = 0.
+        schedule: the denoising steps.
+        weights: type of the trunk's and the condition encoder's matrices, torch.float32 or torch.float16.
+
+    Attributes:
+        model: the structure that native.cpp reads.
+    """
+
+    def __init__(
+        self, network: TransformerForDiffusion, schedule: NoiseSchedule, weights: torch.dtype
+    ) -> None:
+        self._weights = weights
+        self._arena = _Arena()
+        self._heads = network.n_head
+        self._head_size = network.n_emb // network.n_head
+        self._width = -(-network.n_emb // PANEL) * PANEL
+        with torch.no_grad():
+            self.model = self._pack(network, schedule)
+
+    def _pack(self, network, schedule) -> Model:
+        coefficients = step_coefficients(schedule)
+        layers = [self._pack_layer(layer) for layer in network.decoder.layers]
+        tables = self._time_tables(network, schedule)
+        positions, cond_positions = network.pos_emb[0].double(), network.cond_pos_emb[0, 1:].double()
+        norm, head = network.ln_f, network.head
+        valid = torch.zeros(2 * self._width)
+        valid[: network.n_emb] = 1  # the zeros behind it serve as a bias
+        columns = ("noise_scale", "signal_scale", "clean_weight", "sample_weight", "eps_weight", "spread")
+        layer_array = (_Layer * len(layers))(*layers)
+        self._layers = layer_array  # the structure only points to it
+        return Model(
+            horizon=network.horizon,
+            width=network.n_emb,
+            layers=network.n_layer,
+            heads=network.n_head,
+            obs_steps=network.n_obs_steps,
+            action_dim=network.input_dim,
+            cond_dim=network.cond_dim,
+            steps=schedule.num_inference_steps,
+            causal=network.causal_attn,
+            half=self._weights == torch.float16,
+            clip=coefficients.clip,
+            layer=layer_array,
+            embed=self._matrix(network.input_emb.weight, network.input_emb.bias + positions, torch.float32),
+            head=self._matrix(*_after_norm(norm, head.weight, head.bias), torch.float32),
+            cond=self._matrix(
+                network.cond_obs_emb.weight, network.cond_obs_emb.bias + cond_positions, torch.float32
+            ),
+            encode_up=self._matrix(network.encoder[0].weight, network.encoder[0].bias),
+            encode_down=self._matrix(network.encoder[2].weight, network.encoder[2].bias),
+            coefficients=self._keep(torch.stack([getattr(coefficients, name) for name in columns], dim=1)),
+            valid=self._keep(valid),
+            **{name: self._keep(table) for name, table in tables.items()},
+        )
+
+    def _pack_layer(self, layer) -> _Layer:
+        attention = layer.self_attn
+        qkv, bias = _after_norm(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
+        scale = torch.ones(3, 1).double()
+        scale[0] = self._head_size**-0.5
+        qkv, bias = qkv.unflatten(0, (3, -1)) * scale[..., None], bias.unflatten(0, (3, -1)) * scale
+        key_value = [tensor.unflatten(0, (3, -1))[1:] for tensor in _in_proj(layer.multihead_attn)]
+        query, query_bias, out = _cross_matrices(layer)
+        query, query_bias = self._per_head(query), self._per_head(query_bias)
+        return _Layer(
+            qkv=self._matrix(self._padded_heads(qkv), self._padded_heads(bias)),
+            out=self._matrix(
+                self._per_head(attention.out_proj.weight.T).flatten(0, 1).T, attention.out_proj.bias
+            ),
+            up=self._matrix(*_after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
+            down=self._matrix(layer.linear2.weight, layer.linear2.bias),
+            kv=self._matrix(*(self._padded_heads(tensor) for tensor in key_value)),
+            fold_q=self._keep(torch.stack([pack_panels(head.T, self._weights) for head in query])),
+            fold_o=self._keep(
+                torch.stack([pack_panels(head.T, self._weights) for head in self._per_head(out.T)])
+            ),
+            query_bias=self._keep(query_bias),
+            cross_bias=self._keep(self._padded_width(layer.multihead_attn.out_proj.bias)),
+        )
+
+    def _time_tables(self, network, schedule) -> dict[str, Tensor]:
+        """Folded keys, values [K, L, heads, width] and score biases [K, L, heads] of the time tokens."""
+        up, _, down = network.encoder
+        token = network.time_emb(schedule.timesteps).double() + network.cond_pos_emb[0, 0]
+        token = functional.mish(functional.linear(token, up.weight.double(), up.bias.double()))
+        token = functional.linear(token, down.weight.double(), down.bias.double())
+        tables = {"time_key": [], "time_value": [], "time_bias": []}
+        for layer in network.decoder.layers:
+            weight, bias = (tensor.unflatten(0, (3, -1))[1:] for tensor in _in_proj(layer.multihead_attn))
+            key, value = (torch.einsum("nod,kd->nko", weight, token) + bias[:, None]).unflatten(
+                2, (self._heads, -1)
+            )
+            query, query_bias, out = _cross_matrices(layer)
+            query, out = query.unflatten(0, (self._heads, -1)), out.unflatten(1, (self._heads, -1))
+            tables["time_key"].append(torch.einsum("khc,hcd->khd", key, query))
+            tables["time_value"].append(torch.einsum("khc,dhc->khd", value, out))
+            tables["time_bias"].append(
+                torch.einsum("khc,hc->kh", key, query_bias.unflatten(0, (self._heads, -1)))
+            )
+        stacked = {name: torch.stack(layers, dim=1) for name, layers in tables.items()}
+        return {
+            name: table if name == "time_bias" else self._padded_width(table)
+            for name, table in stacked.items()
+        }
+
+    # -- padding -----------------------------------------------------------------------------------------------
+
+    def _per_head(self, tensor: Tensor) -> Tensor:
+        """[heads * size, ...] as [heads, padded size, ...]."""
+        heads = tensor.double().unflatten(0, (self._heads, -1))
+        return functional.pad(heads, (0, 0) * (heads.ndim - 2) + (0, -self._head_size % 16))
+
+    def _padded_heads(self, parts: Tensor) -> Tensor:
+        """[n, heads * size, ...] as [n * part, ...]: padded heads, and every part padded to whole panels."""
+        flat = [self._per_head(part).flatten(0, 1) for part in parts]
+        return torch.cat(
+            [functional.pad(part, (0, 0) * (part.ndim - 1) + (0, -len(part) % PANEL)) for part in flat]
+        )
+
+    def _padded_width(self, tensor: Tensor) -> Tensor:
+        return functional.pad(tensor, (0, self._width - tensor.shape[-1]))
+
+    # -- memory ------------------------------------------------------------------------------------------------
+
+    def _matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None) -> _Matrix:
+        packed = pack_panels(weight, dtype or self._weights)
+        bias = functional.pad(bias, (0, -bias.shape[-1] % PANEL))
+        return _Matrix(self._keep(packed), self._keep(bias), weight.shape[1], len(packed) * PANEL)
+
+    def _keep(self, tensor: Tensor) -> int:
+        """Address of a copy of ``tensor`` as f32, or as it is if it has been packed."""
+        return self._arena.keep(tensor if tensor.dtype == torch.float16 else tensor.float())
+
+
+def _after_norm(norm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """``weight`` and ``bias`` of the layer behind ``norm``, to be used on what is normalised but not yet scaled."""
+    weight = weight.double()
+    return weight * norm.weight.double(), bias.double() + weight @ norm.bias.double()
+
+
+def _in_proj(attention) -> tuple[Tensor, Tensor]:
+    return attention.in_proj_weight.double(), attention.in_proj_bias.double()
+
+
+def _cross_matrices(layer) -> tuple[Tensor, Tensor, Tensor]:
+    """Scaled query weight [d, d] and bias [d] on normalised activations, and the output weight [d, d]."""
+    weight, bias = (tensor.unflatten(0, (3, -1))[0] for tensor in _in_proj(layer.multihead_attn))
+    weight, bias = _after_norm(layer.norm2, weight, bias)
+    scale = (len(weight) // layer.multihead_attn.num_heads) ** -0.5
+    return weight * scale, bias * scale, layer.multihead_attn.out_proj.weight.double()

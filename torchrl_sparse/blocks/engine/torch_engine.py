@@ -1,0 +1,116 @@
+"""The PyTorch engine: the reference's results in a fraction of its time, on a CPU or a GPU.
+
+What does not change within a query is done before its loop: time tokens are encoded and folded once per
+network, observations once per query, cross-attention reads folded memory
+(:mod:`torchrl_sparse.blocks.engine.folding`), the scheduler is a table, and a mask becomes a program
+(:mod:`torchrl_sparse.blocks.engine.plan`), built once per distinct mask.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.engine.costs import time_blocks
+from torchrl_sparse.blocks.engine.graphs import GraphCache
+from torchrl_sparse.blocks.engine.linear import can_pack
+from torchrl_sparse.blocks.engine.reference import check_query
+from torchrl_sparse.blocks.engine.torch_blocks import Tables
+from torchrl_sparse.blocks.engine.torch_loop import build_loop, make_walk, run_loop
+from torchrl_sparse.blocks.engine.weights import WeightWatch
+from torchrl_sparse.blocks.mask import Reuse
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["TorchEngine"]
+
+
+class TorchEngine:
+    """Runs programs in PyTorch. Not differentiable; safe to share between threads.
+
+    The engine tabulates the network's weights, and does so again when it finds them changed
+    (:class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). Dropout is never applied.
+
+    Rows of a batch that compute a block are gathered, the block runs on them alone, its results are
+    scattered; where every row agrees, as with one mask for all, nothing is. On a CUDA device a query
+    whose masks came before replays a CUDA graph of its own.
+
+    Args:
+        network: the denoiser, on any device; float32 is what it is made for, float64 works.
+        schedule: the sampler.
+
+    Attributes:
+        name: ``"torch"``.
+        detail: the device and the matrix product in use.
+
+    Examples:
+        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
+        ... ).eval()
+        >>> engine = TorchEngine(network, NoiseSchedule("ddim", 10))
+        >>> engine.denoise(torch.randn(3, 10, 4, 7), torch.randn(3, 2, 5)).shape
+        torch.Size([3, 4, 7])
+    """
+
+    name = "torch"
+
+    def __init__(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> None:
+        self._network, self._schedule = network, schedule
+        self._watch = WeightWatch(network)
+        self._known: tuple = (None, None, None)
+        self._current()
+
+    @property
+    def detail(self) -> str:
+        weight = self._network.head.weight
+        packed = "oneDNN on packed weights" if can_pack(weight) else "general matrix products"
+        return f"{weight.device.type}, {packed}"
+
+    def denoise(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+    ) -> Tensor:
+        """See :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`; no gradients flow."""
+        check_query(self._network, self._schedule, noise, cond, mask, reuse)
+        with torch.inference_mode():
+            actions = self._denoise(noise, cond, mask, reuse)
+        return actions.clone()  # made outside of inference mode, it can be used anywhere
+
+    @torch.inference_mode()
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """See :meth:`torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
+        tables = self._current()[0]
+        return time_blocks(make_walk(tables), tables.num_layers, repeats, tables.device)
+
+    def _current(self) -> tuple[Tables, GraphCache | None]:
+        """Tables of the present weights, and the CUDA graphs made with them."""
+        state = self._watch.state()
+        known, tables, graphs = self._known  # read and replaced in one go: other threads may do the same
+        if known != state:
+            with torch.inference_mode():
+                tables = Tables(self._network, self._schedule)
+            graphs = GraphCache() if tables.device.type == "cuda" else None
+            self._known = state, tables, graphs
+        return tables, graphs
+
+    def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
+        tables, graphs = self._current()
+        loop = build_loop(self._host_masks(mask), tables.device)
+        if graphs is None:
+            return run_loop(tables, loop, noise, cond, reuse)
+        query = partial(run_loop, tables, loop, reuse=reuse)
+        return graphs((loop, reuse, noise.shape), query, noise, cond)
+
+    def _host_masks(self, mask: Tensor | None) -> np.ndarray:
+        """The masks on the host, a single one if that is that of all rows."""
+        if mask is None:
+            return np.zeros((1, self._schedule.num_inference_steps, self._network.num_blocks), bool)
+        host = mask.cpu().numpy()
+        return host[:1] if (host == host[0]).all() else host

@@ -1,0 +1,200 @@
+"""``engine.json``, its table and its bar charts: how fast each engine answers each kind of query.
+
+Schema version 1 (seconds; ``null`` where there is nothing to compare)::
+
+    {"schema": 1,
+     "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
+     "shapes": {NAME: {
+        "threads": int, "batch": int,
+        "bandwidth_gb_per_s": float,
+        "rows": {VARIANT: {"p50_s": float, "p10_s": float, "p90_s": float, "n": int,
+                           "x_eager": float, "x_dense": float, "max_err": float, "limit_s": float}},
+        "program_build_s": float,
+        "all_pruned_step_s": {RUNNER: float}}}}
+
+``x_eager`` and ``x_dense`` are ratios of medians, to the eager baseline and to the dense query of the same runner;
+``max_err`` is the largest difference of a normalised action to the reference's, on the same noise and mask. ``limit_s`` is what
+reading the weights of all computed blocks takes, once per evaluation, at ``bandwidth_gb_per_s``: the rate at which one thread
+reads an array as large as those weights, again and again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_sparse.blocks.engine.plan import build_program
+from torchrl_sparse.evaluation.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.engine_cases import EngineCase, Variant
+from torchrl_sparse.evaluation.latency import Latency
+from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = [
+    "format_engine_table",
+    "measure_bandwidth",
+    "plot_engine_times",
+    "program_seconds",
+    "save_engine_results",
+    "shape_results",
+]
+
+_COLORS = {"eager": "#999999", "reference": "#333333", "torch": "#E69F00", "native": "#0072B2"}
+
+
+def block_weights(network: TransformerForDiffusion) -> tuple[int, int, int]:
+    """Weights that one SA, CA and FFN block must read; folded cross-attention reads next to nothing."""
+    width = network.n_emb
+    return 4 * width * width, 0, 8 * width * width
+
+
+def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> float:
+    """Bytes per second at which this thread reads as much as one denoising step's weights, the best of ``repeats``."""
+    size = network.n_layer * sum(block_weights(network))
+    array, best = torch.ones(size), float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        array.sum()
+        best = min(best, time.perf_counter() - start)
+    return 4 * size / best
+
+
+def program_seconds(case: EngineCase, repeats: int = 50) -> float:
+    """Median seconds that the program of a new random mask takes to build."""
+    mask = case.queries["random91"].mask[0].numpy()
+    samples = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        build_program(mask)
+        samples.append(time.perf_counter() - start)
+    return statistics.median(samples)
+
+
+def shape_results(
+    case: EngineCase, variants: Mapping[str, Variant], latency: Mapping[str, Latency], threads: int
+) -> dict[str, Any]:
+    """The entry of one shape in ``engine.json``.
+
+    Args:
+        case: what was run.
+        variants: its variants.
+        latency: of each of them, measured interleaved.
+        threads: that were used.
+    """
+    bandwidth = measure_bandwidth(case.network)
+    expected = {kind: case.reference(kind) for kind in case.queries}
+    rows = {}
+    for name, variant in variants.items():
+        samples = latency[name].samples
+        rows[name] = {
+            "p50_s": latency[name].p50,
+            "p10_s": float(np.percentile(samples, 10)),
+            "p90_s": float(np.percentile(samples, 90)),
+            "n": latency[name].n,
+            "x_eager": latency["eager dense"].p50 / latency[name].p50,
+            "x_dense": latency[variant.dense].p50 / latency[name].p50,
+            "max_err": (variant.call() - expected[variant.kind]).abs().max().item(),
+            "limit_s": _bytes_read(case, variant) / bandwidth,
+        }
+    return {
+        "threads": threads,
+        "batch": case.batch,
+        "bandwidth_gb_per_s": bandwidth / 1e9,
+        "rows": rows,
+        "program_build_s": program_seconds(case),
+        "all_pruned_step_s": _all_pruned_steps(case, rows),
+    }
+
+
+def _bytes_read(case: EngineCase, variant: Variant) -> int:
+    query, network = case.queries[variant.kind], case.network
+    weights = torch.tensor(block_weights(network)).repeat(network.n_layer)
+    evaluations = query.evaluations()
+    count = query.schedule.num_inference_steps if evaluations is None else evaluations
+    return variant.weight_bytes * int((weights * count).sum())
+
+
+def _all_pruned_steps(case: EngineCase, rows: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds of a step that computes nothing, per runner: what all of them take, less one dense step."""
+    steps = case.queries["dense"].schedule.num_inference_steps
+    runners = [name.split()[0] for name in rows if name.endswith(" all-pruned")]
+    return {
+        runner: (rows[f"{runner} all-pruned"]["p50_s"] - rows[f"{runner} dense"]["p50_s"] / steps)
+        / (steps - 1)
+        for runner in runners
+    }
+
+
+def save_engine_results(results: Mapping[str, Any], path: str | os.PathLike) -> None:
+    """Write ``engine.json``, in one piece or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+
+
+def format_engine_table(name: str, shape: Mapping[str, Any]) -> str:
+    """The rows of one shape as a table in Markdown."""
+    lines = [
+        f"{name}: batch {shape['batch']}, threads {shape['threads']}, weights read at "
+        f"{shape['bandwidth_gb_per_s']:.1f} GB/s, program built in {1e3 * shape['program_build_s']:.2f} ms",
+        "",
+        "| variant | p50 (ms) | p10 – p90 | × eager | × own dense | max error |",
+        "|---|---|---|---|---|---|",
+    ]
+    for variant, row in shape["rows"].items():
+        spread = f"{1e3 * row['p10_s']:.1f} – {1e3 * row['p90_s']:.1f}"
+        lines.append(
+            f"| {variant} | {1e3 * row['p50_s']:.1f} | {spread} | {row['x_eager']:.1f} | {row['x_dense']:.1f} "
+            f"| {row['max_err']:.1e} |"
+        )
+    return "\n".join(lines)
+
+
+def plot_engine_times(
+    name: str, shape: Mapping[str, Any], machine: Mapping[str, Any], path: str | os.PathLike
+) -> Path:
+    """Median time of every variant as a bar (log axis), and what reading its weights alone would take as a tick.
+
+    Args:
+        name: of the shape, for the title.
+        shape: its entry in ``engine.json``.
+        machine: what it was measured on.
+        path: of the PNG.
+    """
+    rows = shape["rows"]
+    names = sorted(rows, key=lambda variant: -rows[variant]["p50_s"])
+    times = [1e3 * rows[variant]["p50_s"] for variant in names]
+    limits = [1e3 * rows[variant]["limit_s"] for variant in names]
+    figure, axes = make_figure(9, 1.6 + 0.24 * len(names))
+    places = range(len(names))
+    axes.barh(
+        places, times, color=[_COLORS[variant.split()[0].split("-")[0]] for variant in names], height=0.7
+    )
+    axes.plot(
+        limits,
+        places,
+        "|",
+        color="#D55E00",
+        markersize=11,
+        markeredgewidth=2.5,
+        label="memory-bandwidth limit",
+    )
+    for place, milliseconds in zip(places, times, strict=True):
+        axes.annotate(f" {milliseconds:.3g}", (milliseconds, place), va="center", fontsize=9)
+    axes.set_xscale("log")
+    axes.set_xlim(min([*times, *limits]) / 2, 2.5 * max(times))
+    axes.set_yticks(places, names, fontsize=9)
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    axes.grid(False, axis="y")
+    axes.set_xlabel("time per query, median (ms, log scale)")
+    threads = f"{shape['threads']} thread{'' if shape['threads'] == 1 else 's'}"
+    axes.set_title(f"{name}, batch {shape['batch']}; {machine['cpu']}, {threads}", loc="left")
+    figure.legend(loc="outside lower center", frameon=False)
+    return save_figure(figure, path)
