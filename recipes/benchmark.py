@@ -48,7 +48,7 @@ def main(config: DictConfig) -> None:
     out, task = Path(config.out), get_task(config.task)
     for name in config.methods:
         check_method(name)
-    policy = DiffusionPolicy.from_pretrained(config.policy)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
 
     @cache
@@ -103,6 +103,7 @@ def evaluate(
         "horizon": config.horizon,
         "method": name,
         "policy": policy.fingerprint,
+        "engine": policy.engine,
         "sampler": policy.schedule.config,
         "mask": hashlib.sha256(mask.numpy().tobytes()).hexdigest()[:16],
         "n_action_steps": config.n_action_steps,
