@@ -107,6 +107,29 @@ def test_can_that_has_toppled_is_grasped_across_its_axis(envs):
     pytest.fail("the can was not placed")
 
 
+def test_fingers_over_the_square_rise_before_they_grasp_the_handle(envs):
+    env = envs["NutAssemblySquare"]
+    start(env, 8)
+    expert = make_expert("NutAssemblySquare", env.sim_env, style())
+    nut = env.sim_env.nuts[env.sim_env.nut_id].root_body
+    command = expert.command()
+    while expert.hand().position[2] - expert.body(nut)[0][2] > 0.05:
+        execute(env, command)
+        command = expert.command()
+    position, rotation = expert.body(nut)
+    over_square = position + rotation @ [0.046, 0.0, 0.025]
+    for _ in range(20):
+        execute(env, np.array([*over_square, *command[3:6], -1.0]))
+    hand = expert.hand().position
+    np.testing.assert_allclose(hand, over_square, atol=0.004)
+    assert expert.command()[2] > hand[2] + 0.005  # lower, they would come to rest on the square
+    for _ in range(40):
+        execute(env, expert.command())
+        if expert.body(nut)[0][2] > position[2] + 0.03:
+            return
+    pytest.fail("the nut was not lifted by its handle")
+
+
 @pytest.mark.parametrize("nut_yaw", np.linspace(-np.pi, np.pi, 25))
 def test_square_grasp_holds_the_handle_across_and_stays_within_the_joint(nut_yaw):
     yaw = grasp_yaw(nut_yaw, 0.0)

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward, nearest
 
-_HANDLE = np.array([0.056, 0.0, 0.004])  # m, where to grasp, in the nut's frame
+_HANDLE = np.array([0.059, 0.0, 0.004])  # m, where to grasp, in the nut's frame: well clear of the square
 _HANDLE_WIDTH = 0.032  # m
+_CLEAR = 0.052  # m along the handle from the nut's centre; nearer, fingers come to rest on the square
 _PLACED_YAW = (
     np.pi
 )  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
@@ -39,9 +40,10 @@ class NutAssemblySquareExpert(Expert):
         if at(hand, grasp, downward(yaw), position=0.01):
             return [Waypoint(grasp, downward(yaw), CLOSED)]
         left = yaw - _unwrapped(hand.yaw)
-        return [
-            Waypoint(self.above(hand, grasp, turn=left), downward(hand.yaw + _part(left)), OPEN, pace=0.7)
-        ]
+        goal = self.above(hand, grasp, turn=left)
+        over_square = _CLEAR - rotation[:, 0] @ (hand.position - nut)  # raised, the hand slides off it again
+        goal[2] = max(goal[2], grasp[2] + np.clip(8.0 * over_square, 0.0, self.style.hover))
+        return [Waypoint(goal, downward(hand.yaw + _part(left)), OPEN, pace=0.7)]
 
     @property
     def _nut(self):
