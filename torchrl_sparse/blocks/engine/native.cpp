@@ -309,10 +309,18 @@ template <class T>
 void multiply(const float* x, int ldx, int n, const T* w, int rows, int columns, const float* bias, int ld_bias, float* y,
               int ldy, Epilogue epilogue = STORE) {
     const int groups = (n + MAX_ROWS - 1) / MAX_ROWS;
-    for (int c = 0; c < columns; c += PANEL, w += (size_t)rows * PANEL) {
-        for (int g = 0; g < groups; g++) {
-            const int m = n * g / groups, count = n * (g + 1) / groups - m;
-            tiles<MAX_ROWS>(count, x + m * ldx, ldx, w, rows, bias + m * ld_bias + c, ld_bias, y + m * ldy + c, ldy);
+    // Where the registers do not hold all rows, a panel is read more than once, and so in parts that stay in the L1 cache.
+    const int part = VECTOR == 16 && groups == 1 ? rows : 128;
+    for (int c = 0; c < columns; c += PANEL) {
+        for (int k = 0; k < rows; k += part) {
+            const int depth = rows - k < part ? rows - k : part;
+            for (int g = 0; g < groups; g++) {
+                const int m = n * g / groups, count = n * (g + 1) / groups - m;
+                float* const out = y + m * ldy + c;  // holds the sum so far
+                const float* start = k ? out : bias + m * ld_bias + c;
+                tiles<MAX_ROWS>(count, x + m * ldx + k, ldx, w, depth, start, k ? ldy : ld_bias, out, ldy);
+            }
+            w += (size_t)depth * PANEL;
         }
         if (epilogue == STORE) continue;
         for (int m = 0; m < n; m++)
