@@ -3,11 +3,11 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint install
+.PHONY: demo test lint install sanitize
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml
+$(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native.cpp
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
@@ -22,3 +22,13 @@ test: install
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+# The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.
+SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined
+sanitize: install
+	mkdir -p build/sanitize
+	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -shared -fPIC \
+		-o build/sanitize/native.so torchrl_sparse/blocks/engine/native.cpp
+	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
+		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
+		$(BIN)/python -m pytest tests/blocks/engine/test_native.py -k "not library"

@@ -10,7 +10,14 @@ NATIVE = Extension(
     "torchrl_sparse.blocks.engine._native",
     sources=["torchrl_sparse/blocks/engine/native.cpp"],
     # A product may be fused with a sum; nothing else that changes results is allowed.
-    extra_compile_args=["-std=c++17", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fvisibility=default"],
+    extra_compile_args=[
+        "-g0",
+        "-std=c++17",
+        "-O3",
+        "-ffp-contract=fast",
+        "-fno-math-errno",
+        "-fvisibility=default",
+    ],
     optional=True,
 )
 

@@ -64,6 +64,7 @@ namespace {
 enum Op { COMPUTE, REUSE, COLLAPSE };
 enum Epilogue { STORE, GELU, MISH };
 constexpr int PANEL = 32;
+constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
 constexpr int AHEAD = 128;  // rows of a panel between the weights that are fetched and those that are used
 using half = uint16_t;
 
@@ -95,7 +96,8 @@ struct Buffers {
         obs_key = take(folded * padded(m.width));
         obs_value = take(folded * padded(m.width));
         obs_bias = take(folded);
-        scores = take(padded(m.heads * (1 + m.obs_steps)) + padded(m.horizon));
+        const int keys = m.horizon > m.obs_steps ? m.horizon : 1 + m.obs_steps;
+        scores = take((size_t)keys * padded(m.horizon * m.heads));
         size = at - begin;
     }
 };
@@ -309,10 +311,18 @@ template <class T>
 void multiply(const float* x, int ldx, int n, const T* w, int rows, int columns, const float* bias, int ld_bias, float* y,
               int ldy, Epilogue epilogue = STORE) {
     const int groups = (n + MAX_ROWS - 1) / MAX_ROWS;
-    for (int c = 0; c < columns; c += PANEL, w += (size_t)rows * PANEL) {
-        for (int g = 0; g < groups; g++) {
-            const int m = n * g / groups, count = n * (g + 1) / groups - m;
-            tiles<MAX_ROWS>(count, x + m * ldx, ldx, w, rows, bias + m * ld_bias + c, ld_bias, y + m * ldy + c, ldy);
+    // Where the registers do not hold all rows, a panel is read more than once, and so in parts that stay in the L1 cache.
+    const int part = VECTOR == 16 && groups == 1 ? rows : 128;
+    for (int c = 0; c < columns; c += PANEL) {
+        for (int k = 0; k < rows; k += part) {
+            const int depth = rows - k < part ? rows - k : part;
+            for (int g = 0; g < groups; g++) {
+                const int m = n * g / groups, count = n * (g + 1) / groups - m;
+                float* const out = y + m * ldy + c;  // holds the sum so far
+                const float* start = k ? out : bias + m * ld_bias + c;
+                tiles<MAX_ROWS>(count, x + m * ldx + k, ldx, w, depth, start, k ? ldy : ld_bias, out, ldy);
+            }
+            w += (size_t)depth * PANEL;
         }
         if (epilogue == STORE) continue;
         for (int m = 0; m < n; m++)
@@ -328,12 +338,15 @@ template <class T>
 struct Query {
     const Model& m;
     const Buffers b;
-    const int slots, width, ld, head, inner;
     // Strides: `width` of folded vectors, `ld` of activations, `head` and `inner` of one and of all padded heads.
+    const int slots, width, ld, head, inner, lanes;
 
     Query(const Model& m, int slots, float* scratch)
         : m(m), b(m, slots, scratch), slots(slots), width(padded(m.width)), ld(stride(m.width)), head(padded_head(m)),
-          inner(m.heads * head) {}
+          inner(m.heads * head), lanes(padded(m.horizon * m.heads)) {}
+
+    // Whether action t may not look at action s or, in the memory, at observation s (token s + 1).
+    bool hidden(int s, int t) const { return m.causal && s > t; }
 
     void product(const float* x, int ldx, int n, const Matrix& a, float* y, int ldy, Epilogue e = STORE) const {
         multiply(x, ldx, n, (const T*)a.weight, a.rows, a.columns, a.bias, 0, y, ldy, e);
@@ -360,20 +373,25 @@ struct Query {
             for (int j = 0; j < width; j += VECTOR) store(x + j, load(x + j) + load(d + j));
     }
 
-    // s[i] = softmax(s)[i]; what pads `n` to whole vectors is overwritten.
-    static void softmax(float* s, int n) {
-        float most = s[0];
-        for (int i = 1; i < n; i++) most = s[i] > most ? s[i] : most;
-        const int end = (n + VECTOR - 1) / VECTOR * VECTOR;
-        for (int i = n; i < end; i++) s[i] = -1e30f;  // adds e^-87, which is lost next to e^0
-        V total{};
-        for (int i = 0; i < end; i += VECTOR) {
-            const V e = exponential(load(s + i) - most);
-            store(s + i, e);
-            total += e;
+    // Scores lie as [key][lane], a lane being one head of one query: n keys are summed up without leaving the vector.
+    float& score(int key, int t, int h) const { return b.scores[(size_t)key * lanes + t * m.heads + h]; }
+
+    void softmax(int n) const {
+        for (int lane = 0; lane < lanes; lane += VECTOR) {
+            float* const s = b.scores + lane;
+            V most = load(s), total{};
+            for (int i = 1; i < n; i++) {
+                const V v = load(s + (size_t)i * lanes);
+                most = v > most ? v : most;
+            }
+            for (int i = 0; i < n; i++) {
+                const V e = exponential(load(s + (size_t)i * lanes) - most);
+                store(s + (size_t)i * lanes, e);
+                total += e;
+            }
+            const V scale = 1.f / total;
+            for (int i = 0; i < n; i++) store(s + (size_t)i * lanes, load(s + (size_t)i * lanes) * scale);
         }
-        const V scale = splat(1.f / sum(total));
-        for (int i = 0; i < end; i += VECTOR) store(s + i, load(s + i) * scale);
     }
 
     INLINE float dot(const float* a, const float* c, int n) {
@@ -386,18 +404,19 @@ struct Query {
         normalise(b.x, b.y);
         const int part = padded(inner), ldq = stride(3 * part), ldm = stride(inner);
         product(b.y, ld, m.horizon, layer.qkv, b.qkv, ldq);
-        for (int h = 0; h < m.heads; h++)
-            for (int t = 0; t < m.horizon; t++) {
-                const float *q = b.qkv + t * ldq + h * head, *k = b.qkv + part + h * head, *v = k + part;
-                const int seen = m.causal ? t + 1 : m.horizon;
-                for (int s = 0; s < seen; s++) b.scores[s] = dot(q, k + s * ldq, head);
-                softmax(b.scores, seen);
-                for (int j = 0; j < head; j += VECTOR) {
+        const float *keys = b.qkv + part, *values = keys + part;
+        for (int t = 0; t < m.horizon; t++)
+            for (int h = 0; h < m.heads; h++)
+                for (int s = 0; s < m.horizon; s++)
+                    score(s, t, h) = hidden(s, t) ? UNSEEN : dot(b.qkv + t * ldq + h * head, keys + s * ldq + h * head, head);
+        softmax(m.horizon);
+        for (int t = 0; t < m.horizon; t++)
+            for (int h = 0; h < m.heads; h++)
+                for (int j = h * head; j < h * head + head; j += VECTOR) {
                     V total{};
-                    for (int s = 0; s < seen; s++) total += load(v + s * ldq + j) * b.scores[s];
-                    store(b.mixed + t * ldm + h * head + j, total);
+                    for (int s = 0; s < m.horizon && !hidden(s, t); s++) total += load(values + s * ldq + j) * score(s, t, h);
+                    store(b.mixed + t * ldm + j, total);
                 }
-            }
         product(b.mixed, ldm, m.horizon, layer.out, d, ld);
     }
 
@@ -406,28 +425,26 @@ struct Query {
         normalise(b.x, b.y);
         const size_t time = ((size_t)step * m.layers + index) * m.heads, obs = (size_t)index * m.obs_steps * m.heads;
         const float *bias = m.layer[index].cross_bias, *time_value = m.time_value + time * width;
-        const float* obs_value = b.obs_value + obs * width;
-        for (int t = 0; t < m.horizon; t++) {
-            const int most = m.causal && t < m.obs_steps ? t + 1 : m.obs_steps, seen = 1 + most;
-            const float* y = b.y + t * ld;
+        const float *keys = b.obs_key + obs * width, *values = b.obs_value + obs * width;
+        for (int t = 0; t < m.horizon; t++)
             for (int h = 0; h < m.heads; h++) {
-                float s[64];
-                s[0] = dot(y, m.time_key + (time + h) * width, width) + m.time_bias[time + h];
-                for (int o = 0; o < most; o++) {
-                    const size_t at = obs + o * m.heads + h;
-                    s[1 + o] = dot(y, b.obs_key + at * width, width) + b.obs_bias[at];
+                const float* y = b.y + t * ld;
+                score(0, t, h) = dot(y, m.time_key + (time + h) * width, width) + m.time_bias[time + h];
+                for (int o = 0; o < m.obs_steps; o++) {
+                    const int i = o * m.heads + h;
+                    score(1 + o, t, h) = hidden(o, t) ? UNSEEN : dot(y, keys + (size_t)i * width, width) + b.obs_bias[obs + i];
                 }
-                softmax(s, seen);
-                for (int o = 0; o < seen; o++) b.scores[o * m.heads + h] = s[o];
             }
+        softmax(1 + m.obs_steps);
+        for (int t = 0; t < m.horizon; t++)
             for (int j = 0; j < width; j += VECTOR) {
                 V total = load(bias + j);
-                for (int h = 0; h < m.heads; h++) total += load(time_value + h * width + j) * b.scores[h];
-                for (int i = 0; i < most * m.heads; i++)
-                    total += load(obs_value + (size_t)i * width + j) * b.scores[m.heads + i];
+                for (int h = 0; h < m.heads; h++) total += load(time_value + h * width + j) * score(0, t, h);
+                for (int o = 0; o < m.obs_steps && !hidden(o, t); o++)
+                    for (int h = 0; h < m.heads; h++)
+                        total += load(values + (size_t)(o * m.heads + h) * width + j) * score(1 + o, t, h);
                 store(d + t * ld + j, total);
             }
-        }
     }
 
     void feed_forward(const Layer& layer, float* d) const {
