@@ -17,7 +17,7 @@ demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=20 latency_repeats=10 out=outputs/demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: install
 	$(BIN)/ruff check .
