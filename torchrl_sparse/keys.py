@@ -29,6 +29,9 @@ constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================
 """
 
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
 STATE = ("observation", "state")
 IMAGE = ("observation", "image")
 WRIST_IMAGE = ("observation", "wrist_image")
@@ -54,3 +57,16 @@ QUERIED = ("control", "queried")
 
 FLOPS = ("cost", "flops")
 LATENCY = ("cost", "latency")
+
+
+def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """The entry under ``key``.
+
+    Raises:
+        KeyError: if there is none; the message names the key and those that are there.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        there = sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))
+        raise KeyError(f"expected the key {key!r}, got {', '.join(there) or 'an empty TensorDict'}")
+    return value

@@ -94,6 +94,11 @@ def test_every_key_of_the_policy_is_declared():
     assert set(executor.in_keys) == {keys.IS_INIT, "input"}
 
 
+def test_missing_init_flag_is_named():
+    with pytest.raises(KeyError, match="expected the key 'is_init', got input"):
+        ChunkExecutor(CountingPolicy())(TensorDict({"input": torch.zeros(2, 1)}, [2]))
+
+
 def test_bad_lengths_are_named():
     with pytest.raises(ValueError, match="n_action_steps: expected at least 1, got 0"):
         ChunkExecutor(CountingPolicy(), n_action_steps=0)

@@ -104,6 +104,8 @@ def test_bad_observations_are_named(policy):
         ValueError, match=r"expected \[\*B, n_obs_steps, state\] = \[\*B, 2, 5\], got \[3, 2, 6\]"
     ):
         policy(TensorDict({keys.HISTORY_STATE: torch.zeros(3, 2, 6)}, [3]))
+    with pytest.raises(KeyError, match=r"expected the key \('history', 'state'\), got .*other"):
+        policy(TensorDict({"other": torch.zeros(3, 1)}, [3]))
     td = request(3)
     td[keys.HISTORY_STATE][1, 0, 2] = float("nan")
     with pytest.raises(ValueError, match=r"expected finite numbers, got nan at \[1, 0, 2\]"):

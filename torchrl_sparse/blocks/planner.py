@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, validate_mask
-from torchrl_sparse.keys import COND, PRUNE_MASK
+from torchrl_sparse.keys import COND, PRUNE_MASK, read
 
 __all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
 
@@ -106,7 +106,7 @@ class Planner(TensorDictModuleBase):
             ValueError: if :meth:`masks` returns anything but masks for the bound spec.
         """
         spec = self.spec
-        cond = tensordict.get(COND)
+        cond = read(tensordict, COND)
         batch = cond.shape[:-2]
         rows = math.prod(batch)
         masks = self.masks(cond.reshape(rows, *cond.shape[-2:]))

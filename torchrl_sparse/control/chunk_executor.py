@@ -80,7 +80,7 @@ class ChunkExecutor(TensorDictModuleBase):
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """bool [*B, 1]: samples without an action to serve."""
-        due = tensordict.get(keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
+        due = keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
         replan = tensordict.get(keys.REPLAN, None)
         return due if replan is None else due | replan
 

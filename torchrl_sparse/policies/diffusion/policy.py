@@ -214,7 +214,7 @@ class ObservationEncoder(TensorDictModuleBase):
         self._state_shape = (network.n_obs_steps, network.cond_dim)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        state = tensordict.get(keys.HISTORY_STATE)
+        state = keys.read(tensordict, keys.HISTORY_STATE)
         self._check(state)
         tensordict.set(keys.COND, self.normalizer.normalize_state(state))
         return tensordict.set(keys.SEED, self._seed(tensordict))
