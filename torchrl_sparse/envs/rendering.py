@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
-GL_HINT = "rendering needs a GL library: install libegl1 and libgl1-mesa-dri (Debian), or libosmesa6 with MUJOCO_GL=osmesa"
+GL_HINT = (
+    "rendering needs a GL library: install Debian's libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0 libgles2, or "
+    "libosmesa6 with MUJOCO_GL=osmesa"
+)
 
 
 class CameraRenderer:

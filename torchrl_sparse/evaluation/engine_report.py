@@ -187,7 +187,8 @@ def plot_engine_times(
         label="memory-bandwidth limit",
     )
     for place, milliseconds in zip(places, times, strict=True):
-        axes.annotate(f" {milliseconds:.3g}", (milliseconds, place), va="center", fontsize=9)
+        label = f" {milliseconds:.0f}" if milliseconds >= 100 else f" {milliseconds:.3g}"
+        axes.annotate(label, (milliseconds, place), va="center", fontsize=9)
     axes.set_xscale("log")
     axes.set_xlim(min([*times, *limits]) / 2, 2.5 * max(times))
     axes.set_yticks(places, names, fontsize=9)
