@@ -70,14 +70,14 @@ class DiffusionPolicy(TensorDictSequential):
         engine: EngineName = "auto",
     ):
         schedule = NoiseSchedule() if schedule is None else schedule
+        plan = Dense() if plan is None else plan
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer),
-            plan=Dense(),
+            plan=plan,
             denoise=ActionDenoiser(network, normalizer, schedule, engine),
         )
         super().__init__(stages)
-        self._fingerprint: str | None = None
-        self.plan = Dense() if plan is None else plan
+        self.plan = plan  # binds it to this network and sampler
         self.eval()
 
     # -- the parts -----------------------------------------------------------------------------------------------------
@@ -140,12 +140,10 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def fingerprint(self) -> str:
         """Names these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
-        if self._fingerprint is None:
-            digest = hashlib.sha256(repr(sorted(self.network.config.items())).encode())
-            for name, value in sorted(self.network.state_dict().items()):
-                digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
-            self._fingerprint = digest.hexdigest()[:16]
-        return self._fingerprint
+        digest = hashlib.sha256(repr(sorted(self.network.config.items())).encode())
+        for name, value in sorted(self.network.state_dict().items()):
+            digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
+        return digest.hexdigest()[:16]
 
     @property
     def engine(self) -> EngineName:
