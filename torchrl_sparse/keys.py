@@ -19,6 +19,7 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
@@ -47,6 +48,7 @@ IS_INIT = "is_init"
 COND = ("diffusion", "cond")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
+PRUNE_RATE = ("diffusion", "prune_rate")
 
 CHUNK = ("vla_action", "chunk")
 ACTION = "action"
