@@ -32,9 +32,7 @@ def test_values_are_those_of_the_reference(network, scheduler, query, reuse, exp
 
 def test_no_gate_is_dense(network, scheduler, query):
     gate = torch.zeros(5, NUM_STEPS, NUM_BLOCKS)
-    assert torch.equal(
-        denoise_relaxed(network, scheduler, *query, gate), denoise(network, scheduler, *query)
-    )
+    assert torch.equal(denoise_relaxed(network, scheduler, *query, gate), denoise(network, scheduler, *query))
 
 
 @pytest.mark.parametrize("reuse", ["block", "type"])
@@ -76,9 +74,7 @@ def test_checkpointing_changes_nothing(network, scheduler, query):
     gates = [random_mask(5).float().requires_grad_() for _ in range(2)]
     for gate, checkpointed in zip(gates, (False, True), strict=True):
         torch.manual_seed(7)
-        actions = denoise_relaxed(
-            network, scheduler, *query, gate, explore=0.5, checkpointed=checkpointed
-        )
+        actions = denoise_relaxed(network, scheduler, *query, gate, explore=0.5, checkpointed=checkpointed)
         actions.sum().backward()
     assert torch.equal(gates[0].grad, gates[1].grad)
 
