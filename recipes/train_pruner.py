@@ -126,9 +126,8 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     settings = {**asdict(trainer.config), "reference": dict(config.reference), "updates": trainer.step}
     if config.method == "l2c":
         path = out / "l2c.json"
-        schedule = trainer.gates.schedule(
-            policy=policy.fingerprint, reuse=trainer.config.reuse, settings=settings
-        )
+        made_for = {"policy": policy.fingerprint, "sampler": policy.schedule.kind}
+        schedule = trainer.gates.schedule(**made_for, reuse=trainer.config.reuse, settings=settings)
         schedule.save(path)
         return path
     info = PrunerInfo(

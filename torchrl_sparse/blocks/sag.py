@@ -32,7 +32,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
-from torchrl_sparse.blocks.planner import Planner, PlanSpec
+from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.keys import COND, PRUNE_RATE
 from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
@@ -225,6 +225,11 @@ class SAGPruner(Planner):
     def rate(self, value: float) -> None:
         self._check_rates(torch.tensor(value), "rate")
         self._rate = value
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the weights and the rate."""
+        return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
 
     def bind(self, spec: PlanSpec) -> None:
         """See :meth:`Planner.bind`.
