@@ -1,7 +1,8 @@
 """Every TensorDict key that the library reads or writes: one constant each, one meaning each.
 
 Names that TorchRL's own vision-language-action schema (`torchrl.data.vla`) already has are used as they are. ``*B`` is the
-batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps.
+batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps,
+N the visual tokens.
 
 ================================  =====================  ===========================================================
 constant                          shape, dtype           meaning
@@ -19,6 +20,11 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
+``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that a visual token reached: 0 was pruned before the
+                                                         decoder, L (all of them) was never pruned
+``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
+``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
@@ -27,7 +33,8 @@ constant                          shape, dtype           meaning
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
-``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, 0 on served steps
+``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
+                                                         0 on served steps
 ``LATENCY``                       f32 [*B, 1]            seconds of this query, 0 on served steps
 ================================  =====================  ===========================================================
 """
@@ -51,6 +58,11 @@ IS_INIT = "is_init"
 COND = ("diffusion", "cond")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
+
+KEEP_MASK = ("tokens", "keep_mask")
+TOKEN_DEPTH = ("tokens", "depth")
+KEPT = ("tokens", "kept")
+TOKEN_SCORE = ("tokens", "score")
 
 CHUNK = ("vla_action", "chunk")
 ACTION = "action"
