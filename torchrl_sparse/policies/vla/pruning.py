@@ -15,16 +15,16 @@ There are two ways to prune, and both leave the model's code alone:
       pruner.end(td)
 
 **State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
-environment has them), and is the same object in `begin`, in ``state.td`` and in `end`: what must survive from one layer to
-the next is written there under any name. What is in the pruner's ``out_keys`` at `end` goes back to the environment, everything
-else is dropped. So what must outlive a query, such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key; it
-is missing at the first query of all, and rows with ``"is_init"`` start afresh. A pruner may write ``("tokens", "keep_mask")`` in
-`begin`; the model reads it afterwards.
+environment has them), and is the same object in `begin`, in ``state.td`` and in `end`: what must survive from one layer
+to the next is written there under any name. What is in the pruner's ``out_keys`` at `end` goes back to the environment,
+everything else is dropped. So what must outlive a query, such as ``("tokens", "score")`` or the previous frame, is an out_key
+and an in_key; it is missing at the first query of all, and rows with ``"is_init"`` start afresh. A pruner may write
+``("tokens", "keep_mask")`` in `begin`; the model reads it afterwards.
 
-**Guarantees of the model.** BOS, proprio, text, action and stop tokens survive whatever a mask says. Tokens keep their original
-positions. Rows may keep different tokens: they are gathered to the front, padded to the longest row, and padding is masked out of
-attention (``state.alive``), so that a row's actions do not depend on the rest of its batch. Keeping everything is bit-exactly
-the dense model.
+**Guarantees of the model.** BOS, proprio, text, action and stop tokens survive whatever a mask says. Tokens keep their
+original positions. Rows may keep different tokens: they are gathered to the front, padded to the longest row, and padding is
+masked out of attention (``state.alive``), so that a row's actions do not depend on the rest of its batch. Keeping everything is
+bit-exactly the dense model.
 """
 
 from __future__ import annotations
@@ -103,11 +103,11 @@ class LayerState:
         task: bool [B, S]; the words of the instruction itself, without the prompt around them.
         num_visual: N.
         td: the query, [B], see the module.
-        scores: f32 [B, N], indexed by visual token id: attention of the rows from `TokenPruner.score_rows` to each visual token,
-            mean over heads and over those rows (SpecPrune-VLA, arXiv:2509.05614, Eq. 1); 0 for tokens that are gone. None where
-            the layer is not scored, and in `score_rows`.
-        attention: f32 [B, R, N], the same before the mean over rows, in the order of the sequence; rows of a sample that has fewer
-            than R are 0. None where ``scores`` is.
+        scores: f32 [B, N], indexed by visual token id: attention of the rows from `TokenPruner.score_rows` to each visual
+            token, mean over heads and over those rows (SpecPrune-VLA, arXiv:2509.05614, Eq. 1); 0 for tokens that are gone.
+            None where the layer is not scored, and in `score_rows`.
+        attention: f32 [B, R, N], the same before the mean over rows, in the order of the sequence; rows of a sample that has
+            fewer than R are 0. None where ``scores`` is.
     """
 
     layer: int
@@ -139,7 +139,7 @@ class LayerState:
         return alive.scatter(1, ids, True)[:, :-1]
 
     def keep_visual(self, keep: Tensor) -> Tensor:
-        """The answer of `TokenPruner.after_layer`, bool [B, S], that keeps of the visual tokens those in ``keep``, bool [B, N]."""
+        """The answer of `TokenPruner.after_layer`, bool [B, S], that keeps the visual tokens in ``keep``, bool [B, N]."""
         ids = self.visual_ids.clamp(0, self.num_visual - 1)
         return keep.gather(1, ids) | ~self.is_visual
 
