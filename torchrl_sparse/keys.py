@@ -25,12 +25,13 @@ constant                          shape, dtype           meaning
                                                          decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
+``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, to see what changed
+``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
-``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
 ``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
@@ -63,6 +64,8 @@ KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")
 KEPT = ("tokens", "kept")
 TOKEN_SCORE = ("tokens", "score")
+TOKEN_FRAMES = ("tokens", "frames")
+TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")
 ACTION = "action"
@@ -72,8 +75,6 @@ FINE = ("control", "fine")
 CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
-
-TOKEN_BUDGET = ("tokens", "budget")
 
 FLOPS = ("cost", "flops")
 LATENCY = ("cost", "latency")
