@@ -1,8 +1,8 @@
 """EfficientVLA, the part that concerns the language model (Yang et al., arXiv:2506.10100): fewer layers, fewer visual tokens.
 
-Layers that hardly change their input are left out altogether. Of the visual tokens stay a few that the instruction attends to, and
-beside them some more of those and some that are unlike them. The third part, caching inside a diffusion head, has nothing
-to act on in a policy that predicts actions in one pass.
+Layers that hardly change their input are left out altogether. Of the visual tokens stay a few that the instruction attends to,
+and beside them some more of those and some that are unlike them. The third part, caching inside a diffusion head, has
+nothing to act on in a policy that predicts actions in one pass.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec

@@ -33,8 +33,8 @@ def random_set(seed: Tensor, num_tokens: int, count: int) -> Tensor:
 class RandomPruner(TokenPruner):
     """Keeps a random ``share`` of all visual tokens, drawn anew at each query, before the decoder.
 
-    The draw follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them, else from torch's
-    global generator.
+    The draw follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them, else from
+    torch's global generator.
 
     Args:
         share: of the visual tokens that stay, in (0, 1].

@@ -1,7 +1,7 @@
 """SparseVLM: words that look at the image rate its tokens; of what is dropped, the better part is merged (arXiv:2410.04417).
 
-Zhang et al., ICML 2025. How many tokens go is adaptive: the more the raters' attention is spread over independent directions (its
-rank), the fewer. A merged token takes the place, and the position, of the token at the centre of its cluster.
+Zhang et al., ICML 2025. How many tokens go is adaptive: the more independent directions the raters' attention has (its rank),
+the fewer. A merged token takes the place, and the position, of the token at the centre of its cluster.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec
+from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner
 from torchrl_sparse.tokens.selection import check_share, scaled_layers
 
 _DEPTH = 32

@@ -127,8 +127,8 @@ class SpecPruneOptions:
         budget: tokens per camera where no controller grants them.
         wrist_share: share of the budget for each camera but the first.
         threshold: patches less similar than this (Eq. 2) have changed.
-        static_share: None: what changed joins in up to the budget (Eq. 3). Else the release's rule: everything stays but the most
-            similar patches, up to this share of a camera in coarse and in fine mode.
+        static_share: None: what changed joins in up to the budget (Eq. 3). Else the release's rule: everything stays but the
+            most similar patches, up to this share of a camera in coarse and in fine mode.
         carry: use the last query's scores.
         early: None, or prune after the first layer as well, to so many times K.
         dynamic: prune in deeper layers.
@@ -154,9 +154,9 @@ class SpecPruneOptions:
 
 PRESETS = {
     "paper": SpecPruneOptions(),
-    # Documented deviations of the release of August 2025, with its bugs put right: 200 of 256 patches may count as static, 220 in
-    # fine mode; no carried scores; r = 0.8; fewer tokens for the wrist; no dynamic pruning unless asked for. Its controller
-    # is ActionAwareController("commanded", coarse=20, fine=32).
+    # Documented deviations of the release of August 2025, without its bugs: 200 of 256 patches may count as static, 220 in fine
+    # mode; no carried scores; r = 0.8; fewer tokens for the wrist; no dynamic pruning unless asked for. Its controller is
+    # ActionAwareController("commanded", coarse=20, fine=32).
     "release": SpecPruneOptions(
         alpha=0.8,
         budget=20.0,
@@ -180,8 +180,8 @@ _COUNTS, _CARRIED, _CHANGED, _FIRST, _RUNNING, _TO_CARRY = (
 class SpecPrune(TokenPruner):
     """Static pruning after two layers, dynamic pruning in deeper ones; see the module.
 
-    The budget is ``("tokens", "budget")``, per sample, where an `ActionAwareController` writes it. Scores and images of the last
-    query travel as ``("tokens", "score")`` and ``("tokens", "frames")``.
+    The budget is ``("tokens", "budget")``, per sample, where an `ActionAwareController` writes it. Scores and images of the
+    last query travel as ``("tokens", "score")`` and ``("tokens", "frames")``.
 
     Args:
         preset: ``"paper"`` or ``"release"``.

@@ -32,7 +32,8 @@ _REUSABLE, _ALIKE, _REUSED_NOW, _ENTROPY, _NEW_CACHE = (
 def reusable_set(
     similarity: Tensor, attention: Tensor, static: int, relevant: int, threshold: float, cameras: int
 ) -> Tensor:
-    """In each camera the ``static`` most alike patches at or above ``threshold``, without the ``relevant`` most attended, bool [B, N].
+    """Unchanged and irrelevant, bool [B, N]: in each camera the ``static`` patches most alike their predecessors, none below
+    ``threshold``, without the ``relevant`` most attended.
 
     Args:
         similarity: [B, N] to the last query's patches.
