@@ -101,7 +101,9 @@ class VLAConfig:
                 f"expected towers of at least 2 layers, got dino {self.dino.layers}, siglip {self.siglip.layers}"
             )
         if self.dino.mlp % self.dino.dim:
-            raise ValueError(f"dino.mlp: expected a multiple of dino.dim={self.dino.dim}, got {self.dino.mlp}")
+            raise ValueError(
+                f"dino.mlp: expected a multiple of dino.dim={self.dino.dim}, got {self.dino.mlp}"
+            )
         if not 1 <= len(self.cameras) <= 2:
             raise ValueError(f"cameras: expected one or two keys, got {list(self.cameras)}")
         if not 0 < self.crop_area <= 1:
