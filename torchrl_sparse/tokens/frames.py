@@ -70,7 +70,7 @@ def compare_frames(td: TensorDictBase, spec: VisualSpec) -> tuple[Tensor, Tensor
     """
     frames = torch.stack([keys.read(td, camera) for camera in spec.cameras], 1)
     previous = keys.recall(td, keys.TOKEN_FRAMES, frames.shape[1:], 0, frames.dtype)
-    first = keys.read(td, keys.IS_INIT) | ~previous.flatten(1).any(-1, keepdim=True)
+    first = keys.read(td, keys.IS_INIT) | (previous.flatten(1).amax(-1, keepdim=True) == 0)
     alike = similarity(patches(previous, spec.grid), patches(frames, spec.grid))
     td.set(keys.TOKEN_FRAMES, frames)
     return alike, first

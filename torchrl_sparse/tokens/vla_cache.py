@@ -149,7 +149,7 @@ class VLACachePruner(TokenPruner):
 
     def end(self, td: TensorDictBase) -> None:
         td.set(REUSE_SHARE, reuse_shares(td.get(_ENTROPY), self.growth))
-        td.set(CACHE, td.get(_NEW_CACHE))
+        td.set(CACHE, td.get(_NEW_CACHE).detach())
 
 
 def _with_features(state: LayerState, features: Tensor) -> Tensor:
