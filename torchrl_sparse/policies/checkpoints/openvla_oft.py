@@ -1,11 +1,12 @@
 """Published OpenVLA-OFT checkpoints (arXiv:2502.19645), a folder as on the Hugging Face hub, as a `VLAPolicy`.
 
-Read are ``config.json``, the safetensors shards, ``action_head--*_checkpoint.pt``, ``proprio_projector--*_checkpoint.pt`` (tensors only),
-``dataset_statistics.json`` and ``tokenizer.json``. The Python files in such a folder are neither imported nor looked at.
+Read are ``config.json``, the safetensors shards, ``action_head--*_checkpoint.pt`` and ``proprio_projector--*_checkpoint.pt``
+(tensors only), ``dataset_statistics.json`` and ``tokenizer.json``. The Python files in such a folder are neither imported nor
+looked at.
 
-The towers carry timm's names there (``featurizer`` is DINOv2, ``fused_featurizer`` SigLIP), with LayerScale's ``gamma`` renamed to
-``scale_factor``, and the two ``.pt`` files the prefix ``module.``. The towers' last blocks and final norms, SigLIP's pooling head
-and the vocabulary projection take no part in OpenVLA-OFT and are left out.
+The towers carry timm's names there (``featurizer`` is DINOv2, ``fused_featurizer`` SigLIP), with LayerScale's ``gamma`` renamed
+to ``scale_factor``, and the two ``.pt`` files the prefix ``module.``. The towers' last blocks and final norms, SigLIP's pooling
+head and the vocabulary projection take no part in OpenVLA-OFT and are left out.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ def load_openvla_oft(
 
     Args:
         path: the folder.
-        unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where the file
-            has it so); not needed where the file has one only.
+        unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where the
+            file has it so); not needed where the file has one only.
         cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
         heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
         dtype: of the network.
