@@ -45,10 +45,10 @@ class QuantileNormalizer(nn.Module):
             raise ValueError(
                 f"gripper: expected bool {list(action_low.shape)}, got {gripper.dtype} {list(gripper.shape)}"
             )
-        self.register_buffer("state_low", state_low.float())
-        self.register_buffer("state_high", state_high.float())
-        self.register_buffer("action_low", action_low.float())
-        self.register_buffer("action_high", action_high.float())
+        self.register_buffer("state_low", state_low.float().clone())
+        self.register_buffer("state_high", state_high.float().clone())
+        self.register_buffer("action_low", action_low.float().clone())
+        self.register_buffer("action_high", action_high.float().clone())
         self.register_buffer("gripper", gripper)
 
     @classmethod

@@ -15,6 +15,8 @@ from torch import Tensor
 __all__ = ["BOS_ID", "STOP_ID", "InstructionTokenizer", "LlamaTokenizer", "Prompts", "WordTokenizer"]
 
 BOS_ID, STOP_ID = 1, 2
+_EMPTY_WORD_ID = 29871
+"""Of Llama's vocabulary; ends every prompt that OpenVLA was trained on."""
 _BEFORE, _AFTER = "In: What action should the robot take to ", "?\nOut:"
 _PIECE = re.compile(r"\w+|[^\w\s]|\s")
 
@@ -57,7 +59,7 @@ class WordTokenizer:
         >>> tokenizer = WordTokenizer(["lift", "cube"])
         >>> prompts = tokenizer.encode(["Lift cube", "lift"])
         >>> prompts.task.sum(1).tolist(), tokenizer.vocab_size
-        ([2, 1], 274)
+        ([2, 1], 270)
     """
 
     def __init__(self, words: Sequence[str]):
@@ -99,7 +101,7 @@ class LlamaTokenizer:
         except Exception as error:  # the Rust library raises plain Exceptions
             raise ValueError(f"expected the text of a tokenizer.json, got: {error}") from error
         self.definition = definition
-        self.vocab_size = self._tokenizer.get_vocab_size()
+        self.vocab_size = max(self._tokenizer.get_vocab_size(), _EMPTY_WORD_ID + 1)
 
     @classmethod
     def from_file(cls, path: str | Path) -> LlamaTokenizer:
@@ -124,8 +126,7 @@ class LlamaTokenizer:
             start, stop = len(_BEFORE), len(_BEFORE) + len(text)
             # a token belongs to the instruction if its last character does: it may begin with the space before
             inside = [start < end <= stop for _, end in encoding.offsets]
-            # the id 29871 of an empty word ends every prompt that OpenVLA was trained on
-            rows.append(encoding.ids + [29871] * (encoding.ids[-1] != 29871))
+            rows.append(encoding.ids + [_EMPTY_WORD_ID] * (encoding.ids[-1] != _EMPTY_WORD_ID))
             spans.append((inside.index(True) if any(inside) else 0, sum(inside)))
         return _pad(rows, spans)
 
