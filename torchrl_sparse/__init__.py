@@ -16,6 +16,10 @@ _HOME = {
     "DiffusionPolicy": "policies.diffusion.policy",
     "TransformerForDiffusion": "policies.diffusion.transformer",
     "NoiseSchedule": "policies.diffusion.schedule",
+    "VLAPolicy": "policies.vla.policy",
+    "VLAConfig": "policies.vla.config",
+    "TokenPruner": "policies.vla.pruning",
+    "load_openvla_oft": "policies.checkpoints.openvla_oft",
     "Normalizer": "data.normalize",
     "Planner": "blocks.planner",
     "StaticPlanner": "blocks.planner",
@@ -46,9 +50,13 @@ if TYPE_CHECKING:
     from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env
     from torchrl_sparse.evaluation.latency import measure_latency
     from torchrl_sparse.evaluation.paired import rollout_episodes
+    from torchrl_sparse.policies.checkpoints.openvla_oft import load_openvla_oft
     from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.policies.vla.config import VLAConfig
+    from torchrl_sparse.policies.vla.policy import VLAPolicy
+    from torchrl_sparse.policies.vla.pruning import TokenPruner
 
 
 def __getattr__(name: str):

@@ -64,6 +64,10 @@ def load_openvla_oft(
 ) -> VLAPolicy:
     """The policy in the folder ``path``. Nothing in its files is executed.
 
+    The policy reads upright images of the published size and crops them itself. What the published evaluation did to LIBERO's
+    images before that belongs to the environment: a turn by 180 degrees, and JPEG and Lanczos on the way to 224 pixels. The
+    state is position, axis-angle and both fingers of the gripper.
+
     Args:
         path: the folder.
         unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where the

@@ -12,9 +12,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import LlamaConfig, LlamaModel
-from transformers.models.llama.modeling_llama import LlamaDecoderLayer, apply_rotary_pos_emb
 
+from torchrl_sparse.policies.vla.backbones import (
+    LlamaConfig,
+    LlamaDecoderLayer,
+    LlamaModel,
+    apply_rotary_pos_emb,
+)
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner
 

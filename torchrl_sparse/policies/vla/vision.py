@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from transformers import (
+
+from torchrl_sparse.policies.vla.backbones import (
     Dinov2WithRegistersConfig,
     Dinov2WithRegistersModel,
     SiglipVisionConfig,
     SiglipVisionModel,
 )
-
 from torchrl_sparse.policies.vla.config import VLAConfig
 
 __all__ = ["FusedProjector", "VisionTowers", "center_crop"]
