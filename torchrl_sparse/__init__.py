@@ -29,6 +29,7 @@ _HOME = {
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
     "make_engine": "blocks.engine.factory",
+    "SpecPrune": "tokens.specprune",
     "ActionAwareController": "control.action_aware",
     "ChunkExecutor": "control.chunk_executor",
     "rollout_episodes": "evaluation.paired",
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.policies.vla.config import VLAConfig
     from torchrl_sparse.policies.vla.policy import VLAPolicy
     from torchrl_sparse.policies.vla.pruning import TokenPruner
+    from torchrl_sparse.tokens.specprune import SpecPrune
 
 
 def __getattr__(name: str):

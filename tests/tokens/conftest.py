@@ -1,6 +1,8 @@
 import pytest
 import torch
 
+pytest.importorskip("transformers")
+
 
 @pytest.fixture(autouse=True)
 def _without_gradients():

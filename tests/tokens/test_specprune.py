@@ -1,13 +1,19 @@
 """SpecPrune's equations on examples worked out by hand, and its two stages on a small model."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Watch, later, make_policy, query
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.pruning import TokenKind, VisualSpec
+from torchrl_sparse.policies.vla import decoder
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.decoder import pack
+from torchrl_sparse.policies.vla.flops import query_flops
+from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, VisualSpec
 from torchrl_sparse.tokens.specprune import (
     SpecPrune,
     confidence,
@@ -37,8 +43,6 @@ def test_eq_1_is_the_mean_over_heads_and_words():
 
 def test_eq_1_is_what_the_decoder_gives():
     """The decoder's scores against the whole softmax of its own queries and keys."""
-    from torchrl_sparse.policies.vla import decoder
-
     caught = []
     watch = Watch(SpecPrune(budget=4))
     inner, run_layer = watch.inner, decoder._run_layer
@@ -166,6 +170,54 @@ def test_carried_scores_are_zero_where_tokens_were_gone():
     assert gone.any()
     assert (td[keys.TOKEN_SCORE][gone] == 0).all()
     assert (td[keys.TOKEN_SCORE][~gone] > 0).all()
+
+
+def walk(pruner, spec, td, scores):
+    """Visual tokens [num_layers] that each layer of a decoder would see, for given scores of Eq. 1, without a network."""
+    kinds = [TokenKind.BOS, *[TokenKind.PRIMARY] * 256, *[TokenKind.WRIST] * 256, TokenKind.PROPRIO]
+    kinds = torch.tensor([kinds + [TokenKind.TEXT] * 34 + [TokenKind.ACTION] * 56 + [TokenKind.STOP]])
+    positions = torch.arange(kinds.shape[1])[None]
+    alive = torch.ones_like(kinds, dtype=torch.bool)
+    hidden = positions[..., None].float()
+    state = LayerState(0, hidden, alive, positions, kinds, kinds == TokenKind.TEXT, spec.num_visual, td)
+    pruner.begin(td)
+    seen = []
+    for layer in range(spec.num_layers):
+        seen.append(int(state.is_visual.sum()))
+        scored = layer in pruner.layers_scored(spec.num_layers)
+        state = replace(state, layer=layer, scores=scores[layer] * state.visual_alive if scored else None)
+        keep = pruner.after_layer(layer, state)
+        if keep is not None:
+            state, _ = pack(state, state.alive & keep)
+        assert torch.equal(state.hidden[..., 0].long(), state.positions)
+    pruner.end(td)
+    return seen
+
+
+def test_published_counts():
+    """Four disjoint sets of 24 in each camera: what was carried, what changed, and the picks of the first two layers."""
+    config = VLAConfig()
+    spec, pruner = config.visual_spec, SpecPrune()
+    pruner.bind(spec)
+    black = torch.zeros(1, 2, 3, 224, 224, dtype=torch.uint8)
+    frames, carried, scores = black + 9, torch.zeros(1, 512), torch.full((32, 1, 512), 0.5)
+    rows = slice(14, 28)  # patches 16 to 31, and eight of the next row
+    frames[..., rows, :], frames[..., 28:42, : 8 * 14] = black[..., rows, :], black[..., 28:42, : 8 * 14]
+    for camera in (0, 256):
+        carried[:, camera + 48 : camera + 72] = 1.0
+        scores[0, :, camera + 80 : camera + 104] = 1.0
+        scores[1, :, camera + 112 : camera + 136] = 1.0
+    td = TensorDict({keys.IS_INIT: torch.zeros(1, 1, dtype=torch.bool), keys.TOKEN_SCORE: carried}, [1])
+    td[keys.TOKEN_FRAMES] = black + 9
+    td[keys.IMAGE], td[keys.WRIST_IMAGE] = frames[:, 0], frames[:, 1]
+    seen = walk(pruner, spec, td, scores)
+    expected = [512] * 2 + [192] * 4 + [154] * 5 + [124] * 5 + [100] * 5 + [80] * 11
+    assert seen == expected
+    dense = torch.full((1, 32), 605)
+    sparse = dense - 512 + torch.tensor([seen])
+    none = torch.zeros(1, dtype=torch.int64)
+    ratio = query_flops(config, sparse, none) / query_flops(config, dense, none)
+    assert ratio.item() == pytest.approx(0.44, abs=0.005)
 
 
 def test_published_depth_prunes_where_the_paper_does():

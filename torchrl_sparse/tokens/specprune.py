@@ -23,7 +23,9 @@ Eq.    function                          defines
 The numbers of Eqs. 3 and 4 are inferred. What the paper leaves open is settled so: the carried score is the mean of Eq. 1 over
 two deep layers, 0 for tokens that were gone there; it contributes as many tokens as one layer does, and what changed at most as
 many (K_G = K_D = K); the threshold of Eq. 2 and the share kept by a dynamic layer are those of the release; an episode's first
-query keeps every token until the dynamic layers, because nothing is known of it yet.
+query keeps every token until the dynamic layers, because nothing is known of it yet. Where the four sets of a coarse query do
+not overlap, that keeps 192 of 512 visual tokens after two layers and 80 after the last dynamic one: 320 and 112 of about 600
+tokens pruned, beside the 315 (52.5 %) and 19 % that are reported of the paper.
 """
 
 from __future__ import annotations
