@@ -49,4 +49,6 @@ class StaticGates(nn.Module):
         """The learned schedule; the arguments are those of :class:`~torchrl_sparse.blocks.static.Schedule`."""
         mask = self.logits.detach() > 0
         mask[0] = False
-        return Schedule.from_mask(mask, method="l2c", policy=policy, sampler=sampler, reuse=reuse, settings=settings)
+        return Schedule.from_mask(
+            mask, method="l2c", policy=policy, sampler=sampler, reuse=reuse, settings=settings
+        )

@@ -137,7 +137,9 @@ class Schedule:
         num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
         num_layers = max(1, num_blocks // len(BLOCK_TYPES))
         validate_mask(mask, num_steps, num_layers, batch=())
-        return cls(method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {})
+        return cls(
+            method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
+        )
 
     def mask(self) -> Tensor:
         """The prune mask bool [K, 3L]."""

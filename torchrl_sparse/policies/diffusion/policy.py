@@ -7,7 +7,6 @@ the `Dense` planner, so that every method is compared on one code path.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from torchrl_sparse.blocks.mask import Reuse, query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.policies.checkpoints.pretrained import read_pretrained, write_pretrained
+from torchrl_sparse.policies.clock import synchronised_clock
 from torchrl_sparse.policies.diffusion.noise import query_seed, sample_noise
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -184,9 +184,9 @@ class DiffusionPolicy(TensorDictSequential):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         device = next(self.network.parameters()).device
-        start = _synchronised_clock(device)
+        start = synchronised_clock(device)
         tensordict = super().forward(tensordict)
-        seconds = _synchronised_clock(device) - start
+        seconds = synchronised_clock(device) - start
         return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
 
     # -- files ---------------------------------------------------------------------------------------------------------
@@ -281,9 +281,3 @@ class ActionDenoiser(TensorDictModuleBase):
         if self.network.training or cond.requires_grad:
             return denoise(self.network, self.schedule, noise, cond, mask, reuse=reuse)
         return self.engine.get(self.network, self.schedule).denoise(noise, cond, mask, reuse)
-
-
-def _synchronised_clock(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
