@@ -170,7 +170,11 @@ def damaged(config, path, how):
         ("no weights", FileNotFoundError, "expected a file .*pruner.safetensors"),
         ("truncated weights", ValueError, "pruner.safetensors: expected a complete safetensors file"),
         ("truncated config", ValueError, "config.json: expected a complete JSON file"),
-        ("format", ValueError, "config.json: format: expected 'torchrl_sparse.sag/1', got 'torchrl_sparse.sag/9'"),
+        (
+            "format",
+            ValueError,
+            "config.json: format: expected 'torchrl_sparse.sag/1', got 'torchrl_sparse.sag/9'",
+        ),
         ("rate", ValueError, r"config.json: .*rate: expected a prune rate in \(0, 1\), got 1.5"),
         ("reuse", ValueError, "config.json: .*reuse: expected one of .*got 'layer'"),
         ("unknown field", ValueError, "config.json: .*'colour'"),
