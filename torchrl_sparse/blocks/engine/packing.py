@@ -58,17 +58,7 @@ class _Layer(ctypes.Structure):
 class Model(ctypes.Structure):
     """``struct Model`` of native.cpp."""
 
-    _SIZES = (
-        "horizon",
-        "width",
-        "layers",
-        "heads",
-        "obs_steps",
-        "action_dim",
-        "cond_dim",
-        "steps",
-        "causal",
-    )
+    _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps", "causal"]
     _fields_ = [
         *((name, c_int32) for name in _SIZES),
         ("clip", c_float),
@@ -83,8 +73,8 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
     Args:
         weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
-        dtype: torch.float32, torch.float16 or torch.bfloat16. Of bfloat16, two rows that follow each other become one
-            of i32, the first in the lower half: CPUs multiply them in pairs.
+        dtype: torch.float32, torch.float16 or torch.bfloat16. Of bfloat16, each two rows become one of i32, the first
+            in the lower half: CPUs multiply them in pairs.
 
     Returns:
         flat, part after part of up to 256 rows, in each [ceil(columns / 32), rows of the part, 32]; zero where there
@@ -110,8 +100,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 class _Arena:
-    """Memory for constants, in large pages where the system has them: weights are streamed, and with small pages the
-    processor spends a tenth of that time on looking up addresses."""
+    """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
 
     _BLOCK = 32 << 20
 
@@ -259,8 +248,6 @@ class PackedNetwork:
             for name, table in stacked.items()
         }
 
-    # -- padding -----------------------------------------------------------------------------------------------
-
     def _per_head(self, tensor: Tensor) -> Tensor:
         """[heads * size, ...] as [heads, padded size, ...]."""
         heads = tensor.double().unflatten(0, (self._heads, -1))
@@ -275,8 +262,6 @@ class PackedNetwork:
 
     def _padded_width(self, tensor: Tensor) -> Tensor:
         return functional.pad(tensor, (0, self._width - tensor.shape[-1]))
-
-    # -- memory ------------------------------------------------------------------------------------------------
 
     def _matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None) -> _Matrix:
         dtype = dtype or self._weights
