@@ -26,6 +26,7 @@ SHAPES = {
     "block push": {"horizon": 5, "n_obs_steps": 3, "cond_dim": 16, "n_layer": 2, "n_emb": 64},
     "kitchen": {"horizon": 16, "n_obs_steps": 4, "cond_dim": 60, "n_layer": 1, "n_emb": 96},
     "no multiple of a vector": {"horizon": 7, "n_obs_steps": 2, "cond_dim": 3, "n_layer": 2, "n_emb": 42, "n_head": 3},
+    "more than one part": {"horizon": 3, "n_obs_steps": 1, "cond_dim": 300, "n_layer": 1, "n_emb": 132, "n_head": 2},
     "more rows than registers": {"horizon": 37, "n_obs_steps": 2, "cond_dim": 3, "n_layer": 1, "n_emb": 32},
     "more observations than actions": {"horizon": 2, "n_obs_steps": 9, "cond_dim": 3, "n_layer": 3, "n_emb": 16},
     "one of each": {"horizon": 1, "n_obs_steps": 1, "cond_dim": 1, "n_layer": 1, "n_emb": 8, "n_head": 1},
@@ -121,12 +122,28 @@ def test_half_precision_weights_are_those_of_a_network_rounded_to_half(instructi
     assert (engine.denoise(noise, cond, mask) - expected).abs().max() < 1e-5
 
 
-def test_a_row_of_a_batch_is_bit_identical_to_the_row_alone_and_threads_change_nothing():
+@pytest.mark.parametrize("instruction_set", SETS)
+@pytest.mark.parametrize("shape", ["lift", "kitchen", "more rows than registers", "no multiple of a vector"])
+def test_bfloat16_rounds_and_nothing_else(shape, instruction_set):
+    """Half an ulp of bfloat16 is 0.2 %; pairs in the wrong order or a lost input would change results by their size."""
+    network, schedule = make_network(shape), NoiseSchedule("ddpm", 10)
+    noise, cond, mask = make_query(network, schedule)
+    engine = NativeEngine(network, schedule, weights="bfloat16", instruction_set=instruction_set)
+    actions, expected = engine.denoise(noise, cond, mask), exact(network, schedule, noise, cond, mask)
+    assert 0 < (actions - expected).abs().max() < 2e-2
+    portable = NativeEngine(network, schedule, weights="bfloat16", instruction_set="portable")
+    assert (actions - portable.denoise(noise, cond, mask)).abs().max() < 2e-2
+
+
+@pytest.mark.parametrize("weights", ["float32", "float16", "bfloat16"])
+def test_a_row_of_a_batch_is_bit_identical_to_the_row_alone_and_threads_change_nothing(weights):
     network, schedule = make_network(), NoiseSchedule("ddpm", 10)
     noise, cond, mask = make_query(network, schedule, batch=5)
-    together = NativeEngine(network, schedule, threads=1).denoise(noise, cond, mask)
-    assert torch.equal(together, NativeEngine(network, schedule, threads=3).denoise(noise, cond, mask))
-    engine = NativeEngine(network, schedule)
+    together = NativeEngine(network, schedule, weights=weights, threads=1).denoise(noise, cond, mask)
+    for threads in (2, 3, 9):
+        engine = NativeEngine(network, schedule, weights=weights, threads=threads)
+        assert torch.equal(together, engine.denoise(noise, cond, mask))
+    engine = NativeEngine(network, schedule, weights=weights)
     for row in range(5):
         one = slice(row, row + 1)
         assert torch.equal(together[one], engine.denoise(noise[one], cond[one], mask[one]))
@@ -205,7 +222,7 @@ def test_what_it_cannot_run_is_refused_with_the_reason():
     ):
         with pytest.raises(ValueError, match=reason):
             NativeEngine(network, schedule)
-    with pytest.raises(ValueError, match=r'weights: expected "float32" or "float16", got .int8.'):
+    with pytest.raises(ValueError, match=r"weights: expected one of .*'bfloat16'\], got 'int8'"):
         NativeEngine(make_network(), schedule, weights="int8")
     with pytest.raises(ValueError, match="instruction_set: expected one of"):
         NativeEngine(make_network(), schedule, instruction_set="mmx")
@@ -221,10 +238,24 @@ def test_weights_outside_the_range_of_half_precision_are_refused():
 
 
 def test_panels_hold_the_matrix():
-    weight = torch.randn(40, 7)
-    panels = pack_panels(weight)
-    assert torch.equal(panels.transpose(1, 2).reshape(64, 7)[:40], weight)
+    weight = torch.randn(40, 300)
+    parts = [part.view(2, -1, 32) for part in pack_panels(weight).split([2 * 256 * 32, 2 * 44 * 32])]
+    panels = torch.cat(parts, dim=1)
+    assert torch.equal(panels.transpose(1, 2).reshape(64, 300)[:40], weight)
     assert not panels[1, :, 8:].any()
+
+
+def test_panels_of_bfloat16_hold_pairs_of_inputs():
+    weight = torch.randn(32, 7).bfloat16()
+    pairs = (
+        pack_panels(weight.float(), torch.bfloat16)
+        .view(4, 32)
+        .contiguous()
+        .view(torch.bfloat16)
+        .view(4, 32, 2)
+    )
+    assert torch.equal(pairs.transpose(1, 2).reshape(8, 32)[:7], weight.T)
+    assert not pairs[3, :, 1].any()
 
 
 def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monkeypatch):

@@ -11,8 +11,8 @@ and in float64, so that the only rounding it adds is that of the result:
   all denoising steps; those of the observations are computed within every query.
 * Position embeddings are biases of the layers before them, one row for each token.
 
-A matrix [columns, rows] of PyTorch becomes panels of 32 columns, [panel, row, 32]; heads are padded to multiples of
-16. ``native.cpp`` declares the same structures.
+A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into panels of 32 columns,
+[part][panel][row][32]; heads are padded to multiples of 16. ``native.cpp`` declares the same structures.
 """
 
 from __future__ import annotations
@@ -35,36 +35,30 @@ if TYPE_CHECKING:
 
 __all__ = ["Model", "PackedNetwork", "pack_panels"]
 
-PANEL = 32
+PANEL, PART = 32, 256
+_TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as native.cpp numbers them
 _CACHE_LINE = 64
 
 
 class _Matrix(ctypes.Structure):
-    _fields_ = [("weight", c_void_p), ("bias", c_void_p), ("rows", c_int32), ("columns", c_int32)]
+    _fields_ = [
+        *((name, c_void_p) for name in ("weight", "bias")),
+        *((name, c_int32) for name in ("rows", "columns", "bias_stride", "type")),
+    ]
 
 
 class _Layer(ctypes.Structure):
     _fields_ = [
         *((name, _Matrix) for name in ("qkv", "out", "up", "down", "kv")),
-        *((name, c_void_p) for name in ("fold_q", "fold_o", "query_bias", "cross_bias")),
+        ("fold", POINTER(_Matrix)),
+        *((name, c_void_p) for name in ("query_bias", "cross_bias")),
     ]
 
 
 class Model(ctypes.Structure):
     """``struct Model`` of native.cpp."""
 
-    _SIZES = (
-        "horizon",
-        "width",
-        "layers",
-        "heads",
-        "obs_steps",
-        "action_dim",
-        "cond_dim",
-        "steps",
-        "causal",
-        "half",
-    )
+    _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps", "causal"]
     _fields_ = [
         *((name, c_int32) for name in _SIZES),
         ("clip", c_float),
@@ -75,35 +69,38 @@ class Model(ctypes.Structure):
 
 
 def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Panels of a matrix.
+    """A matrix in the order in which ``native.cpp`` reads it.
 
     Args:
         weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
-        dtype: torch.float32 or torch.float16.
+        dtype: torch.float32, torch.float16 or torch.bfloat16. Of bfloat16, each two rows become one of i32, the first
+            in the lower half: CPUs multiply them in pairs.
 
     Returns:
-        [ceil(columns / 32), rows, 32], zero where there is no column.
+        flat, part after part of up to 256 rows, in each [ceil(columns / 32), rows of the part, 32]; zero where there
+        is no column.
 
     Raises:
         ValueError: if a weight is too large for ``dtype``.
 
     Examples:
-        >>> pack_panels(torch.ones(40, 7)).shape
-        torch.Size([2, 7, 32])
+        >>> pack_panels(torch.ones(40, 7)).view(2, 7, 32)[1, 0].sum()
+        tensor(8.)
     """
-    columns, rows = weight.shape
-    weight = functional.pad(weight, (0, 0, 0, -columns % PANEL))
-    packed = weight.view(-1, PANEL, rows).transpose(1, 2).to(dtype).contiguous()
-    if not packed.isfinite().all():
+    rounded = weight.to(dtype)
+    if not rounded.isfinite().all():
         raise ValueError(
             f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
         )
-    return packed
+    if dtype == torch.bfloat16:
+        rounded = functional.pad(rounded, (0, weight.shape[1] % 2)).contiguous().view(torch.int32)
+    columns, rows = rounded.shape
+    panels = functional.pad(rounded, (0, 0, 0, -columns % PANEL)).view(-1, PANEL, rows).transpose(1, 2)
+    return torch.cat([part.flatten() for part in panels.split(PART, dim=1)])
 
 
 class _Arena:
-    """Memory for constants, in large pages where the system has them: weights are streamed, and with small pages the
-    processor spends a tenth of that time on looking up addresses."""
+    """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
 
     _BLOCK = 32 << 20
 
@@ -124,11 +121,13 @@ class _Arena:
 
 
 def _pages(size: int) -> mmap.mmap:
-    memory = mmap.mmap(-1, size)
-    if hasattr(mmap, "MADV_HUGEPAGE"):
-        # A kernel without large pages refuses, and nothing is lost.
-        with contextlib.suppress(OSError):
-            memory.madvise(mmap.MADV_HUGEPAGE)
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return mmap.mmap(-1, size)
+    # Private, because memory that processes share, the default here, is not given large pages.
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    # A kernel without large pages refuses, and nothing is lost.
+    with contextlib.suppress(OSError):
+        memory.madvise(mmap.MADV_HUGEPAGE)
     return memory
 
 
@@ -138,7 +137,7 @@ class PackedNetwork:
     Args:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
         schedule: the denoising steps.
-        weights: type of the trunk's and the condition encoder's matrices, torch.float32 or torch.float16.
+        weights: type of the trunk's and the condition encoder's matrices, one of those of :func:`pack_panels`.
 
     Attributes:
         model: the structure that native.cpp reads.
@@ -149,6 +148,7 @@ class PackedNetwork:
     ) -> None:
         self._weights = weights
         self._arena = _Arena()
+        self._arrays: list[ctypes.Array] = []  # structures only point to theirs
         self._heads = network.n_head
         self._head_size = network.n_emb // network.n_head
         self._width = -(-network.n_emb // PANEL) * PANEL
@@ -157,15 +157,18 @@ class PackedNetwork:
 
     def _pack(self, network, schedule) -> Model:
         coefficients = step_coefficients(schedule)
-        layers = [self._pack_layer(layer) for layer in network.decoder.layers]
+        # What follows each other in the loop or before it does so in memory.
+        loop = [self._pack_loop(layer) for layer in network.decoder.layers]
+        layers = [
+            _Layer(**loop[i], **self._pack_memory(layer)) for i, layer in enumerate(network.decoder.layers)
+        ]
         tables = self._time_tables(network, schedule)
         positions, cond_positions = network.pos_emb[0].double(), network.cond_pos_emb[0, 1:].double()
         norm, head = network.ln_f, network.head
-        valid = torch.zeros(2 * self._width)
-        valid[: network.n_emb] = 1  # the zeros behind it serve as a bias
+        valid = self._padded_width(torch.ones(network.n_emb))
         columns = ("noise_scale", "signal_scale", "clean_weight", "sample_weight", "eps_weight", "spread")
         layer_array = (_Layer * len(layers))(*layers)
-        self._layers = layer_array  # the structure only points to it
+        self._arrays.append(layer_array)
         return Model(
             horizon=network.horizon,
             width=network.n_emb,
@@ -176,7 +179,6 @@ class PackedNetwork:
             cond_dim=network.cond_dim,
             steps=schedule.num_inference_steps,
             causal=network.causal_attn,
-            half=self._weights == torch.float16,
             clip=coefficients.clip,
             layer=layer_array,
             embed=self._matrix(network.input_emb.weight, network.input_emb.bias + positions, torch.float32),
@@ -191,30 +193,35 @@ class PackedNetwork:
             **{name: self._keep(table) for name, table in tables.items()},
         )
 
-    def _pack_layer(self, layer) -> _Layer:
+    def _pack_loop(self, layer) -> dict[str, _Matrix]:
+        """The matrices of self-attention and of the feed-forward network."""
         attention = layer.self_attn
         qkv, bias = _after_norm(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
         scale = torch.ones(3, 1).double()
         scale[0] = self._head_size**-0.5
         qkv, bias = qkv.unflatten(0, (3, -1)) * scale[..., None], bias.unflatten(0, (3, -1)) * scale
+        out = self._per_head(attention.out_proj.weight.T).flatten(0, 1).T
+        return {
+            "qkv": self._matrix(self._padded_heads(qkv), self._padded_heads(bias)),
+            "out": self._matrix(out, attention.out_proj.bias),
+            "up": self._matrix(*_after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
+            "down": self._matrix(layer.linear2.weight, layer.linear2.bias),
+        }
+
+    def _pack_memory(self, layer) -> dict:
+        """What folds memory tokens into cross-attention."""
         key_value = [tensor.unflatten(0, (3, -1))[1:] for tensor in _in_proj(layer.multihead_attn)]
         query, query_bias, out = _cross_matrices(layer)
-        query, query_bias = self._per_head(query), self._per_head(query_bias)
-        return _Layer(
-            qkv=self._matrix(self._padded_heads(qkv), self._padded_heads(bias)),
-            out=self._matrix(
-                self._per_head(attention.out_proj.weight.T).flatten(0, 1).T, attention.out_proj.bias
-            ),
-            up=self._matrix(*_after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
-            down=self._matrix(layer.linear2.weight, layer.linear2.bias),
-            kv=self._matrix(*(self._padded_heads(tensor) for tensor in key_value)),
-            fold_q=self._keep(torch.stack([pack_panels(head.T, self._weights) for head in query])),
-            fold_o=self._keep(
-                torch.stack([pack_panels(head.T, self._weights) for head in self._per_head(out.T)])
-            ),
-            query_bias=self._keep(query_bias),
-            cross_bias=self._keep(self._padded_width(layer.multihead_attn.out_proj.bias)),
-        )
+        kv = self._matrix(*(self._padded_heads(tensor) for tensor in key_value))
+        per_head = [head.T for side in (query, out.T) for head in self._per_head(side)]
+        fold = (_Matrix * len(per_head))(*(self._matrix(head, torch.zeros(len(head))) for head in per_head))
+        self._arrays.append(fold)
+        return {
+            "kv": kv,
+            "fold": fold,
+            "query_bias": self._keep(self._per_head(query_bias)),
+            "cross_bias": self._keep(self._padded_width(layer.multihead_attn.out_proj.bias)),
+        }
 
     def _time_tables(self, network, schedule) -> dict[str, Tensor]:
         """Folded keys, values [K, L, heads, width] and score biases [K, L, heads] of the time tokens."""
@@ -241,8 +248,6 @@ class PackedNetwork:
             for name, table in stacked.items()
         }
 
-    # -- padding -----------------------------------------------------------------------------------------------
-
     def _per_head(self, tensor: Tensor) -> Tensor:
         """[heads * size, ...] as [heads, padded size, ...]."""
         heads = tensor.double().unflatten(0, (self._heads, -1))
@@ -258,16 +263,22 @@ class PackedNetwork:
     def _padded_width(self, tensor: Tensor) -> Tensor:
         return functional.pad(tensor, (0, self._width - tensor.shape[-1]))
 
-    # -- memory ------------------------------------------------------------------------------------------------
-
     def _matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None) -> _Matrix:
-        packed = pack_panels(weight, dtype or self._weights)
-        bias = functional.pad(bias, (0, -bias.shape[-1] % PANEL))
-        return _Matrix(self._keep(packed), self._keep(bias), weight.shape[1], len(packed) * PANEL)
+        dtype = dtype or self._weights
+        columns, rows = weight.shape
+        bias = functional.pad(bias, (0, -columns % PANEL))
+        return _Matrix(
+            weight=self._arena.keep(pack_panels(weight, dtype)),
+            bias=self._keep(bias),
+            rows=-(-rows // 2) if dtype == torch.bfloat16 else rows,
+            columns=bias.shape[-1],
+            bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
+            type=_TYPES.index(dtype),
+        )
 
     def _keep(self, tensor: Tensor) -> int:
-        """Address of a copy of ``tensor`` as f32, or as it is if it has been packed."""
-        return self._arena.keep(tensor if tensor.dtype == torch.float16 else tensor.float())
+        """Address of a copy of ``tensor`` as f32."""
+        return self._arena.keep(tensor.float())
 
 
 def _after_norm(norm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
