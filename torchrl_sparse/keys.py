@@ -20,9 +20,10 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
-``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that a visual token reached: 0 was pruned before the
-                                                         decoder, L (all of them) was never pruned
+``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
+                                                         the decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
@@ -54,6 +55,7 @@ IS_INIT = "is_init"
 COND = ("diffusion", "cond")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
+PRUNE_RATE = ("diffusion", "prune_rate")
 
 KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")

@@ -39,7 +39,7 @@ def test_a_file_is_small_plain_json_with_one_line_per_block(path):
     assert json.loads(text)["computed_steps"].keys() == {
         f"layers.{i}.{b}" for i in (0, 1) for b in ("SA", "CA", "FFN")
     }
-    assert len(text.splitlines()) == 6 + 6 + 4
+    assert len(text.splitlines()) == 7 + 6 + 4
     assert re.search(r'^    "layers\.1\.CA": \[0, [\d, ]+\],$', text, re.MULTILINE)
 
 

@@ -28,11 +28,14 @@ class PlanSpec:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
+        sampler: kind of its denoising schedule, ``"ddpm"`` or ``"ddim"``.
     """
 
     num_inference_steps: int
     num_layers: int
     policy: str
+    sampler: str = "ddpm"
+    sampler: str = "ddpm"
 
     @property
     def num_blocks(self) -> int:
@@ -44,11 +47,12 @@ class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
-    A subclass writes :meth:`masks`; one that cannot serve every policy also overrides :meth:`bind` and raises
-    ValueError there. ``policy.plan = planner`` binds it.
+    A subclass writes :meth:`masks`; one that reads more keys overrides :meth:`inputs` too, and one that cannot
+    serve every policy :meth:`bind`, and raises ValueError there. ``policy.plan = planner`` binds it.
 
     Attributes:
-        reuse: what a pruned block reuses, ``"block"`` or ``"type"`` (see :mod:`torchrl_sparse.blocks.mask`).
+        reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see
+            :mod:`torchrl_sparse.blocks.mask`).
 
     Examples:
         >>> from tensordict import TensorDict
@@ -98,6 +102,10 @@ class Planner(TensorDictModuleBase):
         """Masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
         raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
 
+    def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
+        """Further arguments of :meth:`masks`, each with the batch dimensions flattened into ``rows``."""
+        return {}
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the mask of every observation.
 
@@ -109,7 +117,7 @@ class Planner(TensorDictModuleBase):
         cond = read(tensordict, COND)
         batch = cond.shape[:-2]
         rows = math.prod(batch)
-        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]))
+        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]), **self.options(tensordict, rows))
         try:
             validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
         except ValueError as error:

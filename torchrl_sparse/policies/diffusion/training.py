@@ -26,7 +26,7 @@ from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
 
-__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
+__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "read_checkpoint", "step_seed"]
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,8 @@ class PolicyTrainer:
             ValueError: if it is no checkpoint of this class, or was made with another network, data set or
                 configuration.
         """
-        state = _read_checkpoint(path)
-        for name in ("config", "network_config", "data"):
-            if state[name] != (expected := self._state_header()[name]):
-                raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
+        header = self._state_header()
+        state = read_checkpoint(path, {*header, "step", "network", "ema", "optimizer"}, header)
         self.network.load_state_dict(state["network"])
         self._ema.load_state_dict(state["ema"])
         self._ema.to(next(self.network.parameters()).device)
@@ -260,7 +258,18 @@ def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Te
     return index
 
 
-def _read_checkpoint(path: str | Path) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
+    """What a trainer saved. Nothing in the file is executed.
+
+    Args:
+        path: the file.
+        fields: names of everything that it must hold.
+        header: those that must be equal, since a training can only go on as it was begun.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming the file, what was expected and what came.
+    """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -270,10 +279,12 @@ def _read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
         ) from error
-    expected = {"config", "network_config", "data", "step", "network", "ema", "optimizer"}
-    if not isinstance(state, dict) or set(state) != expected:
+    if not isinstance(state, dict) or set(state) != fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(expected)}, got {found}")
+        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
+    for name, expected in header.items():
+        if state[name] != expected:
+            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
     return state
 
 
