@@ -27,6 +27,7 @@ constant                          shape, dtype           meaning
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
+``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
@@ -63,6 +64,7 @@ KEPT = ("tokens", "kept")
 TOKEN_SCORE = ("tokens", "score")
 
 CHUNK = ("vla_action", "chunk")
+IS_PAD = "action_is_pad"
 ACTION = "action"
 
 REPLAN = ("control", "replan")
