@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.trainer import TrainConfig
+from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.policies.vla.loss import VLALoss
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
@@ -37,7 +38,9 @@ def demos():
 
 
 @pytest.fixture
-def make_trainer(config, demos):
+def make_trainer(demos):
+    config = VLAConfig.tiny(llm=TransformerSize(32, 2, 2, 64))
+
     def make(**changes):
         torch.manual_seed(0)
         tokenizer = WordTokenizer(["lift", "lower", "cube"])
@@ -107,8 +110,8 @@ def test_a_checkpoint_of_another_training_is_refused(make_trainer, tmp_path):
 
 def test_the_instruction_can_be_learned(make_trainer, demos):
     """The frames are the same for both, so no other input tells up from down."""
-    trainer = make_trainer(max_steps=80, lr=1e-2, batch_size=8, val_ratio=0.0, max_grad_norm=1.0)
-    run(trainer, 80)
+    trainer = make_trainer(max_steps=100, lr=3e-3, batch_size=8, val_ratio=0.0, max_grad_norm=1.0)
+    run(trainer, 100)
     sample = demos.windows(torch.tensor([[0, 1]]), [keys.IMAGE, keys.WRIST_IMAGE, keys.STATE])
     with torch.no_grad():
         up = trainer.policy(sample.clone())[keys.CHUNK]
