@@ -1,6 +1,5 @@
 """The policy as a TensorDictModule: rows, masks, pruners, costs, errors."""
 
-
 import pytest
 import torch
 from tensordict import TensorDict
