@@ -26,6 +26,7 @@ from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, m
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -46,6 +47,8 @@ def main(config: DictConfig) -> None:
         print(f"{out / 'checkpoint.pt'}: going on from update {trainer.step}")
     stop = StopSignal()
     train(trainer, config, stop)
+    if config.logger == "csv" and trainer.step >= config.log_every:
+        plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
     how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
     print(f"{save(trainer, config)}: update {trainer.step} of {trainer.total}, {how}; {trainer.validate()}")
 
@@ -126,9 +129,8 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     settings = {**asdict(trainer.config), "reference": dict(config.reference), "updates": trainer.step}
     if config.method == "l2c":
         path = out / "l2c.json"
-        schedule = trainer.gates.schedule(
-            policy=policy.fingerprint, reuse=trainer.config.reuse, settings=settings
-        )
+        made_for = {"policy": policy.fingerprint, "sampler": policy.schedule.kind}
+        schedule = trainer.gates.schedule(**made_for, reuse=trainer.config.reuse, settings=settings)
         schedule.save(path)
         return path
     info = PrunerInfo(

@@ -29,6 +29,8 @@ _HOME = {
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
     "make_engine": "blocks.engine.factory",
+    "SpecPrune": "tokens.specprune",
+    "ActionAwareController": "control.action_aware",
     "ChunkExecutor": "control.chunk_executor",
     "rollout_episodes": "evaluation.paired",
     "measure_latency": "evaluation.latency",
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform
+    from torchrl_sparse.control.action_aware import ActionAwareController
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.data.normalize import Normalizer
     from torchrl_sparse.envs.robosuite import RobosuiteEnv
@@ -55,6 +58,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.policies.vla.config import VLAConfig
     from torchrl_sparse.policies.vla.policy import VLAPolicy
     from torchrl_sparse.policies.vla.pruning import TokenPruner
+    from torchrl_sparse.tokens.specprune import SpecPrune
 
 
 def __getattr__(name: str):

@@ -26,10 +26,14 @@ constant                          shape, dtype           meaning
                                                          the decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
+``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, to see what changed
+``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
+``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
+``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
 ``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
@@ -38,7 +42,8 @@ constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================
 """
 
-from tensordict import NestedKey, TensorDictBase
+import torch
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
 
 STATE = ("observation", "state")
@@ -62,12 +67,16 @@ KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")
 KEPT = ("tokens", "kept")
 TOKEN_SCORE = ("tokens", "score")
+TOKEN_FRAMES = ("tokens", "frames")
+TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")
 IS_PAD = "action_is_pad"
 ACTION = "action"
 
 REPLAN = ("control", "replan")
+FINE = ("control", "fine")
+CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
 
@@ -86,3 +95,30 @@ def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         there = sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))
         raise KeyError(f"expected the key {key!r}, got {', '.join(there) or 'an empty TensorDict'}")
     return value
+
+
+def recall(
+    tensordict: TensorDictBase,
+    key: NestedKey,
+    shape: tuple[int, ...],
+    fill: float,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """What an earlier call wrote under ``key``, [*B, *shape]; ``fill`` for samples that were never called before.
+
+    An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
+    although some of its rows have it. The others get rows of the same shape.
+
+    Args:
+        shape, fill, dtype: of a sample's entry where no sample has one; by default the type of ``fill``.
+    """
+    value = tensordict.get(key, None)
+    if value is not None:
+        return value
+    if isinstance(tensordict, LazyStackedTensorDict):
+        known = [value for row in tensordict.tensordicts if (value := row.get(key, None)) is not None]
+        if known:
+            shape, dtype = known[0].shape[tensordict.ndim - 1 :], known[0].dtype
+        rows = [recall(row, key, shape, fill, dtype) for row in tensordict.tensordicts]
+        return torch.stack(rows, tensordict.stack_dim)
+    return torch.full((*tensordict.batch_size, *shape), fill, dtype=dtype, device=tensordict.device)

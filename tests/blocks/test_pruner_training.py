@@ -192,10 +192,12 @@ def test_gates_and_configuration_have_to_agree(policy, reference):
 def test_learned_gates_become_a_schedule_of_the_policy(policy):
     gates = StaticGates(NUM_STEPS, NUM_BLOCKS)
     torch.nn.init.normal_(gates.logits)
-    schedule = gates.schedule(policy=policy.fingerprint, reuse="type", settings={"updates": 1})
+    schedule = gates.schedule(
+        policy=policy.fingerprint, sampler="ddim", reuse="type", settings={"updates": 1}
+    )
     planner = StaticSchedule(schedule)
     assert (schedule.method, planner.reuse) == ("l2c", "type")
-    mask = planner.mask(PlanSpec(NUM_STEPS, NUM_LAYERS, policy.fingerprint))
+    mask = planner.mask(PlanSpec(NUM_STEPS, NUM_LAYERS, policy.fingerprint, "ddim"))
     expected = gates.logits.detach() > 0
     expected[0] = False
     assert torch.equal(mask, expected)

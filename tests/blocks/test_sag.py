@@ -168,13 +168,17 @@ def damaged(config, path, how):
     ("how", "error", "message"),
     [
         ("no weights", FileNotFoundError, "expected a file .*pruner.safetensors"),
-        ("truncated weights", ValueError, "pruner.safetensors: expected the weights of this pruner"),
+        ("truncated weights", ValueError, "pruner.safetensors: expected a complete safetensors file"),
         ("truncated config", ValueError, "config.json: expected a complete JSON file"),
-        ("format", ValueError, "config.json: expected an object with format 'torchrl_sparse.sag/1'"),
+        (
+            "format",
+            ValueError,
+            "config.json: format: expected 'torchrl_sparse.sag/1', got 'torchrl_sparse.sag/9'",
+        ),
         ("rate", ValueError, r"config.json: .*rate: expected a prune rate in \(0, 1\), got 1.5"),
         ("reuse", ValueError, "config.json: .*reuse: expected one of .*got 'layer'"),
         ("unknown field", ValueError, "config.json: .*'colour'"),
-        ("size", ValueError, "pruner.safetensors: expected the weights of this pruner.*size mismatch"),
+        ("size", ValueError, "pruner.safetensors: fuse_obs.weight: expected shape .32, 64., got .64, 64."),
         ("network", ValueError, "config.json: .*'depth'"),
     ],
 )

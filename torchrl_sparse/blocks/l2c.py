@@ -45,8 +45,10 @@ class StaticGates(nn.Module):
         """f32 [B, K, 3L], the same for every observation of ``cond`` [B, To, D]."""
         return self.logits.expand(len(cond), -1, -1)
 
-    def schedule(self, *, policy: str, reuse: Reuse, settings: dict[str, Any]) -> Schedule:
-        """The learned schedule, for the policy with the fingerprint ``policy``."""
+    def schedule(self, *, policy: str, sampler: str, reuse: Reuse, settings: dict[str, Any]) -> Schedule:
+        """The learned schedule; the arguments are those of :class:`~torchrl_sparse.blocks.static.Schedule`."""
         mask = self.logits.detach() > 0
         mask[0] = False
-        return Schedule.from_mask(mask, method="l2c", policy=policy, reuse=reuse, settings=settings)
+        return Schedule.from_mask(
+            mask, method="l2c", policy=policy, sampler=sampler, reuse=reuse, settings=settings
+        )

@@ -6,7 +6,9 @@ does not) and writes one method.
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -98,6 +100,11 @@ class Planner(TensorDictModuleBase):
         """
         self._spec = spec
 
+    @property
+    def fingerprint(self) -> str:
+        """Names what decides the masks: two planners of one class and one fingerprint decide alike."""
+        return tensors_fingerprint(self.state_dict())
+
     def masks(self, cond: Tensor) -> Tensor:
         """Masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
         raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
@@ -126,6 +133,14 @@ class Planner(TensorDictModuleBase):
         return tensordict
 
 
+def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
+    """Sixteen hexadecimal digits that name the values of named tensors."""
+    digest = hashlib.sha256()
+    for name, value in sorted(tensors.items()):
+        digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
 class StaticPlanner(Planner):
     """Base of the planners whose mask does not depend on the observation; a subclass writes :meth:`mask`."""
 
@@ -151,6 +166,11 @@ class StaticPlanner(Planner):
             raise ValueError(f"{type(self).__name__}.mask: {error}") from error
         self._mask = mask
         super().bind(spec)
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the bound mask."""
+        return tensors_fingerprint({"mask": self.mask(self.spec)})
 
     def masks(self, cond: Tensor) -> Tensor:
         """The mask, once per row of ``cond``."""

@@ -18,7 +18,6 @@ query through ``("diffusion", "prune_rate")``.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -26,20 +25,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
-from torchrl_sparse.blocks.planner import Planner, PlanSpec
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.keys import COND, PRUNE_RATE
+from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes
 from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
 
 __all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner"]
 
 FORMAT = "torchrl_sparse.sag/1"
+_FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
 
 
 class PrunerNetwork(nn.Module):
@@ -226,6 +225,11 @@ class SAGPruner(Planner):
         self._check_rates(torch.tensor(value), "rate")
         self._rate = value
 
+    @property
+    def fingerprint(self) -> str:
+        """Names the weights and the rate."""
+        return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
+
     def bind(self, spec: PlanSpec) -> None:
         """See :meth:`Planner.bind`.
 
@@ -281,14 +285,10 @@ class SAGPruner(Planner):
     def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""
         path = Path(path)
-        config = {"format": FORMAT, **asdict(self.info), "network": self.network.config}
-        tensors = {
-            name: value.detach().cpu().contiguous() for name, value in self.network.state_dict().items()
-        }
-        with atomic_path(path / "pruner.safetensors") as temporary:
-            save_file(tensors, temporary)
-        with atomic_path(path / "config.json") as temporary:
-            temporary.write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        write_tensors(path / "pruner.safetensors", self.network.state_dict())
+        write_config(
+            path / "config.json", {"format": FORMAT, **asdict(self.info), "network": self.network.config}
+        )
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> SAGPruner:
@@ -299,11 +299,18 @@ class SAGPruner(Planner):
             ValueError: naming the file, what was expected in it and what came.
         """
         path = Path(path)
-        for name in ("config.json", "pruner.safetensors"):
-            if not (path / name).is_file():
-                raise FileNotFoundError(f"SAG pruner: expected a file {path / name}")
-        network, info = _read_config(path / "config.json")
-        _load_tensors(network, path / "pruner.safetensors")
+        config = read_config(path / "config.json", FORMAT, _FIELDS)
+        del config["format"]
+        try:
+            network = PrunerNetwork(**config.pop("network"))
+            info = PrunerInfo(**config)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path / 'config.json'}: {error}") from error
+        where, expected = path / "pruner.safetensors", network.state_dict()
+        tensors = read_tensors(where)
+        check_shapes(str(where), tensors, {name: tuple(value.shape) for name, value in expected.items()})
+        check_finite(str(where), tensors)
+        network.load_state_dict(tensors)
         return cls(network, info)
 
     def _check_rates(self, rates: Tensor, name: Any) -> None:
@@ -314,23 +321,3 @@ class SAGPruner(Planner):
             raise ValueError(
                 f"{name}: expected prune rates in [{low}, {high}], got {rates.min():.3g} to {rates.max():.3g}"
             )
-
-
-def _read_config(path: Path) -> tuple[PrunerNetwork, PrunerInfo]:
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a complete JSON file, got: {error}") from error
-    if not isinstance(config, dict) or config.pop("format", None) != FORMAT:
-        raise ValueError(f"{path}: expected an object with format {FORMAT!r}")
-    try:
-        return PrunerNetwork(**config.pop("network")), PrunerInfo(**config)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
-
-
-def _load_tensors(network: PrunerNetwork, path: Path) -> None:
-    try:
-        network.load_state_dict(load_file(path))
-    except (SafetensorError, RuntimeError) as error:
-        raise ValueError(f"{path}: expected the weights of this pruner, got: {error}") from error

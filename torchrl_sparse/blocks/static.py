@@ -7,6 +7,7 @@ read.
       "format": "torchrl_sparse.schedule/1",
       "method": "bac",
       "policy": "<fingerprint of the policy that it was made for>",
+      "sampler": "ddpm",
       "num_inference_steps": 100,
       "num_layers": 8,
       "reuse": "block",
@@ -54,6 +55,7 @@ _FIELDS = (
     "policy",
     "num_inference_steps",
     "num_layers",
+    "sampler",
     "reuse",
     "settings",
     "computed_steps",
@@ -71,6 +73,7 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
+        sampler: kind of the denoising schedule that it was made for, ``"ddpm"`` or ``"ddim"``.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
@@ -88,6 +91,7 @@ class Schedule:
     num_inference_steps: int
     num_layers: int
     computed_steps: tuple[tuple[int, ...], ...]
+    sampler: str = "ddpm"
     reuse: Reuse = "block"
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -102,6 +106,8 @@ class Schedule:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
         if not isinstance(self.settings, dict):
             raise ValueError(f"settings: expected an object, got {type(self.settings).__name__}")
+        if self.sampler not in ("ddpm", "ddim"):
+            raise ValueError(f"sampler: expected 'ddpm' or 'ddim', got {self.sampler!r}")
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:
@@ -119,6 +125,7 @@ class Schedule:
         *,
         method: str,
         policy: str,
+        sampler: str = "ddpm",
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
     ) -> Schedule:
@@ -130,7 +137,9 @@ class Schedule:
         num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
         num_layers = max(1, num_blocks // len(BLOCK_TYPES))
         validate_mask(mask, num_steps, num_layers, batch=())
-        return cls(method, policy, num_steps, num_layers, steps_from_mask(mask), reuse, settings or {})
+        return cls(
+            method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
+        )
 
     def mask(self) -> Tensor:
         """The prune mask bool [K, 3L]."""
@@ -169,6 +178,7 @@ class Schedule:
             "format": FORMAT,
             "method": self.method,
             "policy": self.policy,
+            "sampler": self.sampler,
             "num_inference_steps": self.num_inference_steps,
             "num_layers": self.num_layers,
             "reuse": self.reuse,
@@ -208,9 +218,9 @@ class StaticSchedule(StaticPlanner):
         """The schedule's mask [K, 3L].
 
         Raises:
-            ValueError: if the schedule was made for another number of steps or layers, or for another policy.
+            ValueError: if the schedule was made for another policy or sampler, or for other numbers of steps or layers.
         """
-        for name in ("num_inference_steps", "num_layers", "policy"):
+        for name in ("num_inference_steps", "num_layers", "policy", "sampler"):
             made_for, asked = getattr(self.schedule, name), getattr(spec, name)
             if made_for != asked:
                 label = "policy fingerprint" if name == "policy" else name

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["block_labels", "plot_error_surge", "plot_pareto", "plot_schedule", "plot_similarity"]
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
-_TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
-_REUSED = "#E9E9EC"
+TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
+REUSED_COLOR = "#E9E9EC"
 _FRONT_COLOR = "#B5B5BA"
 # Okabe and Ito's colours, which stay apart for colour-blind readers. The methods of the standard benchmark
 # have the same one in every figure; others take what is left.
@@ -133,7 +133,7 @@ def plot_schedule(
         code,
         aspect="auto",
         interpolation="nearest",
-        cmap=ListedColormap([_REUSED, *_TYPE_COLORS]),
+        cmap=ListedColormap([REUSED_COLOR, *TYPE_COLORS]),
         vmin=-0.5,
         vmax=3.5,
     )
@@ -147,10 +147,10 @@ def plot_schedule(
     axes.set_title(f"{name}: {100 * mask.mean():.1f} % pruned{cost}", loc="left")
     handles = [
         Patch(color=color, label=f"{kind} computed")
-        for kind, color in zip(BLOCK_TYPES, _TYPE_COLORS, strict=True)
+        for kind, color in zip(BLOCK_TYPES, TYPE_COLORS, strict=True)
     ]
     figure.legend(
-        handles=[*handles, Patch(color=_REUSED, label="reused")], ncols=4, loc="outside lower center"
+        handles=[*handles, Patch(color=REUSED_COLOR, label="reused")], ncols=4, loc="outside lower center"
     )
     return save_figure(figure, path)
 

@@ -1,4 +1,4 @@
-"""The two files of a policy, ``config.json`` and ``model.safetensors``, read with checks. Neither can hold code."""
+"""JSON and safetensors files of policies and pruners, read with checks. Neither can hold code."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_json(path: Path) -> Any:
         ValueError: if it is not JSON.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"policy: expected a file {path}")
+        raise FileNotFoundError(f"expected a file {path}, got none")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -66,7 +66,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         ValueError: if it is damaged.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"policy: expected a file {path}")
+        raise FileNotFoundError(f"expected a file {path}, got none")
     try:
         return load_file(path)
     except (SafetensorError, ValueError) as error:
