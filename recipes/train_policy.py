@@ -26,8 +26,9 @@ from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.diffusion.training import PolicyTrainer, TrainConfig
+from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.trainer import TrainConfig
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")

@@ -22,13 +22,14 @@ constant                          shape, dtype           meaning
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
-``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that a visual token reached: 0 was pruned before the
-                                                         decoder, L (all of them) was never pruned
+``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
+                                                         the decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
 ``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, to see what changed
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
+``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
@@ -70,6 +71,7 @@ TOKEN_FRAMES = ("tokens", "frames")
 TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")
+IS_PAD = "action_is_pad"
 ACTION = "action"
 
 REPLAN = ("control", "replan")

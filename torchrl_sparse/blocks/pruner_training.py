@@ -28,7 +28,7 @@ from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_err
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.training import batch_indices, read_checkpoint, step_seed
+from torchrl_sparse.policies.trainer import batch_indices, read_checkpoint, step_seed
 
 __all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "make_reference", "sparsity_loss"]
 

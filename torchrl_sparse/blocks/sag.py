@@ -31,13 +31,8 @@ from torch import Tensor, nn
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.keys import COND, PRUNE_RATE
-from torchrl_sparse.policies.checkpoints.files import (
-    check_tensors,
-    read_config,
-    read_tensors,
-    write_config,
-    write_tensors,
-)
+from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes
 from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
 
 __all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner"]
@@ -313,7 +308,8 @@ class SAGPruner(Planner):
             raise ValueError(f"{path / 'config.json'}: {error}") from error
         where, expected = path / "pruner.safetensors", network.state_dict()
         tensors = read_tensors(where)
-        check_tensors(where, "", tensors, {name: tuple(value.shape) for name, value in expected.items()})
+        check_shapes(str(where), tensors, {name: tuple(value.shape) for name, value in expected.items()})
+        check_finite(str(where), tensors)
         network.load_state_dict(tensors)
         return cls(network, info)
 

@@ -10,7 +10,8 @@ from diffusers.training_utils import EMAModel
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.training import PolicyTrainer, TrainConfig, batch_indices
+from torchrl_sparse.policies.diffusion.training import PolicyTrainer
+from torchrl_sparse.policies.trainer import TrainConfig, batch_indices
 
 CONFIG = TrainConfig(max_steps=12, batch_size=8, n_action_steps=4, lr=1e-3, lr_warmup_steps=3, val_ratio=0.2)
 

@@ -1,12 +1,14 @@
-"""The policy as a TensorDictModule: rows, masks, pruners, costs, errors, files."""
-
-import json
+"""The policy as a TensorDictModule: rows, masks, pruners, costs, errors."""
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import InitTracker, SerialEnv, TransformedEnv
+from torchrl.envs.custom import ToyVLAEnv
 
 from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.flops import query_flops
 from torchrl_sparse.policies.vla.network import VLANetwork
@@ -210,51 +212,39 @@ def test_gradients_reach_every_weight_but_those_that_nothing_reads(policy, query
     assert without == {"vision.dino.embeddings.mask_token"}
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 @torch.no_grad()
-def test_round_trip_at_half_precision(policy, query, tmp_path):
-    policy.save_pretrained(tmp_path)
-    again = VLAPolicy.from_pretrained(tmp_path)
-    assert again.network.config == policy.network.config
-    assert again.tokenizer.words == policy.tokenizer.words
-    for name, value in again.network.state_dict().items():
-        assert torch.equal(value, policy.network.state_dict()[name].half().float()), name
-    torch.testing.assert_close(
-        again(query(3))[keys.CHUNK][..., :6], policy(query(3))[keys.CHUNK][..., :6], rtol=0, atol=0.05
-    )
+def test_half_precision_network(policy, query):
+    td = query(3)
+    td[keys.KEEP_MASK] = keep(3, range(8), [0, 5], [7])
+    full = policy(td.clone())[keys.CHUNK]
+    policy.network.bfloat16()
+    half = policy(td)[keys.CHUNK]
+    assert half.dtype == torch.float32
+    torch.testing.assert_close(half[..., :6], full[..., :6], rtol=0, atol=0.1)
+    assert not torch.equal(half, full)
 
 
-def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
-    VLAPolicy(VLANetwork(VLAConfig.tiny(cameras=(keys.IMAGE,)))).save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match=r"config.json: cameras: expected .*wrist_image.*, got \[\['obs"):
-        VLAPolicy.from_pretrained(tmp_path, config=network.config)
+def test_collector_with_the_chunk_executor(config):
+    def env():
+        sizes = {"action_dim": 7, "state_dim": 8, "image_shape": (3, 28, 28)}
+        return TransformedEnv(ToyVLAEnv(**sizes, device="cpu"), InitTracker())
+
+    policy = VLAPolicy(VLANetwork(VLAConfig.tiny(cameras=(keys.IMAGE,))))
+    policy.pruner = HalfOfFour()
+    actor = ChunkExecutor(policy, n_action_steps=2)
+    collector = Collector(lambda: SerialEnv(2, env), actor, frames_per_batch=8, total_frames=8)
+    steps = next(iter(collector))
+    collector.shutdown()
+    queried = steps[keys.QUERIED].squeeze(-1)
+    assert queried.tolist() == [[True, False] * 2] * 2
+    assert ((steps[keys.FLOPS].squeeze(-1) > 0) == queried).all()
+    assert (steps[keys.KEPT] == 3).all()
+    assert not set(actor.out_keys) - set(steps.keys(True, True))
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("format", "other", "format: expected"),
-        ("tokenizer", {"kind": "pickle"}, "tokenizer: expected kind"),
-        ("network", {}, "expected the fields"),
-    ],
-)
-def test_a_wrong_config_is_named(policy, tmp_path, field, value, message):
-    policy.save_pretrained(tmp_path)
-    config = json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps({**config, field: value}))
-    with pytest.raises(ValueError, match=f"config.json: {message}"):
-        VLAPolicy.from_pretrained(tmp_path)
-
-
-def test_other_sizes_than_the_weights_are_named(policy, tmp_path):
-    policy.save_pretrained(tmp_path)
-    config = json.loads((tmp_path / "config.json").read_text())
-    config["network"]["vocab_size"] = 400
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"embed_tokens.weight: expected shape \(400, 32\), got \(320, 32\)"):
-        VLAPolicy.from_pretrained(tmp_path)
+class HalfOfFour(TokenPruner):
+    def after_layer(self, index, state):
+        return state.keep_visual(torch.arange(4).expand(len(state.hidden), -1) < 2) if index == 1 else None
 
 
 @torch.no_grad()

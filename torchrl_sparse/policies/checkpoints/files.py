@@ -7,22 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchrl_sparse.files import atomic_path
 
-__all__ = [
-    "check_tensors",
-    "read_config",
-    "read_json",
-    "read_tensors",
-    "take",
-    "write_config",
-    "write_tensors",
-]
+__all__ = ["read_config", "read_json", "read_tensors", "write_config", "write_tensors"]
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -80,29 +71,3 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         return load_file(path)
     except (SafetensorError, ValueError) as error:
         raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
-
-
-def take(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Removes the tensors under ``prefix`` and returns them without it."""
-    names = [name for name in tensors if name.startswith(prefix)]
-    return {name.removeprefix(prefix): tensors.pop(name) for name in names}
-
-
-def check_tensors(
-    path: Path, prefix: str, found: Mapping[str, Tensor], expected: Mapping[str, tuple[int, ...]]
-) -> None:
-    """Checks tensors against names and shapes; ``prefix`` is for the message.
-
-    Raises:
-        ValueError: if a name is missing or unknown, a shape is another one, or a number is not finite.
-    """
-    missing, extra = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
-    if missing or extra:
-        raise ValueError(f"{path}: tensors under {prefix!r}: missing {missing}, unexpected {extra}")
-    for name, shape in expected.items():
-        if tuple(found[name].shape) != shape:
-            raise ValueError(
-                f"{path}: {prefix}{name}: expected shape {shape}, got {tuple(found[name].shape)}"
-            )
-        if not torch.isfinite(found[name]).all():
-            raise ValueError(f"{path}: {prefix}{name}: expected finite numbers, got NaN or infinity")

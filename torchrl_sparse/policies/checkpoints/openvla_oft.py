@@ -20,7 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_sparse.policies.checkpoints.files import check_tensors, read_json, read_tensors, take
+from torchrl_sparse.policies.checkpoints.files import read_json, read_tensors
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
@@ -90,7 +91,8 @@ def load_openvla_oft(
     with _default_dtype(dtype):
         network = VLANetwork(config)
     weights = _rename(tensors, config)
-    check_tensors(path, "", weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
+    check_shapes(str(path), weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
+    check_finite(str(path), weights)
     network.load_state_dict(weights)
     return VLAPolicy(network, normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
 

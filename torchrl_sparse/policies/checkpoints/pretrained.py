@@ -15,14 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.checkpoints.files import (
-    check_tensors,
-    read_config,
-    read_tensors,
-    take,
-    write_config,
-    write_tensors,
-)
+from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
@@ -63,8 +57,12 @@ def read_pretrained(path: Path) -> tuple[TransformerForDiffusion, Normalizer, di
     }
     expected_network = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     where = path / "model.safetensors"
-    check_tensors(where, _NETWORK, network_tensors, expected_network)
-    check_tensors(where, _NORMALIZER, normalizer_tensors, expected_normalizer)
+    for prefix, found, expected in (
+        (_NETWORK, network_tensors, expected_network),
+        (_NORMALIZER, normalizer_tensors, expected_normalizer),
+    ):
+        check_shapes(f"{where}: {prefix}", found, expected)
+        check_finite(f"{where}: {prefix}", found)
     if tensors:
         raise ValueError(
             f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"

@@ -15,14 +15,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchrl_sparse.policies.checkpoints.files import (
-    check_tensors,
-    read_config,
-    read_tensors,
-    take,
-    write_config,
-    write_tensors,
-)
+from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
@@ -74,9 +68,10 @@ def read_vla(
         raise ValueError(
             f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
         )
-    check_tensors(where, _NETWORK, weights, _shapes(network.state_dict()))
     identity = QuantileNormalizer.identity(config.state_dim, config.action_dim)
-    check_tensors(where, _NORMALIZER, constants, _shapes(identity.state_dict()))
+    for prefix, found, module in ((_NETWORK, weights, network), (_NORMALIZER, constants, identity)):
+        check_shapes(f"{where}: {prefix}", found, _shapes(module.state_dict()))
+        check_finite(f"{where}: {prefix}", found)
     network.load_state_dict({name: value.float() for name, value in weights.items()})
     return network.eval(), QuantileNormalizer(**constants), tokenizer
 

@@ -1,79 +1,24 @@
-"""Training a diffusion policy: weights, their average, the optimiser and the step in one resumable object.
-
-Everything random in step s (which windows, timesteps, noise, dropout) follows from ``(seed, s)``; a training
-that is stopped and resumed therefore continues bit by bit as if it had not been.
-"""
+"""Training a diffusion policy on demonstrations, see `torchrl_sparse.policies.trainer`."""
 
 from __future__ import annotations
 
-import copy
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import asdict
 
 import torch
-from diffusers.optimization import get_cosine_schedule_with_warmup
-from diffusers.training_utils import EMAModel
 from torch import Tensor
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
-from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+from torchrl_sparse.policies.trainer import TrainConfig, Trainer, split_windows
 
-__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "read_checkpoint", "step_seed"]
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """How to train; defaults as published for low-dimensional robomimic (arXiv:2303.04137, Table VII).
-
-    Attributes:
-        max_steps: optimiser steps; the cosine schedule ends there.
-        batch_size: windows in a step.
-        n_action_steps: actions executed of a chunk; decides how far windows reach over an episode's end.
-        lr: peak learning rate.
-        lr_warmup_steps: steps of linear warm-up.
-        weight_decay: of Linear and attention weights.
-        max_grad_norm: gradient norm clip; 0 does not clip, as published.
-        ema_power, ema_max_decay: of the weight average, decay ``min(max, 1 - (1 + s) ** -power)``.
-        precision: "fp32", or "bf16" (autocast; the weights and the optimiser stay fp32).
-        val_ratio: share of the episodes, the last ones, that are not trained on.
-        seed: fixes everything random.
-    """
-
-    max_steps: int
-    batch_size: int = 256
-    n_action_steps: int = 8
-    lr: float = 1e-4
-    lr_warmup_steps: int = 1000
-    weight_decay: float = 1e-3
-    max_grad_norm: float = 0.0
-    ema_power: float = 0.75
-    ema_max_decay: float = 0.9999
-    precision: Literal["fp32", "bf16"] = "fp32"
-    val_ratio: float = 0.02
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.max_steps < 1 or self.batch_size < 1:
-            raise ValueError(
-                f"expected max_steps and batch_size >= 1, "
-                f"got max_steps={self.max_steps}, batch_size={self.batch_size}"
-            )
-        if self.precision not in ("fp32", "bf16"):
-            raise ValueError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
-        if not 0 <= self.val_ratio < 1:
-            raise ValueError(f"val_ratio: expected a share in [0, 1), got {self.val_ratio}")
+__all__ = ["PolicyTrainer"]
 
 
-class PolicyTrainer:
-    """Trains a network on demonstrations.
+class PolicyTrainer(Trainer):
+    """Trains a denoiser on demonstrations.
 
     Args:
         network: the network, trained in place.
@@ -96,198 +41,25 @@ class PolicyTrainer:
         demos: Demonstrations,
         config: TrainConfig,
     ) -> None:
-        self.network, self.normalizer, self.demos, self.config = network, normalizer, demos, config
+        self.normalizer, self.demos = normalizer, demos
         self.loss = DiffusionLoss(network, normalizer, NoiseSchedule())
-        num_val = math.ceil(config.val_ratio * len(demos))
-        if num_val >= len(demos):
-            raise ValueError(f"val_ratio {config.val_ratio} of {len(demos)} episodes leaves none to train on")
         sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
-        split = len(demos) - num_val
-        self.train_rows = demos.window_rows(*sizes, range(split))
-        self.val_rows = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
-        self._ema = EMAModel(
-            network.parameters(),
-            decay=config.ema_max_decay,
-            power=config.ema_power,
-            update_after_step=0,
-            use_ema_warmup=True,
-            foreach=True,
-        )
-        self._optimizer = torch.optim.AdamW(
-            optimizer_groups(network, config.weight_decay), lr=config.lr, betas=(0.9, 0.95), fused=True
-        )
-        self.step = 0
-        self._set_schedule()
+        groups = optimizer_groups(network, config.weight_decay)
+        super().__init__(network, config, groups, *split_windows(demos, sizes, config.val_ratio))
 
-    @property
-    def lr(self) -> float:
-        return self._schedule.get_last_lr()[0]
-
-    def train_step(self) -> float:
-        """One optimiser step; returns its loss.
-
-        Raises:
-            FloatingPointError: if the loss is not finite; the weights are then those of the step before.
-        """
-        torch.manual_seed(step_seed(self.config.seed, self.step))
-        index = batch_indices(len(self.train_rows), self.config.batch_size, self.step, self.config.seed)
-        self.network.train()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss = self._batch_loss(self.train_rows[index])
-        if not math.isfinite(value := loss.item()):
-            raise FloatingPointError(f"step {self.step}: loss is {value}")
-        loss.backward()
-        if self.config.max_grad_norm > 0:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
-        self._optimizer.step()
-        self._schedule.step()
-        self._ema.step(self.network.parameters())
-        self.step += 1
-        return value
-
-    @torch.no_grad()
-    def validate(self, max_windows: int = 512) -> float:
-        """Loss of the averaged weights on held-out episodes and fixed noise; nan if none is held out."""
-        if self.val_rows is None:
-            return float("nan")
-        self.network.eval()
-        with torch.random.fork_rng(devices=[]), self._averaged_weights():
-            torch.manual_seed(self.config.seed)
-            rows = self.val_rows[torch.randperm(len(self.val_rows))[:max_windows]]
-            return self._batch_loss(rows.repeat(math.ceil(max_windows / len(rows)), 1)).item()
-
-    def ema_network(self) -> TransformerForDiffusion:
-        """A copy of the network with the averaged weights, in evaluation mode."""
-        network = copy.deepcopy(self.network).eval()
-        self._ema.copy_to(network.parameters())
-        return network
-
-    def save(self, path: str | Path) -> None:
-        """Writes a checkpoint. A kill leaves the old file or the new one, never a part of one."""
-        with atomic_path(Path(path)) as temporary:
-            torch.save(self._state(), temporary)
-
-    def load(self, path: str | Path) -> None:
-        """Continues from a checkpoint. Nothing in the file is executed.
-
-        Raises:
-            ValueError: if it is no checkpoint of this class, or was made with another network, data set or
-                configuration.
-        """
-        header = self._state_header()
-        state = read_checkpoint(path, {*header, "step", "network", "ema", "optimizer"}, header)
-        self.network.load_state_dict(state["network"])
-        self._ema.load_state_dict(state["ema"])
-        self._ema.to(next(self.network.parameters()).device)
-        self._optimizer.load_state_dict(state["optimizer"])
-        self.step = state["step"]
-        self._set_schedule()
-
-    def _batch_loss(self, rows: Tensor) -> Tensor:
+    def batch_loss(self, rows: Tensor) -> Tensor:
         batch = self.demos.windows(rows, self.network.n_obs_steps)
         device = next(self.network.parameters()).device
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             return self.loss(batch.to(device)).get("loss")
 
-    @contextmanager
-    def _averaged_weights(self) -> Iterator[None]:
-        self._ema.store(self.network.parameters())
-        self._ema.copy_to(self.network.parameters())
-        try:
-            yield
-        finally:
-            self._ema.restore(self.network.parameters())
-
-    def _set_schedule(self) -> None:
-        for group in self._optimizer.param_groups:
-            group["initial_lr"] = self.config.lr
-        self._schedule = get_cosine_schedule_with_warmup(
-            self._optimizer, self.config.lr_warmup_steps, self.config.max_steps, last_epoch=self.step - 1
-        )
-
-    def _state_header(self) -> dict[str, Any]:
-        rows, data = len(self.train_rows), self.demos.data
+    def header(self) -> dict[str, dict]:
+        data = self.demos.data
         return {
             "config": asdict(self.config),
             "network_config": dict(self.network.config),
             "data": {
-                "windows": rows,
+                "windows": len(self.train_rows),
                 "checksum": sum(float(v.double().sum()) for v in data.values(True, True)),
             },
         }
-
-    def _state(self) -> dict[str, Any]:
-        return {
-            **self._state_header(),
-            "step": self.step,
-            "network": self.network.state_dict(),
-            "ema": self._ema.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-        }
-
-
-def step_seed(seed: int, step: int) -> int:
-    """Seed of torch's global generator in step ``step``; distinct for all steps of a training.
-
-    torch's CPU generator reads only the low 32 bits of a seed, so both numbers have to be mixed into those.
-
-    Examples:
-        >>> step_seed(0, 5), step_seed(1, 5) == step_seed(0, 5)
-        (5, False)
-    """
-    return (seed * 0x9E3779B1 + step) % 2**32
-
-
-def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Tensor:
-    """Windows of step ``step``, i64 [batch_size].
-
-    Every epoch is a permutation of all windows that follows from (seed, epoch). Batches run on over the end
-    of an epoch, so that every window is used equally often.
-
-    Examples:
-        >>> torch.cat([batch_indices(6, 3, step, seed=0) for step in range(2)]).sort().values.tolist()
-        [0, 1, 2, 3, 4, 5]
-    """
-    position = torch.arange(step * batch_size, (step + 1) * batch_size)
-    epoch, offset = position // num_windows, position % num_windows
-    index = torch.empty_like(offset)
-    for number in epoch.unique().tolist():
-        generator = torch.Generator().manual_seed(step_seed(seed, number))
-        chosen = epoch == number
-        index[chosen] = torch.randperm(num_windows, generator=generator)[offset[chosen]]
-    return index
-
-
-def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
-    """What a trainer saved. Nothing in the file is executed.
-
-    Args:
-        path: the file.
-        fields: names of everything that it must hold.
-        header: those that must be equal, since a training can only go on as it was begun.
-
-    Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: naming the file, what was expected and what came.
-    """
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        # torch reports damaged and unsafe files through many exception types.
-        raise ValueError(
-            f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
-        ) from error
-    if not isinstance(state, dict) or set(state) != fields:
-        found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
-    for name, expected in header.items():
-        if state[name] != expected:
-            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
-    return state
-
-
-def _difference(expected: dict, found: dict) -> str:
-    names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
-    return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)

@@ -119,18 +119,18 @@ class VLAPolicy(VLAWrapperBase):
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
         query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
-        actions, decoded = self._run(query)
+        actions, decoded = self.predict(query)
         answer = self._answer(query, actions, decoded)
         answer.set(keys.LATENCY, torch.full_like(answer.get(keys.FLOPS), synchronised_clock(device) - start))
         return self._output_tensordict(tensordict, answer.reshape(tensordict.batch_size), tensordict_out)
 
     def _predict_chunk(self, tensordict: TensorDictBase) -> Tensor:
         query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
-        chunk = self.normalizer.unnormalize_action(self._run(query)[0])
+        chunk = self.normalizer.unnormalize_action(self.predict(query)[0])
         return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
 
-    def _run(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
-        """Normalised actions [B, H, A] of a flat query, and what the decoder did; the pruner writes into ``query``."""
+    def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
+        """Normalised actions f32 [B, H, A] of a query [B], and what the decoder did; the pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
         cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
         images = read_images(query, cameras, config.image_size)

@@ -1,0 +1,55 @@
+"""A policy in files: what comes back, and what is refused."""
+
+import json
+
+import pytest
+import torch
+
+from torchrl_sparse import keys
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+
+
+@torch.no_grad()
+def test_round_trip_at_half_precision(policy, query, tmp_path):
+    policy.save_pretrained(tmp_path)
+    again = VLAPolicy.from_pretrained(tmp_path)
+    assert again.network.config == policy.network.config
+    assert again.tokenizer.words == policy.tokenizer.words
+    for name, value in again.network.state_dict().items():
+        assert torch.equal(value, policy.network.state_dict()[name].half().float()), name
+    torch.testing.assert_close(
+        again(query(3))[keys.CHUNK][..., :6], policy(query(3))[keys.CHUNK][..., :6], rtol=0, atol=0.05
+    )
+
+
+def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
+    VLAPolicy(VLANetwork(VLAConfig.tiny(cameras=(keys.IMAGE,)))).save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"config.json: cameras: expected .*wrist_image.*, got \[\['obs"):
+        VLAPolicy.from_pretrained(tmp_path, config=network.config)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("format", "other", "format: expected"),
+        ("tokenizer", {"kind": "pickle"}, "tokenizer: expected kind"),
+        ("network", {}, "expected the fields"),
+    ],
+)
+def test_a_wrong_config_is_named(policy, tmp_path, field, value, message):
+    policy.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**config, field: value}))
+    with pytest.raises(ValueError, match=f"config.json: {message}"):
+        VLAPolicy.from_pretrained(tmp_path)
+
+
+def test_other_sizes_than_the_weights_are_named(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    config["network"]["vocab_size"] = 400
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"embed_tokens.weight: expected shape \(400, 32\), got \(320, 32\)"):
+        VLAPolicy.from_pretrained(tmp_path)
