@@ -227,6 +227,23 @@ def test_recycled_tokens_hold_the_mean_of_their_cluster():
     torch.testing.assert_close(hidden[centre], expected)
 
 
+def test_recycled_tokens_reach_the_next_layer():
+    pruner, changed = SparseVLMPruner(scale=0.5, layers=[11], recycled=0.5), []
+    watch = Watch(pruner)
+
+    def after_layer(index, state):
+        before = state.hidden
+        keep = pruner.after_layer(index, state)
+        changed.append((state.hidden != before).any(-1))
+        assert keep is None or not (changed[-1] & ~keep).any()
+        return keep
+
+    watch.after_layer = after_layer
+    make_policy(watch)(query())
+    assert changed[2].any(-1).all()
+    assert not any(slots.any() for index, slots in enumerate(changed) if index != 2)
+
+
 # -- VLA-Cache -------------------------------------------------------------------------------------------------------
 
 

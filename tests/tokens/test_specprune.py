@@ -163,9 +163,18 @@ def test_dynamic_layers_keep_their_share_of_what_is_left():
     assert lengths(pruner, query(1)) == [[32], [32], [32], [16], [8], [4]]  # layers 2, 3 and 4 prune
 
 
-def test_carried_scores_are_zero_where_tokens_were_gone():
-    policy = make_policy(SpecPrune(budget=2, keep_share=0.5))
+def test_carried_scores_are_means_and_zero_where_tokens_were_gone():
+    pruner, scores = SpecPrune(budget=2, keep_share=0.5), []
+    watch = Watch(pruner)
+
+    def after_layer(index, state):
+        scores.append(state.scores)
+        return pruner.after_layer(index, state)
+
+    watch.after_layer = after_layer
+    policy = make_policy(watch)
     td = policy(query())
+    torch.testing.assert_close(td[keys.TOKEN_SCORE], (scores[3] + scores[4]) / 2)
     gone = td[keys.TOKEN_DEPTH] < 4  # before the first layer whose scores are carried
     assert gone.any()
     assert (td[keys.TOKEN_SCORE][gone] == 0).all()
@@ -173,7 +182,7 @@ def test_carried_scores_are_zero_where_tokens_were_gone():
 
 
 def walk(pruner, spec, td, scores):
-    """Visual tokens [num_layers] that each layer of a decoder would see, for given scores of Eq. 1, without a network."""
+    """Visual tokens, bool [num_layers, N], that each layer of a decoder would see for given scores of Eq. 1."""
     kinds = [TokenKind.BOS, *[TokenKind.PRIMARY] * 256, *[TokenKind.WRIST] * 256, TokenKind.PROPRIO]
     kinds = torch.tensor([kinds + [TokenKind.TEXT] * 34 + [TokenKind.ACTION] * 56 + [TokenKind.STOP]])
     positions = torch.arange(kinds.shape[1])[None]
@@ -183,7 +192,7 @@ def walk(pruner, spec, td, scores):
     pruner.begin(td)
     seen = []
     for layer in range(spec.num_layers):
-        seen.append(int(state.is_visual.sum()))
+        seen.append(state.visual_alive[0])
         scored = layer in pruner.layers_scored(spec.num_layers)
         state = replace(state, layer=layer, scores=scores[layer] * state.visual_alive if scored else None)
         keep = pruner.after_layer(layer, state)
@@ -191,7 +200,7 @@ def walk(pruner, spec, td, scores):
             state, _ = pack(state, state.alive & keep)
         assert torch.equal(state.hidden[..., 0].long(), state.positions)
     pruner.end(td)
-    return seen
+    return torch.stack(seen)
 
 
 def test_published_counts():
@@ -210,7 +219,7 @@ def test_published_counts():
     td = TensorDict({keys.IS_INIT: torch.zeros(1, 1, dtype=torch.bool), keys.TOKEN_SCORE: carried}, [1])
     td[keys.TOKEN_FRAMES] = black + 9
     td[keys.IMAGE], td[keys.WRIST_IMAGE] = frames[:, 0], frames[:, 1]
-    seen = walk(pruner, spec, td, scores)
+    seen = walk(pruner, spec, td, scores).sum(1).tolist()
     expected = [512] * 2 + [192] * 4 + [154] * 5 + [124] * 5 + [100] * 5 + [80] * 11
     assert seen == expected
     dense = torch.full((1, 32), 605)
@@ -218,6 +227,46 @@ def test_published_counts():
     none = torch.zeros(1, dtype=torch.int64)
     ratio = query_flops(config, sparse, none) / query_flops(config, dense, none)
     assert ratio.item() == pytest.approx(0.44, abs=0.005)
+
+
+def still_scene(first):
+    """A query at the published shape whose images are those of the last one."""
+    frames = torch.full((1, 2, 3, 224, 224), 9, dtype=torch.uint8)
+    td = TensorDict({keys.IS_INIT: torch.tensor([[first]]), keys.TOKEN_FRAMES: frames}, [1])
+    td[keys.IMAGE], td[keys.WRIST_IMAGE] = frames.unbind(1)
+    return td
+
+
+def test_dynamic_layers_drop_by_the_running_score():
+    spec, pruner = VLAConfig().visual_spec, SpecPrune()
+    pruner.bind(spec)
+    scores = torch.rand(32, 1, 512, generator=torch.Generator().manual_seed(0))
+    seen = walk(pruner, spec, still_scene(first=True), scores)
+    alive, running = torch.ones(512, dtype=torch.bool), None
+    for layer in (0, 1, 5, 10, 15, 20):
+        order = sorted(alive.nonzero().flatten().tolist(), key=lambda i: -scores[layer, 0, i])
+        rank = torch.full((1, 512), 512).index_put(
+            (torch.tensor([0]), torch.tensor(order)), torch.arange(len(order))
+        )
+        weight = rank_weight(rank, alive[None], 0.05)
+        now = layer_score(weight, confidence(scores[layer], alive[None]))
+        running = now if running is None else updated_score(running, now, 0.2)
+        if layer > 1:
+            best_first = sorted(alive.nonzero().flatten().tolist(), key=lambda i: -running[0, i])
+            kept = best_first[: math.ceil(0.8 * len(best_first))]
+            alive = torch.zeros(512, dtype=torch.bool).index_fill(0, torch.tensor(kept), True)
+            assert torch.equal(seen[layer + 1], alive)
+
+
+def test_release_prunes_after_the_first_layer_to_three_times_as_many():
+    spec, pruner = VLAConfig().visual_spec, SpecPrune("release")
+    pruner.bind(spec)
+    scores = torch.arange(512.0).flip(0).expand(32, 1, 512)
+    counts = walk(pruner, spec, still_scene(first=False), scores).sum(1).tolist()
+    moving = (
+        256 - 200
+    )  # of each camera, at least so many count as not static; here the last ones, which score low
+    assert counts[:3] == [512, 2 * moving + 3 * (16 + 12), 2 * moving + 16 + 12]
 
 
 def test_published_depth_prunes_where_the_paper_does():

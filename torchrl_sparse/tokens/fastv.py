@@ -16,6 +16,7 @@ def last_text_token(kind: Tensor, alive: Tensor) -> Tensor:
         alive: bool [B, S].
 
     Examples:
+        >>> import torch
         >>> kind = torch.tensor([[0, 1, 4, 4, 5]])
         >>> last_text_token(kind, torch.ones_like(kind, dtype=torch.bool)).int().tolist()
         [[0, 0, 0, 1, 0]]
