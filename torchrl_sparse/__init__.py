@@ -26,6 +26,7 @@ _HOME = {
     "BAC": "blocks.bac",
     "make_engine": "blocks.engine.factory",
     "ChunkExecutor": "control.chunk_executor",
+    "RealtimeExecutor": "control.realtime_executor",
     "rollout_episodes": "evaluation.paired",
     "measure_latency": "evaluation.latency",
 }
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.control.realtime_executor import RealtimeExecutor
     from torchrl_sparse.data.normalize import Normalizer
     from torchrl_sparse.envs.robosuite import RobosuiteEnv
     from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env

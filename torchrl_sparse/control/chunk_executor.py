@@ -72,7 +72,7 @@ class ChunkExecutor(TensorDictModuleBase):
         age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.QUERIED, due)
-        return tensordict.set(keys.ACTION, _take(tensordict.get(keys.CHUNK), age))
+        return tensordict.set(keys.ACTION, self._serve(tensordict, age))
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
         """i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
@@ -100,6 +100,10 @@ class ChunkExecutor(TensorDictModuleBase):
             shape = value.shape[1:]
             whole = _stored(tensordict, key, value.new_zeros(shape)).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
+
+    def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
+        """The action [*B, A] of this step."""
+        return _take(tensordict.get(keys.CHUNK), age)
 
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
         for key in (keys.FLOPS, keys.LATENCY):
