@@ -7,7 +7,6 @@ Kill it and run it again to go on: finished episodes are read from OUT/episodes.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -24,13 +23,15 @@ from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.episodes import EpisodeResult
 from torchrl_sparse.evaluation.fidelity import action_error, block_errors
-from torchrl_sparse.evaluation.latency import Latency, describe_machine, measure_latency
+from torchrl_sparse.evaluation.latency import describe_machine
 from torchrl_sparse.evaluation.methods import (
     answer,
     calibrate_policy,
     check_method,
     make_method,
+    method_identity,
     record_queries,
+    time_queries,
 )
 from torchrl_sparse.evaluation.paired import rollout_episodes
 from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
@@ -72,7 +73,14 @@ def main(config: DictConfig) -> None:
 
     episodes = {name: evaluate(name, method, environment, seeds, config) for name, method in methods.items()}
     queries = record_queries(executor(policy, config), environment, seeds[: config.probe_episodes])
-    latency = time_queries(methods, queries[0], config)
+    with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
+        latency = time_queries(
+            methods,
+            queries[0],
+            repeats=config.latency_repeats,
+            threads=config.threads,
+            on_round=lambda done, total: bar.update(done - bar.n),
+        )
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
     results = build_results(
@@ -97,15 +105,10 @@ def evaluate(
     name: str, policy: DiffusionPolicy, environment: Callable[..., EnvBase], seeds: range, config: DictConfig
 ) -> list[EpisodeResult]:
     """Closed-loop episodes of one method, read from its log as far as they are there."""
-    mask = policy.plan.mask(policy.plan.spec)
     identity = {
         "task": config.task,
         "horizon": config.horizon,
-        "method": name,
-        "policy": policy.fingerprint,
-        "engine": policy.engine,
-        "sampler": policy.schedule.config,
-        "mask": hashlib.sha256(mask.numpy().tobytes()).hexdigest()[:16],
+        **method_identity(name, policy),
         "n_action_steps": config.n_action_steps,
     }
     with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
@@ -121,20 +124,6 @@ def evaluate(
             results_file=Path(config.out) / "episodes" / f"{name}.jsonl",
             identity=identity,
             on_episode=show,
-        )
-
-
-def time_queries(
-    methods: dict[str, DiffusionPolicy], query: TensorDictBase, config: DictConfig
-) -> dict[str, Latency]:
-    """Latency of one observation, all methods interleaved."""
-    calls = {name: partial(answer, method, query) for name, method in methods.items()}
-    with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
-        return measure_latency(
-            calls,
-            repeats=config.latency_repeats,
-            threads=config.threads,
-            on_round=lambda done, total: bar.update(done - bar.n),
         )
 
 
