@@ -11,6 +11,7 @@ import pytest
 
 from torchrl_sparse import DiffusionPolicy
 from torchrl_sparse.evaluation import load_results
+from torchrl_sparse.evaluation.realtime import load_realtime
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
@@ -86,6 +87,27 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     logs = {file.name: file.read_bytes() for file in (out / "episodes").iterdir()}
     run("benchmark", *options)  # a second run reads the episodes instead of running them
     assert {file.name: file.read_bytes() for file in (out / "episodes").iterdir()} == logs
+
+
+def test_realtime_leaves_a_curve_per_method(work, policy):
+    out = work / "realtime"
+    options = (
+        "task=lift_moving", f"policy={policy}", "methods=[ddim2]", "latencies=[0,0.1]", "episodes=1", "horizon=12",
+        "latency_repeats=1", f"out={out}",
+    )  # fmt: skip
+    output = run("realtime", *options)
+    results = load_realtime(out / "realtime.json")
+    assert list(results["methods"]) == ["dense", "ddim2"]
+    for name, method in results["methods"].items():
+        assert name in output
+        assert {0, 2} <= {point["delay_steps"] for point in method["points"]}
+        assert sum(point["own"] for point in method["points"]) == 1
+    assert iio.imread(out / "realtime.png").std() > 5
+
+
+def test_report_makes_one_page_of_what_was_measured(work):
+    assert "report.html: " in run("report", "runs=assets", f"out={work}/report.html")
+    assert "lift/results.json" in (work / "report.html").read_text()
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
