@@ -12,7 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
@@ -36,6 +36,7 @@ from torchrl_sparse.evaluation.methods import (
 from torchrl_sparse.evaluation.paired import rollout_episodes
 from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
 from torchrl_sparse.evaluation.report import MethodRun, build_results, format_table, save_results
+from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
@@ -94,6 +95,8 @@ def main(config: DictConfig) -> None:
     save_results(results, out / "results.json")
     draw(results, methods, calibration(), queries, out)
     film(methods, environment, seeds[0], config)
+    if config.wandb:
+        log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_table(results)}\n\n{config.episodes} paired episodes per method; files are in {out}")
 
 
@@ -111,6 +114,9 @@ def evaluate(
         **method_identity(name, policy),
         "n_action_steps": config.n_action_steps,
     }
+    log = Path(config.out) / "episodes" / f"{name}.jsonl"
+    if name == "dense" and config.dense_log is not None:
+        log = Path(config.dense_log)
     with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
 
         def show(_: EpisodeResult, done: int, total: int) -> None:
@@ -121,7 +127,7 @@ def evaluate(
             environment,
             seeds,
             num_envs=config.num_envs,
-            results_file=Path(config.out) / "episodes" / f"{name}.jsonl",
+            results_file=log,
             identity=identity,
             on_episode=show,
         )
