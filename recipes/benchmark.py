@@ -127,6 +127,7 @@ def evaluate(
             environment,
             seeds,
             num_envs=config.num_envs,
+            workers=config.workers,
             results_file=log,
             identity=identity,
             on_episode=show,

@@ -120,6 +120,7 @@ def evaluate(
             environment,
             seeds,
             num_envs=config.num_envs,
+            workers=config.workers,
             results_file=Path(config.out) / "episodes" / f"{name}_delay{steps}.jsonl",
             identity=identity,
             on_episode=lambda _, done, total: bar.update(done - bar.n),
