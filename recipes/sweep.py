@@ -1,7 +1,7 @@
 """Runs an ordinary wandb sweep yaml; kill it at any moment and run it again to go on.
 
     python recipes/sweep.py sweep=rho_lift                   # no server: wandb's own engine, runs kept offline
-    wandb sync --include-offline outputs/sweeps/rho_lift/*/wandb/offline-run-*    # whenever there is one
+    wandb sync outputs/sweeps/rho_lift/*/wandb/offline-run-*            # whenever there is one
     python recipes/sweep.py sweep=rho_lift mode=online       # creates the sweep and runs an agent
 
 The same file works with `wandb sweep recipes/sweeps/rho_lift.yaml` and `wandb agent`.
