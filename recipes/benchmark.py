@@ -7,34 +7,40 @@ Kill it and run it again to go on: finished episodes are read from OUT/episodes.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.episodes import EpisodeResult
+from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.fidelity import action_error, block_errors
-from torchrl_sparse.evaluation.latency import Latency, describe_machine, measure_latency
+from torchrl_sparse.evaluation.latency import describe_machine
+from torchrl_sparse.evaluation.mask_figures import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.methods import (
+    MethodName,
     answer,
     calibrate_policy,
     check_method,
     make_method,
+    method_identity,
     record_queries,
+    time_queries,
 )
 from torchrl_sparse.evaluation.paired import rollout_episodes
 from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
 from torchrl_sparse.evaluation.report import MethodRun, build_results, format_table, save_results
+from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
@@ -47,7 +53,7 @@ SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 def main(config: DictConfig) -> None:
     out, task = Path(config.out), get_task(config.task)
     for name in config.methods:
-        check_method(name)
+        check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
 
@@ -71,8 +77,16 @@ def main(config: DictConfig) -> None:
     seeds = range(first, first + config.episodes)
 
     episodes = {name: evaluate(name, method, environment, seeds, config) for name, method in methods.items()}
-    queries = record_queries(executor(policy, config), environment, seeds[: config.probe_episodes])
-    latency = time_queries(methods, queries[0], config)
+    settle_rates(methods, episodes)
+    queries = record_queries(executor("dense", policy, config), environment, seeds[: config.probe_episodes])
+    with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
+        latency = time_queries(
+            methods,
+            queries[0],
+            repeats=config.latency_repeats,
+            threads=config.threads,
+            on_round=lambda done, total: bar.update(done - bar.n),
+        )
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
     results = build_results(
@@ -86,56 +100,51 @@ def main(config: DictConfig) -> None:
     save_results(results, out / "results.json")
     draw(results, methods, calibration(), queries, out)
     film(methods, environment, seeds[0], config)
+    if config.wandb:
+        log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_table(results)}\n\n{config.episodes} paired episodes per method; files are in {out}")
 
 
-def executor(policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(policy, n_action_steps=config.n_action_steps)
+def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
+    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, gate=MethodName.parse(name).gate())
 
 
 def evaluate(
     name: str, policy: DiffusionPolicy, environment: Callable[..., EnvBase], seeds: range, config: DictConfig
 ) -> list[EpisodeResult]:
     """Closed-loop episodes of one method, read from its log as far as they are there."""
-    mask = policy.plan.mask(policy.plan.spec)
     identity = {
         "task": config.task,
         "horizon": config.horizon,
-        "method": name,
-        "policy": policy.fingerprint,
-        "engine": policy.engine,
-        "sampler": policy.schedule.config,
-        "mask": hashlib.sha256(mask.numpy().tobytes()).hexdigest()[:16],
+        **method_identity(name, policy),
         "n_action_steps": config.n_action_steps,
     }
+    log = Path(config.out) / "episodes" / f"{name}.jsonl"
+    if name == "dense" and config.dense_log is not None:
+        log = Path(config.dense_log)
     with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
 
         def show(_: EpisodeResult, done: int, total: int) -> None:
             bar.update(done - bar.n)
 
         return rollout_episodes(
-            executor(policy, config),
+            executor(name, policy, config),
             environment,
             seeds,
             num_envs=config.num_envs,
-            results_file=Path(config.out) / "episodes" / f"{name}.jsonl",
+            workers=config.workers,
+            results_file=log,
             identity=identity,
             on_episode=show,
         )
 
 
-def time_queries(
-    methods: dict[str, DiffusionPolicy], query: TensorDictBase, config: DictConfig
-) -> dict[str, Latency]:
-    """Latency of one observation, all methods interleaved."""
-    calls = {name: partial(answer, method, query) for name, method in methods.items()}
-    with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
-        return measure_latency(
-            calls,
-            repeats=config.latency_repeats,
-            threads=config.threads,
-            on_round=lambda done, total: bar.update(done - bar.n),
-        )
+def settle_rates(methods: dict[str, DiffusionPolicy], episodes: dict[str, list[EpisodeResult]]) -> None:
+    """Methods whose rate moves are timed at the mean rate of their episodes."""
+    for name, method in methods.items():
+        rates = MethodName.parse(name).rates
+        if len(rates) == 2:
+            method.plan.rate = min(max(totals(episodes[name]).prune_rate, min(rates)), max(rates))
 
 
 def error_to_dense(method: DiffusionPolicy, queries: TensorDictBase) -> tuple[float, float]:
@@ -161,6 +170,9 @@ def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, querie
     for name, mask in masks.items():
         ratio = results["methods"][name]["flops"]["ratio_to_dense"]
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
+    for name, method in methods.items():
+        if not isinstance(method.plan, StaticPlanner):
+            draw_masks(name, method, queries, out)
     surging = {name: masks[name] for name in SURGE_METHODS if name in masks}
     if surging:
         dense = methods["dense"]
@@ -173,6 +185,17 @@ def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, querie
         )
 
 
+def draw_masks(name: str, method: DiffusionPolicy, queries: TensorDictBase, out: Path) -> None:
+    """How the masks change along an episode, and over all queries."""
+    masks = answer(method, queries)[keys.PRUNE_MASK].numpy()
+    plot_mask_statistics(masks, out / f"masks_{name}.png", name=name)
+    step = queries[keys.EPISODE_STEP].flatten()
+    first_episode = (queries[keys.EPISODE_SEED] == queries[keys.EPISODE_SEED][0]).flatten()
+    steps_per_query = int(step[1] - step[0]) if first_episode.sum() > 1 else 1
+    strip = masks[first_episode.numpy()]
+    plot_mask_strip(strip, out / f"strip_{name}.png", name=name, steps_per_query=steps_per_query)
+
+
 def film(
     methods: dict[str, DiffusionPolicy], environment: Callable[..., EnvBase], seed: int, config: DictConfig
 ) -> None:
@@ -182,7 +205,8 @@ def film(
             continue
         env = environment(seeds=[seed])
         try:
-            frames, captions = follow(name, executor(methods[name], config), env)
+            adaptive = not isinstance(methods[name].plan, StaticPlanner)
+            frames, captions = follow(name, executor(name, methods[name], config), env, adaptive)
         except RuntimeError as error:
             print(f"no video: {error}")
             return
@@ -191,12 +215,21 @@ def film(
         write_video(frames, Path(config.out) / f"rollout_{name}.mp4", captions=captions)
 
 
-def follow(name: str, actor: ChunkExecutor, env: EnvBase) -> tuple[list, list[Caption]]:
-    """Frames of one episode, the last one after its last step, and what to write under them."""
+def follow(name: str, actor: ChunkExecutor, env: EnvBase, show_masks: bool) -> tuple[list, list[Caption]]:
+    """Frames of one episode, the last one after its last step, and what to write under them.
+
+    With ``show_masks``, the mask of the latest query stands beside the camera's view.
+    """
     frames, captions = [], []
 
+    def photograph(env: EnvBase, step: TensorDictBase) -> None:
+        frame = env.base_env.render("agentview", 320, 320)
+        if show_masks:
+            frame = np.hstack([frame, mask_panel(step[keys.PRUNE_MASK].numpy(), height=320)])
+        frames.append(frame)
+
     def watch(env: EnvBase, step: TensorDictBase) -> None:
-        frames.append(env.base_env.render("agentview", 320, 320))
+        photograph(env, step)
         queried = bool(step[keys.QUERIED])
         latency = float(step[keys.LATENCY]) if queried else captions[-1].latency
         captions.append(Caption(name, len(captions), queried, latency, bool(step[keys.SUCCESS])))
@@ -204,7 +237,7 @@ def follow(name: str, actor: ChunkExecutor, env: EnvBase) -> tuple[list, list[Ca
     env.base_env.reset()
     env.base_env.render("agentview", 320, 320)  # fails here, before any query, where there is no GL library
     steps = env.rollout(env.base_env.horizon, actor, callback=watch)
-    frames.append(env.base_env.render("agentview", 320, 320))
+    photograph(env, steps[-1])
     solved = bool(steps["next", keys.SUCCESS][-1])
     captions.append(Caption(name, len(captions), False, captions[-1].latency, solved))
     return frames, captions

@@ -9,16 +9,19 @@ from pathlib import Path
 import imageio.v3 as iio
 import pytest
 
+from tests.evaluation.synthetic import make_results
 from torchrl_sparse import DiffusionPolicy
-from torchrl_sparse.evaluation import load_results
+from torchrl_sparse.evaluation import load_results, save_results
+from torchrl_sparse.evaluation.realtime import load_realtime
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}
 METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 
 
 def run(recipe, *options, expect=0):
     command = [sys.executable, str(RECIPES / f"{recipe}.py"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == expect, done.stderr[-3000:]
     return done.stdout + done.stderr
 
@@ -65,7 +68,7 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
         "task=lift", f"policy={policy}", f"schedules={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
-        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", f"out={out}",
+        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "wandb=true", f"out={out}",
     )  # fmt: skip
     output = run("benchmark", *options)
     results = load_results(out / "results.json")
@@ -83,9 +86,74 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
         or "no video: rendering needs a GL library" in output
     )
 
+    media = next(out.glob("wandb/offline-run-*/files/media"))
+    assert {path.suffix for path in media.rglob("*.*")} >= {".png", ".json"}
+
     logs = {file.name: file.read_bytes() for file in (out / "episodes").iterdir()}
     run("benchmark", *options)  # a second run reads the episodes instead of running them
     assert {file.name: file.read_bytes() for file in (out / "episodes").iterdir()} == logs
+
+
+def test_realtime_leaves_a_curve_per_method(work, policy):
+    out = work / "realtime"
+    options = (
+        "task=lift_moving", f"policy={policy}", "methods=[ddim2]", "latencies=[0,0.1]", "episodes=1", "horizon=12",
+        "latency_repeats=1", f"out={out}",
+    )  # fmt: skip
+    output = run("realtime", *options)
+    results = load_realtime(out / "realtime.json")
+    assert list(results["methods"]) == ["dense", "ddim2"]
+    for name, method in results["methods"].items():
+        assert name in output
+        assert {0, 2} <= {point["delay_steps"] for point in method["points"]}
+        assert sum(point["own"] for point in method["points"]) == 1
+    assert iio.imread(out / "realtime.png").std() > 5
+
+
+FAKE_TRIAL = """
+import os, shutil, sys
+from pathlib import Path
+
+arguments = dict(word.split("=", 1) for word in sys.argv[1:])
+out = Path(os.environ["SWEEP_OUT"]) / os.environ["WANDB_RUN_ID"]
+out.mkdir(exist_ok=True)
+if arguments["num_updates"] == "10" and not (out / "tried").exists():
+    (out / "tried").touch()
+    os.kill(os.getppid(), 9)
+    sys.exit("killed")
+shutil.copy(Path(__file__).with_name("template.json"), out / "results.json")
+"""
+
+
+def test_a_killed_sweep_goes_on_and_ends_with_every_trial(work):
+    (work / "trial.py").write_text(FAKE_TRIAL)
+    save_results(make_results(20, names=("dense", "bac")), work / "template.json")
+    sweep = {
+        "program": str(work / "trial.py"),
+        "method": "grid",
+        "metric": {"name": "tested/success", "goal": "maximize"},
+        "parameters": {"num_updates": {"values": [20, 10, 5]}},
+        "command": ["${env}", "python", "${program}", "${args_no_hyphens}"],
+    }
+    (work / "toy.yaml").write_text(json.dumps(sweep))
+    options = ("sweep", f"sweep={work}/toy.yaml", f"out={work}/sweep")
+    run(*options, expect=-9)
+    before = json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
+    assert [trial["finished"] for trial in before] == [True, False]
+    assert "3 trials" in run(*options)
+    after = json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
+    assert [trial["id"] for trial in after][:2] == [trial["id"] for trial in before]
+    assert [trial["parameters"]["num_updates"] for trial in after] == [20, 10, 5]
+    assert list(load_results(work / "sweep" / "results.json")["methods"]) == [
+        "dense", "num_updates=20", "num_updates=10", "num_updates=5",
+    ]  # fmt: skip
+    assert len((work / "sweep" / "trials.csv").read_text().splitlines()) == 4
+    assert iio.imread(work / "sweep" / "pareto.png").std() > 5
+
+
+def test_report_makes_one_page_of_what_was_measured(work):
+    assert "report.html: " in run("report", "runs=assets", f"out={work}/report.html")
+    assert "lift/results.json" in (work / "report.html").read_text()
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):

@@ -32,6 +32,7 @@ _HOME = {
     "SpecPrune": "tokens.specprune",
     "ActionAwareController": "control.action_aware",
     "ChunkExecutor": "control.chunk_executor",
+    "RealtimeExecutor": "control.realtime_executor",
     "rollout_episodes": "evaluation.paired",
     "measure_latency": "evaluation.latency",
 }
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.uniform import Uniform
     from torchrl_sparse.control.action_aware import ActionAwareController
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.control.realtime_executor import RealtimeExecutor
     from torchrl_sparse.data.normalize import Normalizer
     from torchrl_sparse.envs.robosuite import RobosuiteEnv
     from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env

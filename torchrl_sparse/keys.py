@@ -36,6 +36,9 @@ constant                          shape, dtype           meaning
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
+``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait
+``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
+``HOLD``                          f32 [*B, A]            the action that keeps the arm where it is
 ``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
                                                          0 on served steps
 ``LATENCY``                       f32 [*B, 1]            seconds of this query, 0 on served steps
@@ -79,6 +82,9 @@ FINE = ("control", "fine")
 CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
+DELAY = ("control", "delay")
+MEANWHILE = ("control", "meanwhile")
+HOLD = ("control", "hold")
 
 FLOPS = ("cost", "flops")
 LATENCY = ("cost", "latency")

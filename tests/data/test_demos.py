@@ -243,3 +243,14 @@ def test_an_expert_that_keeps_failing_stops_the_collection(monkeypatch, tmp_path
 def test_out_of_range_options_are_named(tmp_path, field, value):
     with pytest.raises(ValueError, match=field):
         collect(tmp_path / "a.h5", Collection(**{"task": "Lift", "episodes": 1, field: value}))
+
+
+def test_two_workers_make_the_same_file(collected, tmp_path):
+    path, summary = collected
+    assert collect(tmp_path / "two.h5", THREE, workers=2) == summary
+    assert (tmp_path / "two.h5").read_bytes() == path.read_bytes()
+
+
+def test_no_worker_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
+        collect(tmp_path / "none.h5", THREE, workers=0)

@@ -73,7 +73,7 @@ class ChunkExecutor(TensorDictModuleBase):
         age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.QUERIED, due)
-        return tensordict.set(keys.ACTION, action_at(tensordict.get(keys.CHUNK), age))
+        return tensordict.set(keys.ACTION, self._serve(tensordict, age))
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
         """i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
@@ -101,6 +101,10 @@ class ChunkExecutor(TensorDictModuleBase):
             shape = value.shape[1:]
             whole = keys.recall(tensordict, key, shape, 0, value.dtype).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
+
+    def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
+        """The action [*B, A] of this step."""
+        return action_at(tensordict.get(keys.CHUNK), age)
 
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
         for key in (keys.FLOPS, keys.LATENCY):

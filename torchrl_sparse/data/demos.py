@@ -6,10 +6,13 @@ made again, and continued after a kill, to the same bytes on the same machine.
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ import numpy as np
 import torch
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
@@ -120,6 +124,7 @@ def collect(
     collection: Collection,
     *,
     env: RobosuiteEnv | None = None,
+    workers: int = 1,
     on_episode: Callable[[Summary], None] | None = None,
 ) -> Summary:
     """Collects demonstrations into ``path``, going on where a killed run stopped.
@@ -130,7 +135,9 @@ def collect(
     Args:
         path: the HDF5 file to make; layout in `torchrl_sparse.data.hdf5_writer`.
         collection: what to collect.
-        env: an environment of that task to use; made when it is needed by default.
+        env: an environment of that task to use; made when it is needed by default. Workers make their own.
+        workers: processes; the file is the same whatever their number. One that dies is reported as a warning and its
+            episode made again.
         on_episode: called with the tally so far, after episodes found on disk and after each new one.
 
     Raises:
@@ -138,6 +145,8 @@ def collect(
     """
     path = Path(path)
     _check(collection)
+    if workers < 1:
+        raise ValueError(f"workers: expected at least 1, got {workers}")
     parts = path.with_name(path.name + ".parts")
     settings = asdict(collection)
     if path.exists():
@@ -146,20 +155,37 @@ def collect(
     _claim(parts, settings)
     kept: list[Path] = []
     tally = Summary(0, 0, 0, 0.0)
-    while tally.kept < collection.episodes:
-        part = parts / f"{collection.seed + tally.attempts:010d}.h5"
-        if not part.exists():
-            env = env or RobosuiteEnv(collection.task)
-            write_episode(part, demonstrate(env, collection.seed + tally.attempts, collection.quality))
-        tally = _add(tally, part, kept, collection.keep_failures)
-        if on_episode is not None:
-            on_episode(tally)
-        if not collection.keep_failures:
-            _check_yield(tally)
+    make = partial(_make_part, parts, collection.task, collection.quality, env if workers == 1 else None)
+    first = collection.seed
+    seeds = in_order(make, first, workers) if workers > 1 else (make(seed) for seed in itertools.count(first))
+    with closing(seeds):
+        while tally.kept < collection.episodes:
+            tally = _add(tally, _part(parts, next(seeds)), kept, collection.keep_failures)
+            if on_episode is not None:
+                on_episode(tally)
+            if not collection.keep_failures:
+                _check_yield(tally)
     made_in = env_args(get_task(collection.task))
     merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
     shutil.rmtree(parts)
     return tally
+
+
+def _part(parts: Path, seed: int) -> Path:
+    return parts / f"{seed:010d}.h5"
+
+
+def _make_part(parts: Path, task: str, quality: str, env: RobosuiteEnv | None, seed: int) -> int:
+    """Makes the episode of a seed, unless it is there; returns the seed."""
+    if not _part(parts, seed).exists():
+        write_episode(_part(parts, seed), demonstrate(env or _own_env(task), seed, quality))
+    return seed
+
+
+@cache
+def _own_env(task: str) -> RobosuiteEnv:
+    """The environment of this process: making one takes longer than an episode."""
+    return RobosuiteEnv(task)
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:

@@ -44,6 +44,16 @@ def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
     return matrix_to_rot6d(matrix.reshape(*rotvec.shape[:-1], 3, 3))
 
 
+def quaternion_to_rot6d(quat: np.ndarray) -> np.ndarray:
+    """[..., 4] unit quaternions (xyzw) to [..., 6].
+
+    >>> quaternion_to_rot6d(np.array([0.0, 0.0, 0.0, 1.0]))
+    array([1., 0., 0., 0., 1., 0.])
+    """
+    matrix = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix()
+    return matrix_to_rot6d(matrix.reshape(*quat.shape[:-1], 3, 3))
+
+
 def rot6d_to_rotvec(rot6d: np.ndarray) -> np.ndarray:
     """[..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
     matrix = rot6d_to_matrix(rot6d)

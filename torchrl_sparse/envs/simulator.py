@@ -42,6 +42,8 @@ def make_simulator(
         control_freq: actions a second.
     """
     robosuite = import_robosuite()
+    from torchrl_sparse.envs import moving_lift  # noqa: F401  (registers its task)
+
     return robosuite.make(
         task.name,
         robots=["Panda"] * task.arms,

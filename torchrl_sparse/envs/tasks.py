@@ -15,7 +15,7 @@ class Task:
     """One robosuite task.
 
     Attributes:
-        name: robosuite's name.
+        name: robosuite's name, or ours for a variant (`torchrl_sparse.envs.moving_lift`).
         alias: robomimic's short name; folders and command lines use it.
         arms: number of Panda arms.
         object_dim: size of robosuite's ``object-state``.
@@ -53,6 +53,7 @@ TASKS = {
     task.name: task
     for task in (
         Task("Lift", "lift", 1, 10, 400, "lift the red cube"),
+        Task("LiftMoving", "lift_moving", 1, 10, 400, "lift the moving red cube"),
         Task("PickPlaceCan", "can", 1, 14, 400, "put the can into its bin"),
         Task("NutAssemblySquare", "square", 1, 14, 400, "put the square nut on the square peg"),
         Task(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +22,7 @@ from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.evaluation.latency import Latency, measure_latency
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
@@ -169,3 +172,27 @@ def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:
     """Asks another method the same: same observations, same noise."""
     with torch.no_grad():
         return policy(queries.select(keys.HISTORY_STATE, keys.EPISODE_SEED, keys.EPISODE_STEP))
+
+
+def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:
+    """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
+    return {
+        "method": name,
+        "policy": policy.fingerprint,
+        "engine": policy.engine,
+        "sampler": policy.schedule.config,
+        "planner": policy.plan.fingerprint,
+    }
+
+
+def time_queries(
+    methods: Mapping[str, DiffusionPolicy],
+    query: TensorDictBase,
+    *,
+    repeats: int,
+    threads: int,
+    on_round: Callable[[int, int], None] | None = None,
+) -> dict[str, Latency]:
+    """Latency of one recorded query under each method, interleaved; see `measure_latency`."""
+    calls = {name: partial(answer, method, query) for name, method in methods.items()}
+    return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)

@@ -5,14 +5,17 @@ paired by running each on the same seeds, in whatever order, number of environme
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+import signal
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import EnvBase, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
@@ -22,6 +25,8 @@ from torchrl_sparse.evaluation.latency import num_threads
 
 __all__ = ["rollout_episodes"]
 
+_STEPS_PER_BATCH = 16  # that worker processes make between two reports
+_FAILURES = 3  # crashes of workers in a row, without an episode finished between them, that end an evaluation
 _REQUIRED = (keys.EPISODE_SEED, keys.QUERIED, keys.FLOPS, ("next", keys.SUCCESS), ("next", "done"))
 
 
@@ -31,16 +36,19 @@ def rollout_episodes(
     seeds: Sequence[int],
     *,
     num_envs: int = 10,
+    workers: int = 1,
     max_steps: int | None = None,
     results_file: str | os.PathLike | None = None,
     identity: Mapping[str, Any] | None = None,
     on_episode: Callable[[EpisodeResult, int, int], None] | None = None,
     policy_device: torch.device | str | None = None,
 ) -> list[EpisodeResult]:
-    """Run one episode per seed in a TorchRL ``Collector`` over a ``SerialEnv``.
+    """Run one episode per seed in a TorchRL ``Collector`` over a ``SerialEnv``, or several of them in processes.
 
-    Worker ``w`` of the environments gets ``seeds[w::num_envs]``. A worker that has done its seeds keeps
-    stepping until the last one is finished (its surplus episodes are dropped).
+    Seeds are dealt to the environments in turn. An environment that has done its own keeps stepping until the last
+    one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiSyncCollector`` runs as many
+    processes, each with a copy of the actor. A worker that dies is reported as a warning, and the episodes that were
+    under way run again: they come out the same, since nothing but its seed fixes an episode.
 
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
@@ -48,7 +56,8 @@ def rollout_episodes(
         make_env: called as ``make_env(seeds=[...])``; makes one environment whose episodes take these in
             turn and report them under ``("episode", "seed")``, with ``("next", "success")``.
         seeds: one episode each, all different.
-        num_envs: environments stepped as one batch.
+        num_envs: environments stepped as one batch, in each worker.
+        workers: processes; 1 runs in this one. With more, ``actor`` and ``make_env`` must be picklable.
         max_steps: truncates an episode, environment steps; None leaves it to the environment's own horizon.
         results_file: JSON-lines file that every finished episode is appended to at once. If it exists, the
             episodes in it are taken over and only the missing seeds run.
@@ -62,6 +71,7 @@ def rollout_episodes(
     Raises:
         ValueError: if seeds repeat, a count is out of range or the file belongs to something else.
         KeyError: if the actor or the environment leaves out a key that is needed.
+        RuntimeError: if workers keep dying without finishing an episode.
 
     >>> from torchrl_sparse.envs import make_env                                      # doctest: +SKIP
     >>> rollout_episodes(actor, lambda seeds: make_env("Lift", seeds=seeds), range(100),
@@ -72,82 +82,129 @@ def rollout_episodes(
         raise ValueError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
     if num_envs < 1 or (max_steps is not None and max_steps < 1):
         raise ValueError(f"expected num_envs >= 1 and max_steps >= 1 or None, got {num_envs}, {max_steps}")
+    if workers < 1:
+        raise ValueError(f"expected workers >= 1, got {workers}")
     log = None
     finished: dict[int, EpisodeResult] = {}
     if results_file is not None:
         log = EpisodeLog(results_file, {**(identity or {}), "max_steps": max_steps})
         finished.update(log.episodes)
     pending = [seed for seed in seeds if seed not in finished]
-    if pending:
-        count = min(num_envs, len(pending))
-        # TorchRL's batched environments raise PyTorch's thread count when they close: put the caller's back.
-        with (
-            num_threads(None),
-            closing(_Rollout(actor, make_env, pending, count, max_steps, policy_device)) as rollout,
-        ):
-            for episode in rollout.episodes():
-                finished[episode.seed] = episode
-                if log is not None:
-                    log.append(episode)
-                if on_episode is not None:
-                    on_episode(episode, sum(seed in finished for seed in seeds), len(seeds))
+    start = partial(_start, actor, make_env, num_envs, workers, max_steps, policy_device)
+    # TorchRL's collectors and batched environments change PyTorch's thread count when they close.
+    with num_threads(None), closing(_episodes(start, pending)) as episodes:
+        for episode in episodes:
+            finished[episode.seed] = episode
+            if log is not None:
+                log.append(episode)
+            if on_episode is not None:
+                on_episode(episode, sum(seed in finished for seed in seeds), len(seeds))
     return [finished[seed] for seed in seeds]
 
 
-class _Rollout:
-    """A collector and the unfinished episode of each of its environments."""
+def _episodes(
+    start: Callable[[Sequence[int]], Collector | MultiSyncCollector], seeds: Sequence[int]
+) -> Iterator[EpisodeResult]:
+    """The episode of each seed, as it ends; a collector whose worker dies is replaced by a new one for what is left."""
+    pending, failures = list(seeds), 0
+    while pending:
+        collector = start(pending)
+        try:
+            for episode in _finished(collector, set(pending)):
+                pending.remove(episode.seed)
+                failures = 0
+                yield episode
+        except Exception as error:
+            # What TorchRL raises when a worker dies depends on when it notices; that one did is what counts.
+            lost, failures = _lost(collector), failures + 1
+            if not lost:
+                raise
+            if failures == _FAILURES:
+                raise RuntimeError(f"{lost}, {failures} times without an episode finished between") from error
+            warnings.warn(f"{lost}; {len(pending)} episodes are run anew", RuntimeWarning, stacklevel=3)
+        finally:
+            collector.shutdown()
 
-    def __init__(self, actor, make_env, seeds, num_envs, max_steps, policy_device) -> None:
-        self._pending = set(seeds)
-        self._open = [_OpenEpisode() for _ in range(num_envs)]
-        # One function with differing arguments, rather than differing functions, lets SerialEnv take its
-        # specs from a single throw-away environment instead of one per worker.
-        env = SerialEnv(
-            num_envs,
-            make_env,
-            create_env_kwargs=[{"seeds": seeds[worker::num_envs]} for worker in range(num_envs)],
-        )
-        if max_steps is not None:
-            env = TransformedEnv(env, StepCounter(max_steps))
-        self._collector = Collector(
-            env,
-            actor,
-            frames_per_batch=num_envs,
-            total_frames=-1,
-            policy_device=policy_device,
-            storing_device=torch.device("cpu"),
-            # The policy's noise is a key, not a distribution; RANDOM keeps any other actor as it was trained.
-            exploration_type=ExplorationType.RANDOM,
-            auto_register_policy_transforms=True,
-        )
 
-    def episodes(self):
-        """Yield each pending seed's episode as it ends."""
-        for batch in self._collector:
-            step = batch[:, 0]
-            self._check_keys(step)
-            for worker, row in enumerate(step.unbind(0)):
-                episode = self._open[worker]
-                episode.add(row)
-                if not row["next", "done"].item():
-                    continue
-                self._open[worker] = _OpenEpisode()
+def _lost(collector: Collector | MultiSyncCollector) -> str:
+    """Which worker died of itself, in words; empty if none did."""
+    dead = [
+        f"worker {index} ended with exit code {process.exitcode}"
+        for index, process in enumerate(getattr(collector, "procs", ()))
+        # TorchRL terminates and closes those that are alive when it finds a dead one.
+        if not process._closed and process.exitcode not in (None, -signal.SIGTERM)
+    ]
+    return ", ".join(dead)
+
+
+def _start(
+    actor: TensorDictModuleBase,
+    make_env: Callable[..., EnvBase],
+    num_envs: int,
+    workers: int,
+    max_steps: int | None,
+    policy_device: torch.device | str | None,
+    seeds: Sequence[int],
+) -> Collector | MultiSyncCollector:
+    workers = min(workers, len(seeds))
+    count = min(num_envs, len(seeds) // workers)  # as many in each worker, and none without a seed
+    shares = [seeds[index :: workers * count] for index in range(workers * count)]
+    make = [
+        partial(_batched, make_env, shares[worker * count : (worker + 1) * count], max_steps)
+        for worker in range(workers)
+    ]
+    options = {
+        "total_frames": -1,
+        "policy_device": policy_device,
+        "storing_device": torch.device("cpu"),
+        # The policy's noise is a key, not a distribution; RANDOM keeps any other actor as it was trained.
+        "exploration_type": ExplorationType.RANDOM,
+        "auto_register_policy_transforms": True,
+    }
+    if workers == 1:
+        return Collector(make[0](), actor, frames_per_batch=count, **options)
+    return MultiSyncCollector(
+        make,
+        actor,
+        frames_per_batch=workers * count * _STEPS_PER_BATCH,
+        cat_results=0,
+        num_threads=1,
+        **options,
+    )
+
+
+def _batched(
+    make_env: Callable[..., EnvBase], shares: Sequence[Sequence[int]], max_steps: int | None
+) -> EnvBase:
+    """One environment per share of the seeds, stepped as one batch."""
+    # One function with differing arguments, rather than differing functions, lets SerialEnv take its
+    # specs from a single throw-away environment instead of one per worker.
+    env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
+    return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps))
+
+
+def _finished(collector: Collector | MultiSyncCollector, pending: set[int]) -> Iterator[EpisodeResult]:
+    """Each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
+    running: dict[int, _OpenEpisode] = {}
+    for batch in collector:
+        for step in batch.unbind(1):
+            _check_keys(step)
+            for row in step.unbind(0):
                 seed = int(row[keys.EPISODE_SEED])
-                if seed in self._pending:
-                    self._pending.remove(seed)
-                    yield episode.close(seed)
-            if not self._pending:
-                return
+                if seed not in pending:
+                    continue
+                running.setdefault(seed, _OpenEpisode()).add(row)
+                if row["next", "done"].item():
+                    pending.remove(seed)
+                    yield running.pop(seed).close(seed)
+        if not pending:
+            return
 
-    def close(self) -> None:
-        """Shut the collector and its environments down."""
-        self._collector.shutdown()
 
-    @staticmethod
-    def _check_keys(step: TensorDictBase) -> None:
-        missing = [key for key in _REQUIRED if step.get(key, None) is None]
-        if missing:
-            raise KeyError(f"a rollout needs the keys {list(_REQUIRED)}, got none of {missing}")
+def _check_keys(step: TensorDictBase) -> None:
+    missing = [key for key in _REQUIRED if step.get(key, None) is None]
+    if missing:
+        raise KeyError(f"a rollout needs the keys {list(_REQUIRED)}, got none of {missing}")
 
 
 class _OpenEpisode:

@@ -64,7 +64,7 @@ def plot_pareto(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
     figure, axes = make_figure(9, 5)
     latency = {name: 1e3 * method["latency_s"]["p50"] for name, method in methods.items()}
     rate = {name: 100 * method["success"]["rate"] for name, method in methods.items()}
-    colors = _method_colors(methods)
+    colors = method_colors(methods)
     axes.set_xscale("log")
     intervals = {name: [100 * limit for limit in m["success"]["ci95"]] for name, m in methods.items()}
     for name, method in methods.items():
@@ -216,7 +216,7 @@ def plot_error_surge(
             raise ValueError(f"errors[{name!r}]: expected shape {masks[name].shape}, got {error.shape}")
     figure, grid = make_figure(9, 6.2, rows=3, columns=1, heights=(3, 3, 0.34 * len(errors)), sharex=True)
     ffn_axes, all_axes, update_axes = grid[:, 0]
-    colors = _method_colors(errors)
+    colors = method_colors(errors)
     panels = ((ffn_axes, slice(2, None, 3), "FFN blocks"), (all_axes, slice(None), "all blocks"))
     for axes, blocks, label in panels:
         for name, error in errors.items():
@@ -283,7 +283,8 @@ def _plain_log_axis(axes: "Axes", low: float, high: float) -> None:
     axes.minorticks_off()
 
 
-def _method_colors(methods: Iterable[str]) -> dict[str, str]:
+def method_colors(methods: Iterable[str]) -> dict[str, str]:
+    """name -> colour, the same one in every figure for the methods of the standard benchmark."""
     others = itertools.cycle(_OTHER_COLORS)
     return {name: _METHOD_COLORS.get(name) or next(others) for name in methods}
 

@@ -154,8 +154,7 @@ def format_table(results: Mapping[str, Any]) -> str:
         ValueError: if ``results`` is not of the schema.
     """
     validate_results(results)
-    methods = results["methods"]
-    rows = [_table_row(name, method) for name, method in methods.items()]
+    rows = results_rows(results)
     columns = list(rows[0])
     widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in columns}
 
@@ -170,7 +169,12 @@ def format_table(results: Mapping[str, Any]) -> str:
         ":" + "-" * (widths[c] + 1) if c in _LEFT else "-" * (widths[c] + 1) + ":" for c in columns
     )
     header = line({column: column for column in columns})
-    return "\n".join([header, f"|{rule}|", *map(line, rows), "", _table_notes(results)])
+    return "\n".join([header, f"|{rule}|", *map(line, rows), "", results_note(results)])
+
+
+def results_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The rows of the table, one per method: column -> text."""
+    return [_table_row(name, method) for name, method in results["methods"].items()]
 
 
 _LEFT = ("method", "verdict")
@@ -195,7 +199,8 @@ def _table_row(name: str, method: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _table_notes(results: Mapping[str, Any]) -> str:
+def results_note(results: Mapping[str, Any]) -> str:
+    """The lines that explain the table."""
     machine, policy = results["machine"], results["policy"]
     reference = results["methods"][REFERENCE]
     n, margin = reference["success"]["n"], reference["paired_vs_dense"]["margin"]

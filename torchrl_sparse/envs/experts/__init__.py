@@ -7,13 +7,14 @@ from typing import Any
 
 from torchrl_sparse.envs.experts.base import Expert
 from torchrl_sparse.envs.experts.disturbance import Disturbance
-from torchrl_sparse.envs.experts.lift import LiftExpert
+from torchrl_sparse.envs.experts.lift import LiftExpert, LiftMovingExpert
 from torchrl_sparse.envs.experts.nut_assembly_square import NutAssemblySquareExpert
 from torchrl_sparse.envs.experts.operators import OPERATORS, Operator, Style, draw_operator
 from torchrl_sparse.envs.experts.pick_place_can import PickPlaceCanExpert
 
 EXPERTS: Mapping[str, type[Expert]] = {
     "Lift": LiftExpert,
+    "LiftMoving": LiftMovingExpert,
     "PickPlaceCan": PickPlaceCanExpert,
     "NutAssemblySquare": NutAssemblySquareExpert,
 }

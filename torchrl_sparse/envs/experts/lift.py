@@ -8,6 +8,8 @@ import numpy as np
 
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Waypoint, at, downward, nearest
 
+_LAG = 0.17  # s; the hand covers about a sixth of a second's way to its target in a second
+
 
 class LiftExpert(Expert):
     """Approaches the cube from above with the finger axis along its nearest side, grasps and lifts."""
@@ -22,6 +24,19 @@ class LiftExpert(Expert):
         between_fingers = np.linalg.norm(hand.position - cube) < 0.025
         if between_fingers and hand.opening < width + 0.003:
             return [Waypoint(hand.position + np.array([0.0, 0.0, 0.2]), aligned, CLOSED)]
+        ahead = self.lead()
         if at(hand, grasp, aligned, position=0.012):
-            return [Waypoint(grasp, aligned, CLOSED)]
-        return [Waypoint(self.above(hand, grasp), aligned, OPEN)]
+            return [Waypoint(grasp + ahead, aligned, CLOSED)]
+        return [Waypoint(self.above(hand, grasp) + ahead, aligned, OPEN)]
+
+    def lead(self) -> np.ndarray:
+        """f64 [3] by how much to aim ahead of the cube, m."""
+        return np.zeros(3)
+
+
+class LiftMovingExpert(LiftExpert):
+    """The same for a cube that moves: aims ahead of it by as much as the hand lags behind a moving target."""
+
+    def lead(self) -> np.ndarray:
+        velocity = self.sim_env.sim.data.get_joint_qvel(self.sim_env.cube.joints[0])[:3]
+        return _LAG * np.array([velocity[0], velocity[1], 0.0])

@@ -1,0 +1,131 @@
+"""Success against latency: the environment keeps moving while the policy computes.
+
+    python recipes/realtime.py task=lift_moving policy=runs/lift_moving/policy methods=[dense,ddim10,bac] episodes=100
+
+Kill it and run it again to go on: finished episodes are read from OUT/episodes. Latency 0 is the ordinary evaluation.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.evaluation.episodes import EpisodeResult
+from torchrl_sparse.evaluation.latency import describe_machine
+from torchrl_sparse.evaluation.methods import (
+    calibrate_policy,
+    check_method,
+    make_method,
+    method_identity,
+    record_queries,
+    time_queries,
+)
+from torchrl_sparse.evaluation.paired import rollout_episodes
+from torchrl_sparse.evaluation.realtime import (
+    RealtimeRun,
+    build_realtime,
+    format_realtime,
+    plot_realtime,
+    save_realtime,
+)
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+EVALUATION_SEED = 100_000  # as in benchmark.py
+CALIBRATION_SEED = 1_000_000
+
+
+@hydra.main(version_base=None, config_path=".", config_name="realtime")
+def main(config: DictConfig) -> None:
+    out, task = Path(config.out), get_task(config.task)
+    for name in config.methods:
+        check_method(name, Path(config.schedules))
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
+    first = EVALUATION_SEED + config.seed
+    seeds = range(first, first + config.episodes)
+
+    @cache
+    def calibration():
+        samples = range(CALIBRATION_SEED, CALIBRATION_SEED + config.calibration_samples)
+        return calibrate_policy(policy, environment, samples)
+
+    make = partial(
+        make_method,
+        policy=policy,
+        num_updates=config.num_updates,
+        schedules=Path(config.schedules),
+        calibration=calibration,
+    )
+    methods = {name: make(name) for name in dict.fromkeys(["dense", *config.methods])}
+    query = record_queries(ChunkExecutor(policy), environment, seeds[:1])[0]
+    latency = time_queries(methods, query, repeats=config.latency_repeats, threads=config.threads)
+
+    own = {name: delay(latency[name].p50, config) for name in methods}
+    common = {delay(seconds, config) for seconds in config.latencies}
+    runs = {}
+    for name, method in methods.items():
+        episodes = {
+            steps: evaluate(name, method, steps, environment, seeds, config)
+            for steps in sorted({*common, own[name]})
+        }
+        runs[name] = RealtimeRun(latency[name].p50, episodes)
+    results = build_realtime(
+        runs,
+        task=task.name,
+        seed=config.seed,
+        control_freq=config.control_freq,
+        n_action_steps=config.n_action_steps,
+        machine=describe_machine(threads=config.threads),
+        margin=config.margin,
+    )
+    save_realtime(results, out / "realtime.json")
+    plot_realtime(results, out / "realtime.png")
+    print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
+
+
+def delay(seconds: float, config: DictConfig) -> int:
+    return int(delay_steps(torch.tensor(seconds), config.control_freq))
+
+
+def evaluate(
+    name: str, policy: DiffusionPolicy, steps: int, environment, seeds: range, config: DictConfig
+) -> list[EpisodeResult]:
+    """Episodes of one method whose answers come ``steps`` late, read from their log as far as they are there."""
+    actor = RealtimeExecutor(
+        policy,
+        HoldPose(get_task(config.task)),
+        config.n_action_steps,
+        latency=steps / config.control_freq,
+        control_freq=config.control_freq,
+    )
+    identity = {
+        "task": config.task,
+        "horizon": config.horizon,
+        **method_identity(name, policy),
+        "n_action_steps": config.n_action_steps,
+        "delay_steps": steps,
+    }
+    with tqdm(total=len(seeds), unit="episode", desc=f"{name} +{steps}".rjust(14)) as bar:
+        return rollout_episodes(
+            actor,
+            environment,
+            seeds,
+            num_envs=config.num_envs,
+            workers=config.workers,
+            results_file=Path(config.out) / "episodes" / f"{name}_delay{steps}.jsonl",
+            identity=identity,
+            on_episode=lambda _, done, total: bar.update(done - bar.n),
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""One HTML page on any set of results: tables with intervals, Pareto fronts, masks and videos, nothing to fetch.
+
+python recipes/report.py runs=outputs out=outputs/report.html
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_sparse.evaluation.html_report import write_report
+
+
+@hydra.main(version_base=None, config_path=".", config_name="report")
+def main(config: DictConfig) -> None:
+    faults = write_report(config.runs, config.out, title=config.title)
+    for fault in faults.values():
+        print(fault, file=sys.stderr)
+    print(f"{config.out}: {Path(config.out).stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

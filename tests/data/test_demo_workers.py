@@ -1,0 +1,46 @@
+"""Work in several processes comes out in order, and a death on the way loses nothing."""
+
+import os
+import signal
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from torchrl_sparse.data.demo_workers import in_order
+
+
+def note(folder, deadly, number):
+    """Writes a file; at the number ``deadly`` dies instead, the first time or, below zero, at every number."""
+    died = Path(folder) / "died"
+    if deadly < 0 or (number == deadly and not died.exists()):
+        died.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    (Path(folder) / str(number)).touch()
+
+
+def take(numbers, n):
+    taken = [next(numbers) for _ in range(n)]
+    numbers.close()
+    return taken
+
+
+def test_comes_in_order(tmp_path):
+    assert take(in_order(partial(note, tmp_path, 10**9), 5, workers=2), 4) == [5, 6, 7, 8]
+    assert all((tmp_path / str(number)).exists() for number in range(5, 9))
+
+
+def test_a_dead_worker_is_reported_and_its_work_redone(tmp_path):
+    with pytest.warns(RuntimeWarning, match=r"a worker died: going on from number \d"):
+        assert take(in_order(partial(note, tmp_path, 2), 0, workers=2), 4) == [0, 1, 2, 3]
+    assert all((tmp_path / str(number)).exists() for number in range(4))
+
+
+def test_workers_that_keep_dying_end_it(tmp_path):
+    with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match="died 3 times in a row at number 0"):
+        take(in_order(partial(note, tmp_path, -1), 0, workers=1), 1)
+
+
+def test_what_the_work_raises_is_raised():
+    with pytest.raises(TypeError, match="str"):
+        take(in_order(os.getenv, 0, workers=1), 1)

@@ -1,0 +1,109 @@
+"""Episodes do not depend on how many processes ran them, nor on a process that died on the way."""
+
+import os
+import signal
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tests.evaluation.fakes import FakeActor, FakeEnv
+from torchrl_sparse.evaluation import paired
+from torchrl_sparse.evaluation.paired import rollout_episodes
+
+SEEDS = range(7)
+
+
+class MortalEnv(FakeEnv):
+    """Kills its process, once per folder, at the third step of the seed 3."""
+
+    def __init__(self, seeds, folder):
+        super().__init__(seeds)
+        self.died = Path(folder) / "died"
+
+    def _step(self, tensordict):
+        if self.seed == 3 and self.elapsed == 2 and not self.died.exists():
+            self.died.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super()._step(tensordict)
+
+
+def run(make_env, **kwargs):
+    return rollout_episodes(FakeActor(), make_env, SEEDS, **kwargs)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_two_workers_find_what_one_finds():
+    assert run(FakeEnv, workers=2, num_envs=2) == run(FakeEnv, workers=1)
+
+
+def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path):
+    log = tmp_path / "episodes.jsonl"
+    with pytest.warns(RuntimeWarning, match=r"exit code -9.*episodes are run anew"):
+        episodes = run(partial(MortalEnv, folder=tmp_path), workers=2, num_envs=1, results_file=log)
+    assert episodes == run(FakeEnv)
+    assert (tmp_path / "died").exists()
+    assert len(log.read_text().splitlines()) == 1 + len(SEEDS)
+
+
+class Doomed:
+    """A collector whose first worker has been killed."""
+
+    def __init__(self, started):
+        started.append(self)
+        self.procs = [
+            SimpleNamespace(_closed=False, exitcode=-9),
+            SimpleNamespace(_closed=True, exitcode=None),
+        ]
+        self.shut = False
+
+    def __iter__(self):
+        raise ValueError("Cannot close a process while it is still running.")
+
+    def shutdown(self):
+        self.shut = True
+
+
+def test_workers_that_keep_dying_end_the_run():
+    started = []
+    with (
+        pytest.warns(RuntimeWarning),
+        pytest.raises(RuntimeError, match="worker 0 ended with exit code -9, 3 times"),
+    ):
+        list(paired._episodes(lambda seeds: Doomed(started), [3, 8]))
+    assert [collector.shut for collector in started] == [True] * 3
+
+
+def test_an_error_without_a_death_is_not_tried_again():
+    started = []
+
+    def start(seeds):
+        collector = Doomed(started)
+        collector.procs[0].exitcode = None
+        return collector
+
+    with pytest.raises(ValueError, match="Cannot close"):
+        list(paired._episodes(start, [3, 8]))
+    assert len(started) == 1
+
+
+def test_robosuite_gives_the_same_in_two_workers():
+    from torchrl_sparse import ChunkExecutor, DiffusionPolicy, NoiseSchedule, make_env
+
+    policy = DiffusionPolicy.from_pretrained("assets/lift")
+    policy.schedule = NoiseSchedule("ddim", 3)
+    make = partial(make_env, "Lift", horizon=10)
+    runs = [
+        rollout_episodes(ChunkExecutor(policy), make, [100_000, 100_001], num_envs=1, workers=workers)
+        for workers in (1, 2)  # the second with an engine that has already run here
+    ]
+    one, two = ([replace(episode, latency=()) for episode in episodes] for episodes in runs)
+    assert one == two
+    assert all(episode.queries == 2 for episode in one)
+
+
+def test_counts_are_checked():
+    with pytest.raises(ValueError, match="workers >= 1"):
+        run(FakeEnv, workers=0)

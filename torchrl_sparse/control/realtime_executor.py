@@ -1,0 +1,165 @@
+"""Execution in a world that does not wait: while the policy computes, the old chunk plays on.
+
+A query takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is for
+the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
+asynchronous inference; real-time chunking (arXiv:2506.07339) blends the two chunks besides, which is not done here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
+from torchrl_sparse.envs.rotations import quaternion_to_rot6d
+from torchrl_sparse.envs.tasks import Task
+
+
+class RealtimeExecutor(ChunkExecutor):
+    """A `ChunkExecutor` whose answers come as late as the policy is slow.
+
+    A sample queries the policy every ``n_action_steps`` steps, or as soon as the last answer has come if that takes longer.
+    Until the new answer is there the old chunk plays on, and where a chunk has come to its end its last action is held, which
+    for absolute poses is a standstill. Before the first answer of an episode the arm is held where it is. With latency 0 all
+    actions are those of `ChunkExecutor`.
+
+    Args:
+        policy: as for `ChunkExecutor`; ``("cost", "latency")`` is what it took if ``latency`` is None.
+        hold: a TensorDictModule that writes ``("control", "hold")``, [*B, A], the action that keeps the arm where it
+            is, e.g. `HoldPose`.
+        n_action_steps: steps from one query to the next; nothing says that a chunk is long enough for that and the latency.
+        latency: seconds that a query takes; None takes each query's own time, as the policy measured it. Rows of a batch
+            share a measured time, so measured latencies want batches of one.
+        control_freq: steps a second.
+        gate: as for `ChunkExecutor`; not heard while an answer is awaited.
+
+    Raises:
+        ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
+
+    Examples:
+        >>> from torchrl_sparse import DiffusionPolicy, NoiseSchedule, make_env
+        >>> from torchrl_sparse.envs.tasks import get_task
+        >>> env = make_env("Lift", seeds=[7])
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> policy.schedule = NoiseSchedule("ddim", 10)
+        >>> actor = RealtimeExecutor(policy, HoldPose(get_task("lift")), latency=0.1)
+        >>> env.rollout(3, actor)["control", "delay"].flatten().tolist()
+        [2, 2, 2]
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        hold: TensorDictModuleBase,
+        n_action_steps: int = 8,
+        *,
+        latency: float | None = None,
+        control_freq: float = 20.0,
+        gate: TensorDictModuleBase | None = None,
+    ):
+        super().__init__(policy, n_action_steps, gate)
+        if latency is not None and not (math.isfinite(latency) and latency >= 0):
+            raise ValueError(f"latency: expected None or seconds >= 0, got {latency}")
+        self.hold = hold
+        self.latency = latency
+        self.control_freq = control_freq
+
+    @property
+    def in_keys(self):
+        return list(dict.fromkeys([*super().in_keys, *self.hold.in_keys]))
+
+    @property
+    def out_keys(self):
+        return [*super().out_keys, keys.DELAY, keys.MEANWHILE]
+
+    def _due(self, tensordict: TensorDictBase) -> Tensor:
+        awaited = self._age(tensordict) + 1 < self._delay(tensordict)
+        return keys.read(tensordict, keys.IS_INIT) | (super()._due(tensordict) & ~awaited)
+
+    def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
+        before = tensordict.select(keys.CHUNK, keys.AGE, strict=False)
+        super()._query(tensordict, due)
+        tensordict.set(keys.DELAY, torch.where(due, self._new_delay(tensordict), self._delay(tensordict)))
+        meanwhile = self._play_on(tensordict, before)
+        old = keys.recall(tensordict, keys.MEANWHILE, meanwhile.shape[-2:], 0.0)
+        tensordict.set(keys.MEANWHILE, torch.where(due[..., None], meanwhile, old))
+
+    def _delay(self, tensordict: TensorDictBase) -> Tensor:
+        """i64 [*B, 1]: steps that the latest query takes."""
+        return keys.recall(tensordict, keys.DELAY, (1,), 0)
+
+    def _new_delay(self, tensordict: TensorDictBase) -> Tensor:
+        """i64 [*B, 1]: steps that the query just made takes."""
+        if self.latency is None:
+            return delay_steps(keys.read(tensordict, keys.LATENCY), self.control_freq)
+        latency = torch.tensor([self.latency], device=tensordict.device)
+        return delay_steps(latency, self.control_freq).expand(*tensordict.batch_size, 1)
+
+    def _play_on(self, tensordict: TensorDictBase, before: TensorDictBase) -> Tensor:
+        """f32 [*B, n, A]: what is left of the chunk played ``before``; entry 0 is for the present step."""
+        chunk = tensordict.get(keys.CHUNK)
+        left = _shift(keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0), self._age(before) + 1)
+        hold = self.hold(tensordict.select(*self.hold.in_keys)).get(keys.HOLD)
+        return torch.where(tensordict.get(keys.IS_INIT)[..., None], hold[..., None, :], left)
+
+    def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
+        there = age >= self._delay(tensordict)
+        chunk = tensordict.get(keys.CHUNK)
+        playing = torch.where(there[..., None], chunk, tensordict.get(keys.MEANWHILE))
+        return action_at(playing, age.clamp(max=chunk.shape[-2] - 1))
+
+
+class HoldPose(TensorDictModuleBase):
+    """Writes the absolute action, [*B, 10 * arms], that keeps the hands where they are, fingers opened.
+
+    Args:
+        task: tells where each arm's pose lies in the state.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_sparse.envs.tasks import get_task
+        >>> state = torch.zeros(2, 19)
+        >>> state[:, 13] = 1.0  # x of the quaternion: half a turn about x
+        >>> HoldPose(get_task("lift"))(TensorDict({"observation": {"state": state}}, [2]))["control", "hold"][0].tolist()
+        [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0]
+    """
+
+    in_keys = [keys.STATE]
+    out_keys = [keys.HOLD]
+
+    def __init__(self, task: Task):
+        super().__init__()
+        self._poses = [
+            (task.state_slice(f"robot{arm}_eef_pos"), task.state_slice(f"robot{arm}_eef_quat_site"))
+            for arm in range(task.arms)
+        ]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state = keys.read(tensordict, keys.STATE)
+        gripper = -torch.ones_like(state[..., :1])
+        parts = []
+        for position, quaternion in self._poses:
+            rotation = quaternion_to_rot6d(state[..., quaternion].cpu().numpy())
+            parts += [state[..., position], torch.as_tensor(rotation).to(state), gripper]
+        return tensordict.set(keys.HOLD, torch.cat(parts, -1))
+
+
+def delay_steps(latency: Tensor, control_freq: float = 20.0) -> Tensor:
+    """Steps, i64, that the environment makes in ``latency`` seconds: an answer that misses a step waits for the next.
+
+    >>> delay_steps(torch.tensor([0.0, 0.001, 0.05, 0.051])).tolist()
+    [0, 1, 1, 2]
+    """
+    return (latency.double() * control_freq - 1e-3).ceil().long()  # rounding errors are no delay
+
+
+def _shift(chunk: Tensor, by: Tensor) -> Tensor:
+    """[*B, n, A] from entry ``by``, i64 [*B, 1], on; the last entry is repeated."""
+    length = chunk.shape[-2]
+    index = (by + torch.arange(length, device=chunk.device)).clamp(max=length - 1)
+    return chunk.gather(-2, index[..., None].expand(*index.shape, chunk.shape[-1]))
