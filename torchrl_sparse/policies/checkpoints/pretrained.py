@@ -4,46 +4,72 @@
 
     {"format": "torchrl_sparse.diffusion_policy/1",
      "network": {arguments of TransformerForDiffusion},
-     "schedule": {arguments of NoiseSchedule}}
+     "schedule": {arguments of NoiseSchedule},
+     "source": {where an imported policy comes from; only there}}
 
-Network weights are fp16, normalisation constants fp32.
+Network weights are fp16 unless full precision is asked for, normalisation constants fp32.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 _FIELDS = {"format", "network", "schedule"}
+_OPTIONAL_FIELDS = {"source"}
+T = TypeVar("T")
 _NETWORK, _NORMALIZER = "network.", "normalizer."
 
 
-def write_pretrained(
-    path: Path, *, network: TransformerForDiffusion, normalizer: Normalizer, schedule: dict[str, Any]
-) -> None:
-    """Writes both files into the folder ``path``, each in one piece or not at all."""
-    tensors = {_NETWORK + name: value.half() for name, value in network.state_dict().items()}
-    tensors |= {_NORMALIZER + name: value for name, value in normalizer.state_dict().items()}
-    config = {"format": FORMAT, "network": network.config, "schedule": schedule}
+@dataclass(frozen=True)
+class StoredPolicy:
+    """The parts of a policy that files hold.
+
+    Attributes:
+        network: the denoiser, f32, in evaluation mode.
+        normalizer: of states and actions.
+        schedule: the sampler.
+        source: where an imported policy comes from and how to feed it; empty for policies trained here.
+            ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
+            chunk, and ``"state_keys"``, robomimic's names of the observations that make up the state, in order;
+            None for what a checkpoint does not say.
+    """
+
+    network: TransformerForDiffusion
+    normalizer: Normalizer
+    schedule: NoiseSchedule
+    source: dict[str, Any] = field(default_factory=dict)
+
+
+def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
+    """Writes both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
+    weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
+    tensors = {name: value.half() if half else value for name, value in weights.items()}
+    tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
+    config = {"format": FORMAT, "network": policy.network.config, "schedule": policy.schedule.config}
+    if policy.source:
+        config["source"] = policy.source
     with atomic_path(path / "model.safetensors") as temporary:
         save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, temporary)
     with atomic_path(path / "config.json") as temporary:
         temporary.write_text(json.dumps(config, indent=2) + "\n")
 
 
-def read_pretrained(path: Path) -> tuple[TransformerForDiffusion, Normalizer, dict[str, Any]]:
-    """Network (f32, eval mode), normaliser and the arguments of the schedule from the folder ``path``.
+def read_pretrained(path: Path) -> StoredPolicy:
+    """The policy in the folder ``path``, its network in evaluation mode.
 
     Raises:
         FileNotFoundError: if a file is not there.
@@ -51,12 +77,10 @@ def read_pretrained(path: Path) -> tuple[TransformerForDiffusion, Normalizer, di
     """
     config = _read_config(path / "config.json")
     tensors = _read_tensors(path / "model.safetensors")
-    try:
-        network = TransformerForDiffusion(**config["network"])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path / 'config.json'}: network: {error}") from error
-    network_tensors = _take(tensors, _NETWORK)
-    normalizer_tensors = _take(tensors, _NORMALIZER)
+    network = _make(path, TransformerForDiffusion, config, "network")
+    schedule = _make(path, NoiseSchedule, config, "schedule")
+    network_tensors = take(tensors, _NETWORK)
+    normalizer_tensors = take(tensors, _NORMALIZER)
     expected_normalizer = {
         f"{name}_{part}": (size,)
         for name, size in (("state", network.cond_dim), ("action", network.input_dim))
@@ -71,7 +95,15 @@ def read_pretrained(path: Path) -> tuple[TransformerForDiffusion, Normalizer, di
             f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
         )
     network.load_state_dict({name: value.float() for name, value in network_tensors.items()})
-    return network.eval(), Normalizer(**normalizer_tensors), config["schedule"]
+    normalizer = Normalizer(**normalizer_tensors)
+    return StoredPolicy(network.eval(), normalizer, schedule, config.get("source", {}))
+
+
+def _make(path: Path, kind: type[T], config: dict[str, Any], field: str) -> T:
+    try:
+        return kind(**config[field])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path / 'config.json'}: {field}: {error}") from error
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -84,7 +116,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     if not isinstance(config, dict) or config.get("format") != FORMAT:
         found = config.get("format") if isinstance(config, dict) else type(config).__name__
         raise ValueError(f"{path}: format: expected {FORMAT!r}, got {found!r}")
-    if set(config) != _FIELDS:
+    if set(config) - _OPTIONAL_FIELDS != _FIELDS:
         raise ValueError(f"{path}: expected the fields {sorted(_FIELDS)}, got {sorted(config)}")
     return config
 
@@ -98,20 +130,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
 
 
-def _take(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Removes the tensors under ``prefix`` and returns them without it."""
-    names = [name for name in tensors if name.startswith(prefix)]
-    return {name.removeprefix(prefix): tensors.pop(name) for name in names}
-
-
 def _check_tensors(path: Path, prefix: str, found: dict[str, Tensor], expected: dict[str, tuple]) -> None:
-    missing, extra = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
-    if missing or extra:
-        raise ValueError(f"{path}: tensors under {prefix!r}: missing {missing}, unexpected {extra}")
-    for name, shape in expected.items():
-        if tuple(found[name].shape) != shape:
-            raise ValueError(
-                f"{path}: {prefix}{name}: expected shape {shape}, got {tuple(found[name].shape)}"
-            )
-        if not torch.isfinite(found[name]).all():
-            raise ValueError(f"{path}: {prefix}{name}: expected finite numbers, got NaN or infinity")
+    where = f"{path}: {prefix}"
+    check_shapes(where, found, expected)
+    check_finite(where, found)

@@ -24,7 +24,8 @@ from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.checkpoints.pretrained import read_pretrained, write_pretrained
+from torchrl_sparse.policies.checkpoints.diffusion_policy import read_diffusion_policy
+from torchrl_sparse.policies.checkpoints.pretrained import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.policies.diffusion.noise import query_seed, sample_noise
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -50,6 +51,7 @@ class DiffusionPolicy(TensorDictSequential):
     Attributes:
         plan: the planner. Assign another to change the method: ``policy.plan = planner``.
         schedule: the sampler. Assign another to change it: ``policy.schedule = NoiseSchedule("ddim", 10)``.
+        source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -78,6 +80,7 @@ class DiffusionPolicy(TensorDictSequential):
         )
         super().__init__(stages)
         self.plan = plan  # binds it to this network and sampler
+        self.source: dict[str, Any] = {}
         self.eval()
 
     # -- the parts -----------------------------------------------------------------------------------------------------
@@ -183,11 +186,10 @@ class DiffusionPolicy(TensorDictSequential):
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
-    def save_pretrained(self, path: str | Path) -> None:
-        """Writes ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
-        write_pretrained(
-            Path(path), network=self.network, normalizer=self.normalizer, schedule=self.schedule.config
-        )
+    def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
+        """Writes ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
+        stored = StoredPolicy(self.network, self.normalizer, self.schedule, self.source)
+        write_pretrained(Path(path), stored, half=half)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
@@ -196,8 +198,31 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        network, normalizer, schedule = read_pretrained(Path(path))
-        return cls(network, normalizer, schedule=NoiseSchedule(**schedule), engine=engine)
+        return cls._assemble(read_pretrained(Path(path)), engine)
+
+    @classmethod
+    def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
+        """Reads a ``.ckpt`` of the published code (`torchrl_sparse.policies.checkpoints.diffusion_policy`).
+
+        The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
+        what the policy was trained for. Nothing in the file is executed.
+
+        Raises:
+            FileNotFoundError: if there is no file.
+            CheckpointError: a ValueError that names the file, what was expected in it and what was found.
+
+        Examples:
+            >>> policy = DiffusionPolicy.from_diffusion_policy("latest.ckpt")  # doctest: +SKIP
+            >>> policy.source["state_keys"]  # doctest: +SKIP
+            ['object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos']
+        """
+        return cls._assemble(read_diffusion_policy(path), engine)
+
+    @classmethod
+    def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
+        policy = cls(stored.network, stored.normalizer, schedule=stored.schedule, engine=engine)
+        policy.source = stored.source
+        return policy
 
 
 class ObservationEncoder(TensorDictModuleBase):
