@@ -29,6 +29,7 @@ from torchrl_sparse.evaluation.methods import (
     answer,
     calibrate_policy,
     check_method,
+    env_options,
     make_method,
     record_queries,
 )
@@ -49,7 +50,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
-    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
+    environment = partial(make_env, task.name, **env_options(policy), horizon=config.horizon)
 
     @cache
     def calibration():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +21,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
+_CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 METHODS = "dense, ddim<N>, uniform, " + ", ".join(SCHEDULES)
 
 
@@ -60,7 +62,12 @@ def make_method(
     elif name in SCHEDULES:
         plan = _bac(name, policy, num_updates, schedules, calibration)
     return DiffusionPolicy(
-        policy.network, policy.normalizer, schedule=schedule, plan=plan, engine=policy.engine
+        policy.network,
+        policy.normalizer,
+        vision=policy.vision,
+        schedule=schedule,
+        plan=plan,
+        engine=policy.engine,
     )
 
 
@@ -71,6 +78,23 @@ def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
         if found.settings.get("num_updates") == num_updates:
             return StaticSchedule(found)
     return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
+
+
+def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
+    """Arguments of `make_env` for an environment that shows what ``policy`` observes.
+
+    Raises:
+        ValueError: if the policy has cameras and its ``source`` does not say which.
+    """
+    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
+    if policy.vision is None:
+        return options
+    named = policy.source.get("cameras", {})
+    cameras = {name: named.get(name, "").removesuffix("_image") for name in policy.vision.cameras}
+    if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
+        raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
+    options |= {_CAMERA_OPTIONS[name]: camera for name, camera in cameras.items()}
+    return options | {"image_size": policy.vision.image_size[0], "object_state": False}
 
 
 def calibrate_policy(
@@ -99,4 +123,4 @@ def record_queries(
 def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:
     """Asks another method the same: same observations, same noise."""
     with torch.no_grad():
-        return policy(queries.select(keys.HISTORY_STATE, keys.EPISODE_SEED, keys.EPISODE_STEP))
+        return policy(queries.select(*policy.in_keys))

@@ -96,18 +96,22 @@ class LowDimPolicy(nn.Module):
         return (action - field.offset) / field.scale
 
     def chain(self, noise, cond):
-        """The normalised chunk [B, H, A]; noise [B, K, H, A] holds the first sample and what each step adds."""
-        scheduler = DDPMScheduler(
-            100, beta_schedule="squaredcos_cap_v2", variance_type="fixed_small", clip_sample=True
-        )
-        scheduler.set_timesteps(100)
-        sample = noise[:, 0]
-        for step, timestep in enumerate(scheduler.timesteps):
-            eps = self.model(sample, timestep, cond)
-            # diffusers draws its noise itself: what it adds is found by asking for a step from the same state twice.
-            mean, spread = ddpm_mean_and_spread(scheduler, eps, int(timestep), sample)
-            sample = mean if timestep == 0 else mean + spread * noise[:, step + 1]
-        return sample
+        return chain(self.model, noise, cond)
+
+
+def chain(model, noise, cond):
+    """The normalised chunk [B, H, A]; noise [B, K, H, A] holds the first sample and what each step adds."""
+    scheduler = DDPMScheduler(
+        100, beta_schedule="squaredcos_cap_v2", variance_type="fixed_small", clip_sample=True
+    )
+    scheduler.set_timesteps(100)
+    sample = noise[:, 0]
+    for step, timestep in enumerate(scheduler.timesteps):
+        eps = model(sample, timestep, cond)
+        # diffusers draws the noise of a step itself, so its equation is written out to hand it in.
+        mean, spread = ddpm_mean_and_spread(scheduler, eps, int(timestep), sample)
+        sample = mean if timestep == 0 else mean + spread * noise[:, step + 1]
+    return sample
 
 
 def make_blocks_matter(module):
@@ -211,9 +215,9 @@ def make_payload(policy, config):
     return {"cfg": config, "state_dicts": states, "pickles": {k: dill.dumps(v) for k, v in counters.items()}}
 
 
-def write_checkpoint(path, policy, *, change=None):
+def write_checkpoint(path, policy, *, change=None, make_config=low_dim_config):
     """Saves ``policy`` as published; ``change`` edits the payload before."""
-    payload = make_payload(policy, low_dim_config(policy))
+    payload = make_payload(policy, make_config(policy))
     if change is not None:
         change(payload)
     torch.save(payload, path, pickle_module=dill)

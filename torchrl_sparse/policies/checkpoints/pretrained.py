@@ -5,6 +5,7 @@
     {"format": "torchrl_sparse.diffusion_policy/1",
      "network": {arguments of TransformerForDiffusion},
      "schedule": {arguments of NoiseSchedule},
+     "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
 
 Network weights are fp16 unless full precision is asked for, normalisation constants fp32.
@@ -19,19 +20,20 @@ from typing import Any, TypeVar
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 _FIELDS = {"format", "network", "schedule"}
-_OPTIONAL_FIELDS = {"source"}
+_OPTIONAL_FIELDS = {"vision", "source"}
 T = TypeVar("T")
-_NETWORK, _NORMALIZER = "network.", "normalizer."
+_NETWORK, _NORMALIZER, _VISION = "network.", "normalizer.", "vision."
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class StoredPolicy:
         network: the denoiser, f32, in evaluation mode.
         normalizer: of states and actions.
         schedule: the sampler.
+        vision: encoder of the cameras, f32, in evaluation mode.
         source: where an imported policy comes from and how to feed it; empty for policies trained here.
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
             chunk, and ``"state_keys"``, robomimic's names of the observations that make up the state, in order;
@@ -51,15 +54,19 @@ class StoredPolicy:
     network: TransformerForDiffusion
     normalizer: Normalizer
     schedule: NoiseSchedule
+    vision: VisionEncoder | None = None
     source: dict[str, Any] = field(default_factory=dict)
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
     """Writes both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
+    config = {"format": FORMAT, "network": policy.network.config, "schedule": policy.schedule.config}
     weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
+    if policy.vision is not None:
+        config["vision"] = policy.vision.config
+        weights |= {_VISION + name: value for name, value in policy.vision.state_dict().items()}
     tensors = {name: value.half() if half else value for name, value in weights.items()}
     tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
-    config = {"format": FORMAT, "network": policy.network.config, "schedule": policy.schedule.config}
     if policy.source:
         config["source"] = policy.source
     with atomic_path(path / "model.safetensors") as temporary:
@@ -79,24 +86,30 @@ def read_pretrained(path: Path) -> StoredPolicy:
     tensors = _read_tensors(path / "model.safetensors")
     network = _make(path, TransformerForDiffusion, config, "network")
     schedule = _make(path, NoiseSchedule, config, "schedule")
-    network_tensors = take(tensors, _NETWORK)
+    vision = _make(path, VisionEncoder, config, "vision") if "vision" in config else None
+    state_dim = network.cond_dim - (0 if vision is None else vision.feature_dim)
+    where = path / "model.safetensors"
+    _load(where, _NETWORK, tensors, network)
+    if vision is not None:
+        _load(where, _VISION, tensors, vision)
     normalizer_tensors = take(tensors, _NORMALIZER)
-    expected_normalizer = {
+    expected = {
         f"{name}_{part}": (size,)
-        for name, size in (("state", network.cond_dim), ("action", network.input_dim))
+        for name, size in (("state", state_dim), ("action", network.input_dim))
         for part in ("scale", "offset")
     }
-    expected_network = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    where = path / "model.safetensors"
-    _check_tensors(where, _NETWORK, network_tensors, expected_network)
-    _check_tensors(where, _NORMALIZER, normalizer_tensors, expected_normalizer)
+    _check_tensors(where, _NORMALIZER, normalizer_tensors, expected)
     if tensors:
-        raise ValueError(
-            f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
-        )
-    network.load_state_dict({name: value.float() for name, value in network_tensors.items()})
-    normalizer = Normalizer(**normalizer_tensors)
-    return StoredPolicy(network.eval(), normalizer, schedule, config.get("source", {}))
+        raise ValueError(f"{where}: expected tensors of the policy alone, got {sorted(tensors)}")
+    return StoredPolicy(network, Normalizer(**normalizer_tensors), schedule, vision, config.get("source", {}))
+
+
+def _load(where: Path, prefix: str, tensors: dict[str, Tensor], module: nn.Module) -> None:
+    """Moves the tensors under ``prefix`` into ``module`` and puts it in evaluation mode."""
+    found = take(tensors, prefix)
+    _check_tensors(where, prefix, found, {k: tuple(v.shape) for k, v in module.state_dict().items()})
+    module.load_state_dict({name: value.float() for name, value in found.items()})
+    module.eval()
 
 
 def _make(path: Path, kind: type[T], config: dict[str, Any], field: str) -> T:

@@ -17,16 +17,20 @@ from typing import Any, Literal
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
 __all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
+
+_VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class PolicyTrainer:
         normalizer: of states and actions.
         demos: demonstrations.
         config: how to train.
+        vision: encoder of the cameras that the demonstrations have images of, trained in place.
 
     Attributes:
         step: optimiser steps taken.
@@ -95,9 +100,13 @@ class PolicyTrainer:
         normalizer: Normalizer,
         demos: Demonstrations,
         config: TrainConfig,
+        vision: VisionEncoder | None = None,
     ) -> None:
         self.network, self.normalizer, self.demos, self.config = network, normalizer, demos, config
-        self.loss = DiffusionLoss(network, normalizer, NoiseSchedule())
+        self.vision = vision
+        self._trained = nn.ModuleList([network] if vision is None else [network, vision])
+        self.loss = DiffusionLoss(network, normalizer, NoiseSchedule(), vision)
+        self._data_checksum = sum(_checksum(value) for value in demos.data.values(True, True))
         num_val = math.ceil(config.val_ratio * len(demos))
         if num_val >= len(demos):
             raise ValueError(f"val_ratio {config.val_ratio} of {len(demos)} episodes leaves none to train on")
@@ -106,16 +115,17 @@ class PolicyTrainer:
         self.train_rows = demos.window_rows(*sizes, range(split))
         self.val_rows = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
         self._ema = EMAModel(
-            network.parameters(),
+            self._trained.parameters(),
             decay=config.ema_max_decay,
             power=config.ema_power,
             update_after_step=0,
             use_ema_warmup=True,
             foreach=True,
         )
-        self._optimizer = torch.optim.AdamW(
-            optimizer_groups(network, config.weight_decay), lr=config.lr, betas=(0.9, 0.95), fused=True
-        )
+        groups = optimizer_groups(network, config.weight_decay)
+        if vision is not None:
+            groups.append({"params": [*vision.parameters()], "weight_decay": _VISION_WEIGHT_DECAY})
+        self._optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.95), fused=True)
         self.step = 0
         self._set_schedule()
 
@@ -131,17 +141,17 @@ class PolicyTrainer:
         """
         torch.manual_seed(step_seed(self.config.seed, self.step))
         index = batch_indices(len(self.train_rows), self.config.batch_size, self.step, self.config.seed)
-        self.network.train()
+        self._trained.train()
         self._optimizer.zero_grad(set_to_none=True)
         loss = self._batch_loss(self.train_rows[index])
         if not math.isfinite(value := loss.item()):
             raise FloatingPointError(f"step {self.step}: loss is {value}")
         loss.backward()
         if self.config.max_grad_norm > 0:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
+            torch.nn.utils.clip_grad_norm_(self._trained.parameters(), self.config.max_grad_norm)
         self._optimizer.step()
         self._schedule.step()
-        self._ema.step(self.network.parameters())
+        self._ema.step(self._trained.parameters())
         self.step += 1
         return value
 
@@ -150,17 +160,19 @@ class PolicyTrainer:
         """Loss of the averaged weights on held-out episodes and fixed noise; nan if none is held out."""
         if self.val_rows is None:
             return float("nan")
-        self.network.eval()
+        self._trained.eval()
         with torch.random.fork_rng(devices=[]), self._averaged_weights():
             torch.manual_seed(self.config.seed)
             rows = self.val_rows[torch.randperm(len(self.val_rows))[:max_windows]]
             return self._batch_loss(rows.repeat(math.ceil(max_windows / len(rows)), 1)).item()
 
-    def ema_network(self) -> TransformerForDiffusion:
-        """A copy of the network with the averaged weights, in evaluation mode."""
-        network = copy.deepcopy(self.network).eval()
-        self._ema.copy_to(network.parameters())
-        return network
+    def ema_policy(self, schedule: NoiseSchedule | None = None) -> DiffusionPolicy:
+        """The policy with copies of the networks and the averaged weights in them; ``schedule`` is its sampler."""
+        trained = copy.deepcopy(self._trained).eval()
+        self._ema.copy_to(trained.parameters())
+        return DiffusionPolicy(
+            trained[0], self.normalizer, vision=trained[1] if len(trained) > 1 else None, schedule=schedule
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes a checkpoint. A kill leaves the old file or the new one, never a part of one."""
@@ -175,10 +187,14 @@ class PolicyTrainer:
                 configuration.
         """
         state = _read_checkpoint(path)
-        for name in ("config", "network_config", "data"):
-            if state[name] != (expected := self._state_header()[name]):
-                raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
+        for name, expected in self._state_header().items():
+            if state.get(name) != expected:
+                raise ValueError(
+                    f"{path}: made with another {name}: {_difference(expected, state.get(name))}"
+                )
         self.network.load_state_dict(state["network"])
+        if self.vision is not None:
+            self.vision.load_state_dict(state["vision"])
         self._ema.load_state_dict(state["ema"])
         self._ema.to(next(self.network.parameters()).device)
         self._optimizer.load_state_dict(state["optimizer"])
@@ -193,12 +209,12 @@ class PolicyTrainer:
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:
-        self._ema.store(self.network.parameters())
-        self._ema.copy_to(self.network.parameters())
+        self._ema.store(self._trained.parameters())
+        self._ema.copy_to(self._trained.parameters())
         try:
             yield
         finally:
-            self._ema.restore(self.network.parameters())
+            self._ema.restore(self._trained.parameters())
 
     def _set_schedule(self) -> None:
         for group in self._optimizer.param_groups:
@@ -208,24 +224,22 @@ class PolicyTrainer:
         )
 
     def _state_header(self) -> dict[str, Any]:
-        rows, data = len(self.train_rows), self.demos.data
-        return {
+        header = {
             "config": asdict(self.config),
             "network_config": dict(self.network.config),
-            "data": {
-                "windows": rows,
-                "checksum": sum(float(v.double().sum()) for v in data.values(True, True)),
-            },
+            "data": {"windows": len(self.train_rows), "checksum": self._data_checksum},
         }
+        return header if self.vision is None else header | {"vision_config": dict(self.vision.config)}
 
     def _state(self) -> dict[str, Any]:
-        return {
+        state = {
             **self._state_header(),
             "step": self.step,
             "network": self.network.state_dict(),
             "ema": self._ema.state_dict(),
             "optimizer": self._optimizer.state_dict(),
         }
+        return state if self.vision is None else state | {"vision": self.vision.state_dict()}
 
 
 def step_seed(seed: int, step: int) -> int:
@@ -271,12 +285,18 @@ def _read_checkpoint(path: str | Path) -> dict[str, Any]:
             f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
         ) from error
     expected = {"config", "network_config", "data", "step", "network", "ema", "optimizer"}
-    if not isinstance(state, dict) or set(state) != expected:
+    if not isinstance(state, dict) or set(state) - {"vision", "vision_config"} != expected:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
         raise ValueError(f"{path}: expected a training checkpoint with {sorted(expected)}, got {found}")
     return state
 
 
-def _difference(expected: dict, found: dict) -> str:
+def _checksum(value: Tensor) -> float:
+    """Sum of all entries; images are summed without a copy of them in another type."""
+    return float(value.double().sum() if value.is_floating_point() else value.sum(dtype=torch.int64))
+
+
+def _difference(expected: dict, found: dict | None) -> str:
+    found = found or {}
     names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
     return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)
