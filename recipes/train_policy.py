@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Reads the demonstrations and builds an untrained network that fits them."""
-    task, cameras = get_task(config.task), dict(config.cameras)
+    task, cameras = get_task(config.task), chosen_cameras(config)
     demos = read_demos(
         config.demos,
         task.proprioception_keys if cameras else task.state_keys,
@@ -76,11 +76,14 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     return trainer
 
 
+def chosen_cameras(config: DictConfig) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations."""
+    return {name: key for name, key in config.cameras.items() if key is not None}
+
+
 def make_vision(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> VisionEncoder:
     image_size = demos.data["observation", next(iter(cameras))].shape[-2:]
-    crop_size = [
-        round(share * size) for share, size in zip([config.vision.crop] * 2, image_size, strict=True)
-    ]
+    crop_size = [round(config.vision.crop * size) for size in image_size]
     vision = VisionEncoder([*cameras], image_size=image_size, crop_size=crop_size, width=config.vision.width)
     return vision.to(config.device)
 
@@ -114,9 +117,10 @@ def save(trainer: PolicyTrainer, config: DictConfig) -> None:
 def averaged_policy(
     trainer: PolicyTrainer, config: DictConfig, schedule: NoiseSchedule | None = None
 ) -> DiffusionPolicy:
+    """With a note of the cameras, for whoever makes an environment for it."""
     policy = trainer.ema_policy(schedule)
-    if config.cameras:
-        policy.source = {"task": get_task(config.task).alias, "cameras": dict(config.cameras)}
+    if cameras := chosen_cameras(config):
+        policy.source = {"task": get_task(config.task).alias, "cameras": cameras}
     return policy
 
 

@@ -67,8 +67,8 @@ def test_image_policies_go_the_same_way(work, demos):
     output = run("render_demos", *options, expect=None)
     if "rendering needs a GL library" in output:
         pytest.skip("no GL library")
-    cameras = "cameras={image: agentview_image, wrist_image: robot0_eye_in_hand_image}"
-    small = ("vision.width=16", "network.n_layer=2", "network.n_emb=16", "train.val_ratio=0", cameras)
+    cameras = ("cameras.image=agentview_image", "cameras.wrist_image=robot0_eye_in_hand_image")
+    small = ("vision.width=16", "network.n_layer=2", "network.n_emb=16", "train.val_ratio=0", *cameras)
     run(
         "train_policy", f"demos={work}/images.h5", f"out={work}/seeing", "max_steps=2", "batch_size=4", *small
     )

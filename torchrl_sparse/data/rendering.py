@@ -21,7 +21,8 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     """Copies a demonstration file and adds ``obs/<camera>_image``, u8 [T, h, w, 3], to every demonstration.
 
     Images are rendered from the simulator states that were recorded, so experts run once and cameras can be
-    chosen later. ``out`` appears when it is complete.
+    chosen later. Pictures of a running episode are one physics step, 2 ms, behind its states; these are not.
+    ``out`` appears when it is complete.
 
     Args:
         path: a file of `torchrl_sparse.data.demos.collect`.

@@ -123,7 +123,7 @@ def test_a_policy_sees_its_images(policy):
     td = request(3)
     chunk = policy(td.clone())[keys.CHUNK]
     other = td.clone().set(keys.history("image"), images(3, 2, seed=1))
-    assert (policy(other)[keys.CHUNK] - chunk).abs().max() > 1e-3
+    assert (policy(other)[keys.CHUNK] - chunk).abs().max() > 1e-4
     alone = policy(td[1].clone())
     torch.testing.assert_close(alone[keys.CHUNK], chunk[1], atol=1e-5, rtol=0)
 
