@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import importlib.util
-import signal
 import time
 from functools import partial
 from pathlib import Path
@@ -24,6 +23,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer, TrainConfig
@@ -154,21 +154,6 @@ def make_logger(config: DictConfig) -> Logger:
         "config": OmegaConf.to_container(config, resolve=True),
     }
     return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
-
-
-class StopSignal:
-    """Remembers SIGINT or SIGTERM so that the step in progress is finished and saved; a second one kills."""
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-        self._previous = {
-            number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)
-        }
-
-    def _note(self, number: int, _frame: object) -> None:
-        self.name = signal.Signals(number).name
-        for each, handler in self._previous.items():
-            signal.signal(each, handler)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,20 @@ print("fine")
     assert python(code).endswith("fine")
 
 
+def test_without_transformers_all_but_the_network_imports():
+    code = """
+import sys
+sys.modules["transformers"] = None  # any import of it fails
+from torchrl_sparse import BAC, ChunkExecutor, DiffusionPolicy, TokenPruner, VLAConfig
+import torchrl_sparse.policies.vla.flops, torchrl_sparse.policies.vla.text, torchrl_sparse.policies.vla.normalize
+try:
+    from torchrl_sparse import VLAPolicy
+except ImportError as error:
+    print(error)
+"""
+    assert "torchrl-sparse[vla]" in python(code)
+
+
 def test_every_public_name_is_there():
     for name in torchrl_sparse.__all__:
         assert getattr(torchrl_sparse, name).__doc__, name

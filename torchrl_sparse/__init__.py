@@ -16,6 +16,10 @@ _HOME = {
     "DiffusionPolicy": "policies.diffusion.policy",
     "TransformerForDiffusion": "policies.diffusion.transformer",
     "NoiseSchedule": "policies.diffusion.schedule",
+    "VLAPolicy": "policies.vla.policy",
+    "VLAConfig": "policies.vla.config",
+    "TokenPruner": "policies.vla.pruning",
+    "load_openvla_oft": "policies.checkpoints.openvla_oft",
     "Normalizer": "data.normalize",
     "Planner": "blocks.planner",
     "StaticPlanner": "blocks.planner",
@@ -25,6 +29,8 @@ _HOME = {
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
     "make_engine": "blocks.engine.factory",
+    "SpecPrune": "tokens.specprune",
+    "ActionAwareController": "control.action_aware",
     "ChunkExecutor": "control.chunk_executor",
     "rollout_episodes": "evaluation.paired",
     "measure_latency": "evaluation.latency",
@@ -38,15 +44,21 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform
+    from torchrl_sparse.control.action_aware import ActionAwareController
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.data.normalize import Normalizer
     from torchrl_sparse.envs.robosuite import RobosuiteEnv
     from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env
     from torchrl_sparse.evaluation.latency import measure_latency
     from torchrl_sparse.evaluation.paired import rollout_episodes
+    from torchrl_sparse.policies.checkpoints.openvla_oft import load_openvla_oft
     from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.policies.vla.config import VLAConfig
+    from torchrl_sparse.policies.vla.policy import VLAPolicy
+    from torchrl_sparse.policies.vla.pruning import TokenPruner
+    from torchrl_sparse.tokens.specprune import SpecPrune
 
 
 def __getattr__(name: str):

@@ -1,7 +1,8 @@
 """Every TensorDict key that the library reads or writes: one constant each, one meaning each.
 
 Names that TorchRL's own vision-language-action schema (`torchrl.data.vla`) already has are used as they are. ``*B`` is the
-batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps.
+batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps,
+N the visual tokens.
 
 ================================  =====================  ===========================================================
 constant                          shape, dtype           meaning
@@ -20,17 +21,29 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
+``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
+``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that a visual token reached: 0 was pruned before the
+                                                         decoder, L (all of them) was never pruned
+``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
+``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
+``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, to see what changed
+``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
+``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
+``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
-``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, 0 on served steps
+``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
+                                                         0 on served steps
 ``LATENCY``                       f32 [*B, 1]            seconds of this query, 0 on served steps
 ================================  =====================  ===========================================================
 """
 
-from tensordict import NestedKey, TensorDictBase
+import torch
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
 
 STATE = ("observation", "state")
@@ -48,11 +61,21 @@ IS_INIT = "is_init"
 COND = ("diffusion", "cond")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
+PRUNE_RATE = ("diffusion", "prune_rate")
+
+KEEP_MASK = ("tokens", "keep_mask")
+TOKEN_DEPTH = ("tokens", "depth")
+KEPT = ("tokens", "kept")
+TOKEN_SCORE = ("tokens", "score")
+TOKEN_FRAMES = ("tokens", "frames")
+TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")
 ACTION = "action"
 
 REPLAN = ("control", "replan")
+FINE = ("control", "fine")
+CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
 
@@ -80,3 +103,30 @@ def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         there = sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))
         raise KeyError(f"expected the key {key!r}, got {', '.join(there) or 'an empty TensorDict'}")
     return value
+
+
+def recall(
+    tensordict: TensorDictBase,
+    key: NestedKey,
+    shape: tuple[int, ...],
+    fill: float,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """What an earlier call wrote under ``key``, [*B, *shape]; ``fill`` for samples that were never called before.
+
+    An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
+    although some of its rows have it. The others get rows of the same shape.
+
+    Args:
+        shape, fill, dtype: of a sample's entry where no sample has one; by default the type of ``fill``.
+    """
+    value = tensordict.get(key, None)
+    if value is not None:
+        return value
+    if isinstance(tensordict, LazyStackedTensorDict):
+        known = [value for row in tensordict.tensordicts if (value := row.get(key, None)) is not None]
+        if known:
+            shape, dtype = known[0].shape[tensordict.ndim - 1 :], known[0].dtype
+        rows = [recall(row, key, shape, fill, dtype) for row in tensordict.tensordicts]
+        return torch.stack(rows, tensordict.stack_dim)
+    return torch.full((*tensordict.batch_size, *shape), fill, dtype=dtype, device=tensordict.device)

@@ -95,7 +95,7 @@ def test_type_reuse_zigzags_through_layers():
     assert [row[3] for row in source] == [3, 103, 200, 200]
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_reuse_source_is_per_row_and_points_to_computed_blocks_only(reuse):
     masks = random_mask(4, rate=0.8)
     step, column = reuse_source(masks, reuse)
@@ -104,12 +104,15 @@ def test_reuse_source_is_per_row_and_points_to_computed_blocks_only(reuse):
         assert torch.equal(step[row], alone[0])
         assert torch.equal(column[row], alone[1])
         assert not mask[step[row], column[row]].any()
-        assert (column[row] % 3 == torch.arange(6) % 3).all()
+        if reuse != "single":
+            assert (column[row] % 3 == torch.arange(6) % 3).all()
 
 
 def test_unknown_reuse_is_refused():
-    with pytest.raises(ValueError, match='expected "block" or "type", got \'single\''):
-        reuse_source(random_mask(), "single")
+    with pytest.raises(
+        ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\], got 'layer'"
+    ):
+        reuse_source(random_mask(), "layer")
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_a_file_is_small_plain_json_with_one_line_per_block(path):
     assert json.loads(text)["computed_steps"].keys() == {
         f"layers.{i}.{b}" for i in (0, 1) for b in ("SA", "CA", "FFN")
     }
-    assert len(text.splitlines()) == 6 + 6 + 4
+    assert len(text.splitlines()) == 8 + 6 + 4
     assert re.search(r'^    "layers\.1\.CA": \[0, [\d, ]+\],$', text, re.MULTILINE)
 
 
@@ -136,6 +136,7 @@ def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, f
         (PlanSpec(NUM_STEPS, NUM_LAYERS, "77aa"), "policy fingerprint '8d1f', got '77aa'"),
         (PlanSpec(100, NUM_LAYERS, "8d1f"), "num_inference_steps 10, got 100"),
         (PlanSpec(NUM_STEPS, 8, "8d1f"), "num_layers 2, got 8"),
+        (PlanSpec(NUM_STEPS, NUM_LAYERS, "8d1f", "ddim"), "sampler 'ddpm', got 'ddim'"),
     ],
 )
 def test_a_schedule_made_for_another_policy_is_refused_naming_both(schedule, spec, message):

@@ -270,4 +270,6 @@ def _schedule(
 ) -> Schedule:
     num_blocks, num_steps = calibration.similarity.shape[:2]
     settings = {**settings, "num_calibration_samples": calibration.num_samples}
-    return Schedule(method, policy, num_steps, num_blocks // len(BLOCK_TYPES), tuple(steps), settings)
+    return Schedule(
+        method, policy, num_steps, num_blocks // len(BLOCK_TYPES), tuple(steps), settings=settings
+    )

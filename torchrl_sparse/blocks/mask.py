@@ -10,6 +10,7 @@ A pruned block adds an earlier output to the residual stream. Which one is the *
 * ``"block"``: its own most recent output (BAC, update-then-reuse).
 * ``"type"``: the most recent output of *any* block of its type, be it of a shallower layer of the same step
   or of a deeper layer of an earlier one (SAG, "one-for-all" buffers with zig-zag reuse).
+* ``"single"``: the most recent output of any block (the single buffer that SAG's printed equation has).
 
 Costs follow the published convention: FLOPs = 2 · multiply-accumulates, over all K calls of the denoiser,
 vision excluded, and without counting norms, softmax and activations. For d=256, L=8, H=10, To=2 and K=100
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -37,6 +38,7 @@ __all__ = [
     "check_reuse",
     "fixed_macs",
     "mask_from_steps",
+    "num_buffers",
     "prune_rate",
     "query_flops",
     "reuse_source",
@@ -45,7 +47,7 @@ __all__ = [
 ]
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
-Reuse = Literal["block", "type"]
+Reuse = Literal["block", "type", "single"]
 
 
 def block_name(column: int) -> str:
@@ -93,8 +95,17 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
 
 def check_reuse(reuse: str) -> None:
     """Raise ValueError unless ``reuse`` names a reuse rule."""
-    if reuse not in ("block", "type"):
-        raise ValueError(f'reuse: expected "block" or "type", got {reuse!r}')
+    if reuse not in get_args(Reuse):
+        raise ValueError(f"reuse: expected one of {list(get_args(Reuse))}, got {reuse!r}")
+
+
+def num_buffers(reuse: Reuse, num_blocks: int) -> int:
+    """Outputs that a reuse rule keeps; block ``b`` writes and reads number ``b % num_buffers``.
+
+    >>> num_buffers("type", num_blocks=24)
+    3
+    """
+    return {"block": num_blocks, "type": len(BLOCK_TYPES), "single": 1}[reuse]
 
 
 def prune_rate(mask: Tensor) -> Tensor:
@@ -143,8 +154,7 @@ def reuse_source(mask: Tensor, reuse: Reuse = "block") -> tuple[Tensor, Tensor]:
     # With evaluations numbered in order of execution, the newest computed one is a running maximum.
     order = torch.arange(num_steps * num_blocks, device=mask.device).view(num_steps, num_blocks)
     written = order.expand(mask.shape).masked_fill(mask, -1)
-    if reuse == "type":
-        written = written.reshape(*batch, -1, len(BLOCK_TYPES))
+    written = written.reshape(*batch, -1, num_buffers(reuse, num_blocks))
     newest = written.cummax(dim=-2).values.reshape(mask.shape)
     return newest // num_blocks, newest % num_blocks
 

@@ -6,7 +6,9 @@ does not) and writes one method.
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -28,11 +30,14 @@ class PlanSpec:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
+        sampler: kind of its denoising schedule, ``"ddpm"`` or ``"ddim"``.
     """
 
     num_inference_steps: int
     num_layers: int
     policy: str
+    sampler: str = "ddpm"
+    sampler: str = "ddpm"
 
     @property
     def num_blocks(self) -> int:
@@ -44,11 +49,12 @@ class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
-    A subclass writes :meth:`masks`; one that cannot serve every policy also overrides :meth:`bind` and raises
-    ValueError there. ``policy.plan = planner`` binds it.
+    A subclass writes :meth:`masks`; one that reads more keys overrides :meth:`inputs` too, and one that cannot
+    serve every policy :meth:`bind`, and raises ValueError there. ``policy.plan = planner`` binds it.
 
     Attributes:
-        reuse: what a pruned block reuses, ``"block"`` or ``"type"`` (see :mod:`torchrl_sparse.blocks.mask`).
+        reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see
+            :mod:`torchrl_sparse.blocks.mask`).
 
     Examples:
         >>> from tensordict import TensorDict
@@ -94,9 +100,18 @@ class Planner(TensorDictModuleBase):
         """
         self._spec = spec
 
+    @property
+    def fingerprint(self) -> str:
+        """Names what decides the masks: two planners of one class and one fingerprint decide alike."""
+        return tensors_fingerprint(self.state_dict())
+
     def masks(self, cond: Tensor) -> Tensor:
         """Masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
         raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
+
+    def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
+        """Further arguments of :meth:`masks`, each with the batch dimensions flattened into ``rows``."""
+        return {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the mask of every observation.
@@ -109,13 +124,21 @@ class Planner(TensorDictModuleBase):
         cond = read(tensordict, COND)
         batch = cond.shape[:-2]
         rows = math.prod(batch)
-        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]))
+        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]), **self.options(tensordict, rows))
         try:
             validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
         except ValueError as error:
             raise ValueError(f"{type(self).__name__}.masks: {error}") from error
         tensordict.set(PRUNE_MASK, masks.reshape(*batch, spec.num_inference_steps, spec.num_blocks))
         return tensordict
+
+
+def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
+    """Sixteen hexadecimal digits that name the values of named tensors."""
+    digest = hashlib.sha256()
+    for name, value in sorted(tensors.items()):
+        digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 class StaticPlanner(Planner):
@@ -143,6 +166,11 @@ class StaticPlanner(Planner):
             raise ValueError(f"{type(self).__name__}.mask: {error}") from error
         self._mask = mask
         super().bind(spec)
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the bound mask."""
+        return tensors_fingerprint({"mask": self.mask(self.spec)})
 
     def masks(self, cond: Tensor) -> Tensor:
         """The mask, once per row of ``cond``."""

@@ -7,8 +7,10 @@ read.
       "format": "torchrl_sparse.schedule/1",
       "method": "bac",
       "policy": "<fingerprint of the policy that it was made for>",
+      "sampler": "ddpm",
       "num_inference_steps": 100,
       "num_layers": 8,
+      "reuse": "block",
       "settings": {"num_updates": 10, "top_k": 5},
       "computed_steps": {
         "layers.0.SA": [0, 7, 31, 99],
@@ -34,7 +36,9 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.mask import (
     BLOCK_TYPES,
+    Reuse,
     block_name,
+    check_reuse,
     mask_from_steps,
     steps_from_mask,
     validate_mask,
@@ -45,7 +49,17 @@ from torchrl_sparse.files import atomic_path
 __all__ = ["Schedule", "StaticSchedule"]
 
 FORMAT = "torchrl_sparse.schedule/1"
-_FIELDS = ("format", "method", "policy", "num_inference_steps", "num_layers", "settings", "computed_steps")
+_FIELDS = (
+    "format",
+    "method",
+    "policy",
+    "num_inference_steps",
+    "num_layers",
+    "sampler",
+    "reuse",
+    "settings",
+    "computed_steps",
+)
 
 
 @dataclass(frozen=True)
@@ -59,6 +73,8 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
+        sampler: kind of the denoising schedule that it was made for, ``"ddpm"`` or ``"ddim"``.
+        reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
     Raises:
@@ -75,6 +91,8 @@ class Schedule:
     num_inference_steps: int
     num_layers: int
     computed_steps: tuple[tuple[int, ...], ...]
+    sampler: str = "ddpm"
+    reuse: Reuse = "block"
     settings: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,6 +106,9 @@ class Schedule:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
         if not isinstance(self.settings, dict):
             raise ValueError(f"settings: expected an object, got {type(self.settings).__name__}")
+        if self.sampler not in ("ddpm", "ddim"):
+            raise ValueError(f"sampler: expected 'ddpm' or 'ddim', got {self.sampler!r}")
+        check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:
             raise ValueError(
@@ -99,7 +120,14 @@ class Schedule:
 
     @classmethod
     def from_mask(
-        cls, mask: Tensor, *, method: str, policy: str, settings: dict[str, Any] | None = None
+        cls,
+        mask: Tensor,
+        *,
+        method: str,
+        policy: str,
+        sampler: str = "ddpm",
+        reuse: Reuse = "block",
+        settings: dict[str, Any] | None = None,
     ) -> Schedule:
         """The schedule of a mask bool [K, 3L].
 
@@ -109,7 +137,9 @@ class Schedule:
         num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
         num_layers = max(1, num_blocks // len(BLOCK_TYPES))
         validate_mask(mask, num_steps, num_layers, batch=())
-        return cls(method, policy, num_steps, num_layers, steps_from_mask(mask), settings or {})
+        return cls(
+            method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
+        )
 
     def mask(self) -> Tensor:
         """The prune mask bool [K, 3L]."""
@@ -148,8 +178,10 @@ class Schedule:
             "format": FORMAT,
             "method": self.method,
             "policy": self.policy,
+            "sampler": self.sampler,
             "num_inference_steps": self.num_inference_steps,
             "num_layers": self.num_layers,
+            "reuse": self.reuse,
             "settings": self.settings,
         }
         lines = [f"  {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
@@ -180,14 +212,15 @@ class StaticSchedule(StaticPlanner):
     def __init__(self, schedule: Schedule | str | os.PathLike) -> None:
         super().__init__()
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.load(schedule)
+        self.reuse = self.schedule.reuse
 
     def mask(self, spec: PlanSpec) -> Tensor:
         """The schedule's mask [K, 3L].
 
         Raises:
-            ValueError: if the schedule was made for another number of steps or layers, or for another policy.
+            ValueError: if the schedule was made for another policy or sampler, or for other numbers of steps or layers.
         """
-        for name in ("num_inference_steps", "num_layers", "policy"):
+        for name in ("num_inference_steps", "num_layers", "policy", "sampler"):
             made_for, asked = getattr(self.schedule, name), getattr(spec, name)
             if made_for != asked:
                 label = "policy fingerprint" if name == "policy" else name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -14,8 +14,9 @@ class ChunkExecutor(TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
 
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
-    when the gate asks (``("control", "replan")``). Only samples that are due are handed to the policy. Everything the policy
-    writes stays in the TensorDict until that sample's next query, except costs, which are zero on served steps.
+    when the gate asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to the
+    policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are zero on
+    served steps.
 
     All state is in keys, so it follows the environment through any collector.
 
@@ -72,11 +73,11 @@ class ChunkExecutor(TensorDictModuleBase):
         age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.QUERIED, due)
-        return tensordict.set(keys.ACTION, _take(tensordict.get(keys.CHUNK), age))
+        return tensordict.set(keys.ACTION, action_at(tensordict.get(keys.CHUNK), age))
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
         """i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
-        return _stored(tensordict, keys.AGE, torch.tensor([self.n_action_steps], device=tensordict.device))
+        return keys.recall(tensordict, keys.AGE, (1,), self.n_action_steps)
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """bool [*B, 1]: samples without an action to serve."""
@@ -98,7 +99,7 @@ class ChunkExecutor(TensorDictModuleBase):
         for key in self.policy.out_keys:
             value = answer.get(key)
             shape = value.shape[1:]
-            whole = _stored(tensordict, key, value.new_zeros(shape)).reshape(-1, *shape)
+            whole = keys.recall(tensordict, key, shape, 0, value.dtype).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
 
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
@@ -107,25 +108,10 @@ class ChunkExecutor(TensorDictModuleBase):
                 tensordict.set(key, tensordict.get(key).masked_fill(served, 0.0))
 
 
-def _take(chunk: Tensor, age: Tensor) -> Tensor:
+def action_at(chunk: Tensor, age: Tensor) -> Tensor:
     """The action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
     index = age[..., None].expand(*age.shape, chunk.shape[-1])
     return chunk.gather(-2, index).squeeze(-2)
-
-
-def _stored(tensordict: TensorDictBase, key: NestedKey, default: Tensor) -> Tensor:
-    """What an earlier call wrote, [*B, *default.shape]; ``default`` for samples that were never called before.
-
-    An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
-    although some of its rows have it.
-    """
-    value = tensordict.get(key, None)
-    if value is not None:
-        return value
-    if isinstance(tensordict, LazyStackedTensorDict):
-        rows = [_stored(row, key, default) for row in tensordict.tensordicts]
-        return torch.stack(rows, tensordict.stack_dim)
-    return default.expand(*tensordict.batch_size, *default.shape)
 
 
 def _unique(nested_keys: list) -> list:

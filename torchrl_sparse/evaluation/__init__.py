@@ -20,6 +20,12 @@ from torchrl_sparse.evaluation.stats import (
     verdict,
     wilson_interval,
 )
+from torchrl_sparse.evaluation.token_figures import (
+    draw_tokens,
+    plot_control,
+    plot_token_strip,
+    plot_tokens_per_layer,
+)
 from torchrl_sparse.evaluation.video import Caption, write_video
 
 __all__ = [
@@ -32,15 +38,19 @@ __all__ = [
     "block_errors",
     "build_results",
     "describe_machine",
+    "draw_tokens",
     "episodes_needed",
     "format_table",
     "load_results",
     "measure_latency",
     "paired_difference",
+    "plot_control",
     "plot_error_surge",
     "plot_pareto",
     "plot_schedule",
     "plot_similarity",
+    "plot_token_strip",
+    "plot_tokens_per_layer",
     "rollout_episodes",
     "save_results",
     "summarize_latency",

@@ -66,7 +66,7 @@ def test_equals_the_reference_for_random_masks(shape, kind, steps, instruction_s
     network, schedule = make_network(shape), NoiseSchedule(kind, steps)
     engine = NativeEngine(network, schedule, instruction_set=instruction_set)
     noise, cond, mask = make_query(network, schedule)
-    for masks, reuse in ((None, "block"), (mask, "block"), (mask, "type")):
+    for masks, reuse in ((None, "block"), (mask, "block"), (mask, "type"), (mask, "single")):
         expected = exact(network, schedule, noise, cond, masks, reuse)
         assert (engine.denoise(noise, cond, masks, reuse) - expected).abs().max() < 1e-5
 
@@ -75,7 +75,7 @@ def test_equals_the_reference_for_random_masks(shape, kind, steps, instruction_s
 def test_property_any_rate_and_rule(seed):
     generator = torch.Generator().manual_seed(seed)
     rate = torch.rand((), generator=generator).item() ** 0.3
-    kind, reuse = ("ddpm", "ddim")[seed % 2], ("block", "type")[seed // 2 % 2]
+    kind, reuse = ("ddpm", "ddim")[seed % 2], ("block", "type", "single")[seed // 2 % 3]
     shape = list(SHAPES)[torch.randint(len(SHAPES), (), generator=generator)]
     network, schedule = make_network(shape, action_dim=1 + seed), NoiseSchedule(kind, 9)
     noise, cond, mask = make_query(network, schedule, batch=3, rate=rate, seed=seed)
@@ -95,7 +95,7 @@ def test_published_sizes_over_the_whole_chain():
 def test_all_but_the_first_step_pruned():
     network, schedule = make_network(), NoiseSchedule("ddpm", 8)
     noise, cond, mask = make_query(network, schedule, rate=1.1)
-    for reuse in ("block", "type"):
+    for reuse in ("block", "type", "single"):
         expected = exact(network, schedule, noise, cond, mask, reuse)
         assert (
             NativeEngine(network, schedule).denoise(noise, cond, mask, reuse) - expected
@@ -187,7 +187,7 @@ def test_wrong_inputs_are_named():
         engine.denoise(noise, cond.double())
     with pytest.raises(ValueError, match="prune mask: expected shape"):
         engine.denoise(noise, cond, mask[..., :3])
-    with pytest.raises(ValueError, match='reuse: expected "block" or "type"'):
+    with pytest.raises(ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\]"):
         engine.denoise(noise, cond, mask, "layer")
     network.train()
     with pytest.raises(ValueError, match="expected eval mode"):

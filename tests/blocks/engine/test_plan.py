@@ -11,7 +11,7 @@ from torchrl_sparse.blocks.engine.plan import (
     REUSE,
     ProgramCache,
     build_program,
-    type_counts,
+    slot_counts,
 )
 
 
@@ -65,9 +65,10 @@ def test_nothing_pruned_only_computes():
 
 @pytest.mark.parametrize("first", range(7))
 @pytest.mark.parametrize("size", range(7))
-def test_type_counts_counts(first, size):
-    kinds = [block % 3 for block in range(first, first + size)]
-    assert type_counts(first, first + size) == tuple(kinds.count(kind) for kind in range(3))
+@pytest.mark.parametrize("slots", [1, 3])
+def test_slot_counts_counts(first, size, slots):
+    read = [block % slots for block in range(first, first + size)]
+    assert slot_counts(first, first + size, slots) == tuple(read.count(slot) for slot in range(slots))
 
 
 def test_the_cache_keeps_the_latest_masks():

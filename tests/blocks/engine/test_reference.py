@@ -50,7 +50,7 @@ def trace(scheduler, masks, reuse):
     return recorder.features()[..., 0, 0].permute(2, 1, 0)
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_no_mask_and_an_all_false_mask_are_bit_exactly_dense(network, scheduler, query, reuse):
     expected = dense_loop(network, scheduler, *query)
     mask = torch.zeros(5, NUM_STEPS, NUM_BLOCKS, dtype=torch.bool)
@@ -74,7 +74,7 @@ def assert_rows_equal_rows_alone(network, scheduler, noise, cond, reuse, toleran
         torch.testing.assert_close(together[part], alone, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_a_row_with_its_own_mask_equals_the_row_alone(network, scheduler, query, reuse):
     # Matrix products round by batch size, dense or not; the published initialisation does not amplify that.
     torch.manual_seed(0)
@@ -82,7 +82,7 @@ def test_a_row_with_its_own_mask_equals_the_row_alone(network, scheduler, query,
     assert_rows_equal_rows_alone(initial, scheduler, *query, reuse, tolerance=1e-6)
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_float64_shows_that_a_row_differs_from_the_row_alone_by_rounding_only(
     network, scheduler, query, reuse
 ):
@@ -100,9 +100,13 @@ def test_type_reuse_follows_a_hand_computed_zigzag(ddpm):
     by_block = trace(ddpm, mask_from_steps(steps, NUM_STEPS)[None], "block")[0]
     assert by_block[:4, 0].tolist() == [0, 0, 200, 200]
     assert by_block[:4, 3].tolist() == [3, 103, 103, 103]
+    # In step 3 layer 0's SA reads what layer 1's FFN wrote last, layer 1's SA what layer 0's FFN just wrote.
+    single = trace(ddpm, mask_from_steps(steps, NUM_STEPS)[None], "single")[0]
+    assert single[:4, 0].tolist() == [0, 5, 200, 205]
+    assert single[:4, 3].tolist() == [3, 103, 202, 302]
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_every_block_adds_what_reuse_source_says(ddpm, reuse):
     masks = random_mask(4, rate=0.7)
     step, column = reuse_source(masks, reuse)
@@ -167,7 +171,7 @@ def test_a_dense_query_records_what_every_block_adds(network, ddpm, query):
         ({"mask": random_mask()}, r"mask: expected shape \[5, 10, 6\].*got \[10, 6\]"),
         ({"mask": random_mask(5).float()}, r"expected a tensor of dtype torch.bool, got dtype torch.float32"),
         ({"mask": torch.ones(5, 10, 6, dtype=torch.bool)}, r"row 0 .* to prune nothing, got True"),
-        ({"reuse": "single"}, r'reuse: expected "block" or "type", got \'single\''),
+        ({"reuse": "layer"}, r"reuse: expected one of \['block', 'type', 'single'\], got 'layer'"),
     ],
 )
 def test_wrong_input_is_refused(network, ddpm, query, change, message):

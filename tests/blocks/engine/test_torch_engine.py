@@ -62,7 +62,7 @@ def test_equals_the_reference_for_random_masks(shape, kind, steps):
         query = make_query(network, schedule, batch, seed)
         masks = make_masks(network, schedule, batch, rate, seed)
         same = masks[:1].repeat(batch, 1, 1)
-        for reuse in ("block", "type"):
+        for reuse in ("block", "type", "single"):
             assert largest_error(engine, network, schedule, query, masks, reuse) < 1e-9
             assert largest_error(engine, network, schedule, query, same, reuse) < 1e-9
         assert largest_error(engine, network, schedule, query) < 1e-9
@@ -73,11 +73,11 @@ def test_rows_that_compute_nothing_ride_along_with_rows_that_do():
     masks = torch.zeros(3, 8, 6, dtype=torch.bool)
     masks[0, 1:], masks[1, 1::2], masks[2, 4:6] = True, True, True
     engine, query = TorchEngine(network, schedule), make_query(network, schedule, 3)
-    for reuse in ("block", "type"):
+    for reuse in ("block", "type", "single"):
         assert largest_error(engine, network, schedule, query, masks, reuse) < 1e-9
 
 
-@pytest.mark.parametrize("reuse", ["block", "type"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_published_shape_in_float32(reuse):
     """100 steps at the published initialisation: the whole chain within 1e-5 of the reference."""
     torch.manual_seed(0)
@@ -141,8 +141,10 @@ def test_wrong_input_is_refused():
         engine.denoise(noise[:, 1:], cond)
     with pytest.raises(ValueError, match="to prune nothing, got True"):
         engine.denoise(noise, cond, torch.ones(2, 5, 6, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r'reuse: expected "block" or "type", got \'single\''):
-        engine.denoise(noise, cond, reuse="single")
+    with pytest.raises(
+        ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\], got 'layer'"
+    ):
+        engine.denoise(noise, cond, reuse="layer")
 
 
 @pytest.mark.parametrize(

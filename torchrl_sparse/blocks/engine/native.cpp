@@ -55,7 +55,7 @@ struct Model {
 struct Program {
     const int32_t* ops;     // [n][3]
     const int32_t* starts;  // [steps + 1]
-    int32_t slots;          // latest outputs kept: one for each block, or 3 (one for each type)
+    int32_t slots;          // latest outputs kept: one for each block, 3 (one for each type), or 1
 };
 }
 
@@ -467,13 +467,14 @@ struct Query {
 
     // to [horizon, width] = from + what the blocks first .. last-1 add, in one pass.
     void reuse(const float* from, int ld_from, float* to, int ld_to, int first, int last) const {
-        const bool shared = slots == 3;  // by type: a slot counts as often as its type occurs
-        const int begin = shared ? 0 : first, end = shared ? 3 : last;
+        const bool shared = slots < 3 * m.layers;  // a slot counts as often as its blocks occur
+        const int begin = shared ? 0 : first, end = shared ? slots : last;
         for (int t = 0; t < m.horizon; t++)
             for (int j = 0; j < width; j += VECTOR) {
                 V total = load(from + t * ld_from + j);
                 for (int s = begin; s < end; s++) {
-                    const float times = shared ? (last + 2 - s) / 3 - (first + 2 - s) / 3 : 1;
+                    const int before = slots - 1 - s;
+                    const float times = shared ? (last + before) / slots - (first + before) / slots : 1;
                     total += load(b.latest + ((size_t)s * m.horizon + t) * ld + j) * times;
                 }
                 store(to + t * ld_to + j, total);

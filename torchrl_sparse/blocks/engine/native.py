@@ -26,7 +26,7 @@ from torchrl_sparse.blocks.engine.packing import Model, PackedNetwork
 from torchrl_sparse.blocks.engine.plan import Program, ProgramCache
 from torchrl_sparse.blocks.engine.reference import check_query
 from torchrl_sparse.blocks.engine.weights import WeightWatch
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
 
 if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -187,7 +187,7 @@ class NativeEngine:
         self._check(noise, cond)
         noise, cond = noise.contiguous(), cond.contiguous()
         packed = self._current()
-        slots = self.network.num_blocks if reuse == "block" else len(BLOCK_TYPES)
+        slots = num_buffers(reuse, self.network.num_blocks)
         masks = [self._dense] * len(cond) if mask is None else mask.numpy()
         programs = [self._programs.get(rows) for rows in masks]
         actions = torch.empty(len(cond), self.network.horizon, self.network.input_dim)

@@ -11,8 +11,8 @@ runs, and a run adds a sum of vectors that are already there, so it is one opera
 
 Blocks are the columns of the mask, :mod:`torchrl_sparse.blocks.mask` says which. The functions here are pure;
 engines give the operations their arithmetic and know the reuse rule: with ``"block"``, block b adds
-``latest[b]``; with ``"type"`` all blocks of a type share one ``latest``, and a run adds it as often as the type
-occurs in the run (:func:`type_counts`).
+``latest[b]``; with ``"type"`` all blocks of a type share one ``latest``, with ``"single"`` all blocks do, and a
+run adds it as often as they occur in the run (:func:`slot_counts`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES
-
-__all__ = ["COLLAPSE", "COMPUTE", "REUSE", "Program", "ProgramCache", "build_program", "type_counts"]
+__all__ = ["COLLAPSE", "COMPUTE", "REUSE", "Program", "ProgramCache", "build_program", "slot_counts"]
 
 COMPUTE, REUSE, COLLAPSE = 0, 1, 2
 
@@ -100,14 +98,15 @@ def build_program(mask: Tensor | np.ndarray) -> Program:
     return Program(np.ascontiguousarray(ops[order]), starts.astype(np.int32))
 
 
-def type_counts(first: int, last: int) -> tuple[int, int, int]:
-    """How many SA, CA and FFN blocks are among the columns ``first .. last-1``.
+def slot_counts(first: int, last: int, num_slots: int) -> tuple[int, ...]:
+    """How many of the columns ``first .. last-1`` read each of ``num_slots`` buffers (column modulo number).
 
-    >>> type_counts(1, 6)
+    >>> slot_counts(1, 6, num_slots=3)
     (1, 2, 2)
     """
-    size = len(BLOCK_TYPES)
-    return tuple((last - 1 - kind) // size - (first - 1 - kind) // size for kind in range(size))
+    return tuple(
+        (last - 1 - slot) // num_slots - (first - 1 - slot) // num_slots for slot in range(num_slots)
+    )
 
 
 class ProgramCache:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, validate_mask
+from torchrl_sparse.blocks.mask import Reuse, check_reuse, num_buffers, validate_mask
 
 if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["FeatureRecorder", "check_query", "denoise"]
+__all__ = ["ComputedRows", "FeatureRecorder", "check_query", "denoise"]
 
 
 class FeatureRecorder:
@@ -71,8 +71,8 @@ def denoise(
         mask: bool [B, K, 3L], True = pruned, row 0 all False; rows of the batch may differ. None prunes
             nothing.
         reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`: ``"block"`` (BAC,
-            arXiv:2506.13456) or ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
-            last-writer-wins).
+            arXiv:2506.13456), ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
+            last-writer-wins) or ``"single"``.
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
 
     Returns:
@@ -95,14 +95,14 @@ def denoise(
         torch.Size([3, 4, 7])
     """
     check_query(network, scheduler, noise, cond, mask, reuse)
-    plan = _Plan(mask)
-    latest: list[Tensor | None] = [None] * (network.num_blocks if reuse == "block" else len(BLOCK_TYPES))
+    computed = ComputedRows(mask)
+    latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks)
     sample = noise[:, 0]
     for step, timestep in enumerate(scheduler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(network.num_blocks):
             slot = block % len(latest)
-            output = _block_output(network, block, x, memory, plan.rows(step, block), latest[slot])
+            output = _block_output(network, block, x, memory, computed.at(step, block), latest[slot])
             latest[slot] = output
             x = x + output
             if record is not None:
@@ -123,8 +123,12 @@ def _block_output(
     return latest.index_copy(0, rows, network.block(block, x[rows], memory[rows]))
 
 
-class _Plan:
-    """Which rows of the batch compute a block; the mask is read to the host once."""
+class ComputedRows:
+    """Which rows of the batch compute a block; the mask is read to the host once.
+
+    Args:
+        mask: bool [B, K, 3L], True = pruned; None prunes nothing.
+    """
 
     def __init__(self, mask: Tensor | None) -> None:
         self._device = None if mask is None else mask.device
@@ -132,7 +136,7 @@ class _Plan:
         self._all = None if mask is None else self._computed.all(dim=0).tolist()
         self._any = None if mask is None else self._computed.any(dim=0).tolist()
 
-    def rows(self, step: int, block: int) -> Tensor | bool:
+    def at(self, step: int, block: int) -> Tensor | bool:
         """True if every row computes, False if none does, else the i64 indices of those that do."""
         if self._computed is None or self._all[step][block]:
             return True

@@ -14,11 +14,14 @@ from torch.nn import functional as F
 from torchrl_sparse.blocks.engine.coefficients import step_coefficients
 from torchrl_sparse.blocks.engine.folding import ConditionEncoder, CrossAttentionFold
 from torchrl_sparse.blocks.engine.linear import make_linear, transposed
-from torchrl_sparse.blocks.engine.plan import type_counts
+from torchrl_sparse.blocks.engine.plan import slot_counts
+from torchrl_sparse.blocks.mask import num_buffers
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["CrossAttention", "FeedForward", "SelfAttention", "Tables"]
+
+_SHARED_BUFFERS = tuple(num_buffers(reuse, num_blocks=0) for reuse in ("type", "single"))
 
 
 def _make_norm(norm: nn.LayerNorm) -> Callable[[Tensor], Tensor]:
@@ -130,11 +133,11 @@ class Tables:
         rows = zip(*coefficients.columns(), strict=True)
         # A division by a Python number would first make a tensor of it, in every step.
         self.updates = [(a, torch.tensor(b).to(self.spread), c, d, e) for a, b, c, d, e in rows]
-        self.counts = _count_table(self.num_blocks, self.stem_weight)
+        self.counts = {n: _count_table(self.num_blocks, n, self.stem_weight) for n in _SHARED_BUFFERS}
 
 
-def _count_table(num_blocks: int, like: Tensor) -> list[list[Tensor]]:
-    """``table[first][last]``: how many SA, CA and FFN blocks there are among ``first .. last-1``, [3]."""
+def _count_table(num_blocks: int, num_slots: int, like: Tensor) -> list[list[Tensor]]:
+    """``table[first][last]``: how often the blocks ``first .. last-1`` read each shared buffer, [num_slots]."""
     edges = range(num_blocks + 1)
-    counts = [[type_counts(first, max(first, last)) for last in edges] for first in edges]
+    counts = [[slot_counts(first, max(first, last), num_slots) for last in edges] for first in edges]
     return [list(row.unbind(0)) for row in torch.tensor(counts).to(like).unbind(0)]

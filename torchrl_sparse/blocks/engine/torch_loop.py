@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.folding import FoldedMemory
 from torchrl_sparse.blocks.engine.plan import COLLAPSE, COMPUTE, build_program
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
 
 if TYPE_CHECKING:
     from torchrl_sparse.blocks.engine.torch_blocks import Tables
@@ -135,7 +135,7 @@ class _Query:
     """The state of one query."""
 
     def __init__(self, tables: Tables, loop: Loop, noise: Tensor, cond: Tensor, reuse: Reuse) -> None:
-        self._tables, self._loop, self._by_type = tables, loop, reuse == "type"
+        self._tables, self._loop = tables, loop
         self._batch = batch = len(noise)
         rows, size = batch * tables.horizon, batch * tables.horizon * tables.width
         self._sample = noise[:, 0].reshape(rows, -1).clone()
@@ -145,7 +145,8 @@ class _Query:
         self._stem = tables.stem_bias.repeat(batch, 1)
         self._x = noise.new_empty(rows, tables.width)
         self._sum = torch.empty_like(self._x)
-        slots = len(BLOCK_TYPES) if self._by_type else tables.num_blocks
+        slots = num_buffers(reuse, tables.num_blocks)
+        self._counts = tables.counts.get(slots)  # None where every block has a buffer of its own
         self._latest = None if loop.dense else noise.new_empty(slots, size)
         self._slots = None if loop.dense else [slot.view(rows, -1) for slot in self._latest]
         self._ones = noise.new_ones(tables.num_blocks)
@@ -203,8 +204,8 @@ class _Query:
 
     def _add_reused(self, x: Tensor, first: int, last: int) -> None:
         """Add to ``x`` what the pruned blocks ``first .. last-1`` add: one matrix times one vector."""
-        if self._by_type:
-            x.view(-1).addmv_(self._latest.mT, self._tables.counts[first][last])
+        if self._counts is not None:
+            x.view(-1).addmv_(self._latest.mT, self._counts[first][last])
         else:
             x.view(-1).addmv_(self._latest[first:last].mT, self._ones[: last - first])
 

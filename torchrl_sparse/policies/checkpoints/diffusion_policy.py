@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.policies.checkpoints.files import take
 from torchrl_sparse.policies.checkpoints.inert_pickle import read_pickle
 from torchrl_sparse.policies.checkpoints.pretrained import StoredPolicy
 from torchrl_sparse.policies.checkpoints.published_config import KNOWN_NAMES, PublishedConfig
 from torchrl_sparse.policies.checkpoints.published_network import read_affine, read_network, read_sampler
 from torchrl_sparse.policies.checkpoints.published_vision import ImageLayout, read_vision
-from torchrl_sparse.policies.checkpoints.tensors import take
 from torchrl_sparse.policies.checkpoints.torch_archive import StoredTensor, TorchArchive
 
 __all__ = ["CheckpointError", "read_diffusion_policy"]

@@ -13,18 +13,21 @@ Network weights are fp16 unless full precision is asked for, normalisation const
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.files import atomic_path
-from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
+from torchrl_sparse.policies.checkpoints.files import (
+    check_tensors,
+    read_config,
+    read_tensors,
+    take,
+    write_config,
+    write_tensors,
+)
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
@@ -47,8 +50,8 @@ class StoredPolicy:
         vision: encoder of the cameras, f32, in evaluation mode.
         source: where an imported policy comes from and how to feed it; empty for policies trained here.
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
-            chunk, and ``"state_keys"``, robomimic's names of the observations that make up the state, in order;
-            None for what a checkpoint does not say.
+            chunk, ``"state_keys"``, robomimic's names of the observations that make up the state, in order, and
+            ``"cameras"``, name of the image here -> robomimic's; None for what a checkpoint does not say.
     """
 
     network: TransformerForDiffusion
@@ -69,10 +72,8 @@ def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> 
     tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
     if policy.source:
         config["source"] = policy.source
-    with atomic_path(path / "model.safetensors") as temporary:
-        save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, temporary)
-    with atomic_path(path / "config.json") as temporary:
-        temporary.write_text(json.dumps(config, indent=2) + "\n")
+    write_tensors(path / "model.safetensors", tensors)
+    write_config(path / "config.json", config)
 
 
 def read_pretrained(path: Path) -> StoredPolicy:
@@ -82,8 +83,8 @@ def read_pretrained(path: Path) -> StoredPolicy:
         FileNotFoundError: if a file is not there.
         ValueError: naming the file, what was expected and what came.
     """
-    config = _read_config(path / "config.json")
-    tensors = _read_tensors(path / "model.safetensors")
+    config = read_config(path / "config.json", FORMAT, _FIELDS, _OPTIONAL_FIELDS)
+    tensors = read_tensors(path / "model.safetensors")
     network = _make(path, TransformerForDiffusion, config, "network")
     schedule = _make(path, NoiseSchedule, config, "schedule")
     vision = _make(path, VisionEncoder, config, "vision") if "vision" in config else None
@@ -98,7 +99,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
         for name, size in (("state", state_dim), ("action", network.input_dim))
         for part in ("scale", "offset")
     }
-    _check_tensors(where, _NORMALIZER, normalizer_tensors, expected)
+    check_tensors(where, _NORMALIZER, normalizer_tensors, expected)
     if tensors:
         raise ValueError(f"{where}: expected tensors of the policy alone, got {sorted(tensors)}")
     return StoredPolicy(network, Normalizer(**normalizer_tensors), schedule, vision, config.get("source", {}))
@@ -107,7 +108,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
 def _load(where: Path, prefix: str, tensors: dict[str, Tensor], module: nn.Module) -> None:
     """Moves the tensors under ``prefix`` into ``module`` and puts it in evaluation mode."""
     found = take(tensors, prefix)
-    _check_tensors(where, prefix, found, {k: tuple(v.shape) for k, v in module.state_dict().items()})
+    check_tensors(where, prefix, found, {k: tuple(v.shape) for k, v in module.state_dict().items()})
     module.load_state_dict({name: value.float() for name, value in found.items()})
     module.eval()
 
@@ -117,33 +118,3 @@ def _make(path: Path, kind: type[T], config: dict[str, Any], field: str) -> T:
         return kind(**config[field])
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path / 'config.json'}: {field}: {error}") from error
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise FileNotFoundError(f"policy: expected a file {path}")
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a complete JSON file, got: {error}") from error
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        found = config.get("format") if isinstance(config, dict) else type(config).__name__
-        raise ValueError(f"{path}: format: expected {FORMAT!r}, got {found!r}")
-    if set(config) - _OPTIONAL_FIELDS != _FIELDS:
-        raise ValueError(f"{path}: expected the fields {sorted(_FIELDS)}, got {sorted(config)}")
-    return config
-
-
-def _read_tensors(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise FileNotFoundError(f"policy: expected a file {path}")
-    try:
-        return load_file(path)
-    except (SafetensorError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
-
-
-def _check_tensors(path: Path, prefix: str, found: dict[str, Tensor], expected: dict[str, tuple]) -> None:
-    where = f"{path}: {prefix}"
-    check_shapes(where, found, expected)
-    check_finite(where, found)

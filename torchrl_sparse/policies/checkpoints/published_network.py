@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchrl_sparse.policies.checkpoints.files import check_finite, check_shapes, take
 from torchrl_sparse.policies.checkpoints.published_config import PublishedConfig
-from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.checkpoints.torch_archive import StoredTensor, TorchArchive
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.policies.checkpoints.files import check_shapes, take
 from torchrl_sparse.policies.checkpoints.published_config import PublishedConfig
 from torchrl_sparse.policies.checkpoints.published_network import read_tensors
-from torchrl_sparse.policies.checkpoints.tensors import check_shapes, take
 from torchrl_sparse.policies.checkpoints.torch_archive import StoredTensor, TorchArchive
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 

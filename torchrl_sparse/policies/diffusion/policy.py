@@ -7,7 +7,6 @@ the `Dense` planner, so that every method is compared on one code path.
 from __future__ import annotations
 
 import hashlib
-import time
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,12 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.mask import query_flops
+from torchrl_sparse.blocks.mask import Reuse, query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.policies.checkpoints.diffusion_policy import read_diffusion_policy
 from torchrl_sparse.policies.checkpoints.pretrained import StoredPolicy, read_pretrained, write_pretrained
+from torchrl_sparse.policies.clock import synchronised_clock
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.noise import sample_noise
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -122,7 +122,9 @@ class DiffusionPolicy(TensorDictSequential):
 
     def _install(self, plan: Planner, schedule: NoiseSchedule) -> None:
         """Changes planner and sampler together, or, if the planner cannot serve that sampler, neither."""
-        plan.bind(PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint))
+        plan.bind(
+            PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint, schedule.kind)
+        )
         denoiser = self.module["denoise"]
         denoiser.schedule, denoiser.reuse = schedule, plan.reuse
         self.module["plan"] = plan
@@ -190,11 +192,17 @@ class DiffusionPolicy(TensorDictSequential):
         """All noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
         return sample_noise(seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
 
+    def denoise(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, *, reuse: Reuse = "block"
+    ) -> Tensor:
+        """Normalised actions f32 [B, H, A] in the chosen engine, see `torchrl_sparse.blocks.engine.Engine.denoise`."""
+        return self.module["denoise"].run(noise, cond, mask, reuse)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         device = next(self.network.parameters()).device
-        start = _synchronised_clock(device)
+        start = synchronised_clock(device)
         tensordict = super().forward(tensordict)
-        seconds = _synchronised_clock(device) - start
+        seconds = synchronised_clock(device) - start
         return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
 
     # -- files ---------------------------------------------------------------------------------------------------------
@@ -266,18 +274,13 @@ class ActionDenoiser(TensorDictModuleBase):
         mask = tensordict.get(keys.PRUNE_MASK).reshape(cond.shape[0], -1, self.network.num_blocks)
         shape = (self.network.horizon, self.network.input_dim)
         noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.schedule.num_inference_steps, shape)
-        actions = self._denoise(noise, cond, mask)
+        actions = self.run(noise, cond, mask, self.reuse)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         return tensordict.set(keys.FLOPS, query_flops(self.network, mask).reshape(*batch, 1))
 
-    def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor) -> Tensor:
+    def run(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
+        """Normalised actions [B, H, A], all that the network denoises."""
         if self.network.training or cond.requires_grad:
-            return denoise(self.network, self.schedule, noise, cond, mask, reuse=self.reuse)
-        return self.engine.get(self.network, self.schedule).denoise(noise, cond, mask, self.reuse)
-
-
-def _synchronised_clock(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
+            return denoise(self.network, self.schedule, noise, cond, mask, reuse=reuse)
+        return self.engine.get(self.network, self.schedule).denoise(noise, cond, mask, reuse)

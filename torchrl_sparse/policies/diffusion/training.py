@@ -28,7 +28,7 @@ from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
-__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
+__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "read_checkpoint", "step_seed"]
 
 _VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
 
@@ -186,12 +186,10 @@ class PolicyTrainer:
             ValueError: if it is no checkpoint of this class, or was made with another network, data set or
                 configuration.
         """
-        state = _read_checkpoint(path)
-        for name, expected in self._state_header().items():
-            if state.get(name) != expected:
-                raise ValueError(
-                    f"{path}: made with another {name}: {_difference(expected, state.get(name))}"
-                )
+        header, fields = self._state_header(), {"step", "network", "ema", "optimizer"}
+        if self.vision is not None:
+            fields.add("vision")
+        state = read_checkpoint(path, {*header, *fields}, header)
         self.network.load_state_dict(state["network"])
         if self.vision is not None:
             self.vision.load_state_dict(state["vision"])
@@ -274,7 +272,18 @@ def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Te
     return index
 
 
-def _read_checkpoint(path: str | Path) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
+    """What a trainer saved. Nothing in the file is executed.
+
+    Args:
+        path: the file.
+        fields: names of everything that it must hold.
+        header: those that must be equal, since a training can only go on as it was begun.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming the file, what was expected and what came.
+    """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -284,10 +293,12 @@ def _read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
         ) from error
-    expected = {"config", "network_config", "data", "step", "network", "ema", "optimizer"}
-    if not isinstance(state, dict) or set(state) - {"vision", "vision_config"} != expected:
+    if not isinstance(state, dict) or set(state) != fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(expected)}, got {found}")
+        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
+    for name, expected in header.items():
+        if state[name] != expected:
+            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
     return state
 
 
@@ -296,7 +307,6 @@ def _checksum(value: Tensor) -> float:
     return float(value.double().sum() if value.is_floating_point() else value.sum(dtype=torch.int64))
 
 
-def _difference(expected: dict, found: dict | None) -> str:
-    found = found or {}
+def _difference(expected: dict, found: dict) -> str:
     names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
     return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)

@@ -1,0 +1,155 @@
+"""Trains SAG's pruner, or L2C's static gates, for a trained policy.
+
+    python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
+
+Stop it at any moment; the same command goes on, equal to the last bit. ``out/pruner`` is for
+`SAGPruner.from_pretrained`, ``out/l2c.json`` for `StaticSchedule`; ``out/curves.png`` shows how it went.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from safetensors import safe_open
+from safetensors.torch import save_file
+from tensordict import TensorDict
+from torchrl.record.loggers import Logger, get_logger
+from tqdm import tqdm
+
+from torchrl_sparse.blocks.l2c import StaticGates
+from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, make_reference
+from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.files import atomic_path
+from torchrl_sparse.interrupt import StopSignal
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+
+
+@hydra.main(version_base=None, config_path=".", config_name="train_pruner")
+def main(config: DictConfig) -> None:
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    policy = DiffusionPolicy.from_pretrained(config.policy)
+    if config.sampler is not None:
+        policy.schedule = NoiseSchedule(**config.sampler)
+    out = Path(config.out)
+    trainer = make_trainer(policy, reference_set(policy, config), config)
+    if (out / "checkpoint.pt").exists():
+        trainer.load(out / "checkpoint.pt")
+        print(f"{out / 'checkpoint.pt'}: going on from update {trainer.step}")
+    stop = StopSignal()
+    train(trainer, config, stop)
+    how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
+    print(f"{save(trainer, config)}: update {trainer.step} of {trainer.total}, {how}; {trainer.validate()}")
+
+
+def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
+    """The reference set, from ``out/reference.safetensors`` if it was made before."""
+    path = Path(config.out) / "reference.safetensors"
+    made_for = {
+        "policy": policy.fingerprint,
+        **policy.schedule.config,
+        "demos": config.demos,
+        **config.reference,
+    }
+    if path.exists():
+        return read_reference(path, made_for)
+    demos = read_demos(config.demos, get_task(config.task).state_keys)
+    with tqdm(unit="window", desc="dense answers") as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        reference = make_reference(policy, demos, **config.reference, on_progress=show)
+    with atomic_path(path) as temporary:
+        save_file(dict(reference.flatten_keys("/").items()), temporary, {"made_for": json.dumps(made_for)})
+    return reference
+
+
+def read_reference(path: Path, made_for: dict) -> TensorDict:
+    with safe_open(path, "pt") as file:
+        found = json.loads(file.metadata()["made_for"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
+    if found != made_for:
+        raise ValueError(
+            f"{path}: expected a reference set for {made_for}, got one for {found}; remove it or change out"
+        )
+    return TensorDict(tensors, batch_size=[len(tensors["target"])]).unflatten_keys("/")
+
+
+def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictConfig) -> PrunerTrainer:
+    options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
+    torch.manual_seed(options.seed)
+    if config.method == "sag":
+        gates = PrunerNetwork(
+            policy.schedule.timesteps.tolist(),
+            policy.num_blocks,
+            (policy.n_obs_steps, policy.network.cond_dim),
+            rate_input=options.rate_range is not None,
+            **config.network,
+        )
+    elif config.method == "l2c":
+        gates = StaticGates(policy.num_inference_steps, policy.num_blocks)
+    else:
+        raise ValueError(f"method: expected 'sag' or 'l2c', got {config.method!r}")
+    return PrunerTrainer(gates, policy, reference, options)
+
+
+def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
+    """Updates until the end or a signal, logging and saving on the way."""
+    logger = make_logger(config)
+    with tqdm(total=trainer.total, initial=trainer.step, unit="update", mininterval=2) as bar:
+        while trainer.step < trainer.total and stop.name is None:
+            metrics = trainer.train_step()
+            bar.update()
+            if trainer.step % config.log_every == 0:
+                bar.set_postfix(fidelity=f"{metrics['fidelity']:.4f}", rate=f"{metrics['rate']:.3f}")
+                logger.log_metrics({f"train/{name}": v for name, v in metrics.items()}, step=trainer.step)
+            if trainer.step % config.checkpoint_every == 0:
+                save(trainer, config)
+                held_out = trainer.validate()
+                logger.log_metrics({f"held_out/{name}": v for name, v in held_out.items()}, step=trainer.step)
+
+
+def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
+    """Writes the checkpoint and the pruner or schedule as it is now; returns where that is."""
+    out, policy = Path(config.out), trainer.policy
+    trainer.save(out / "checkpoint.pt")
+    settings = {**asdict(trainer.config), "reference": dict(config.reference), "updates": trainer.step}
+    if config.method == "l2c":
+        path = out / "l2c.json"
+        made_for = {"policy": policy.fingerprint, "sampler": policy.schedule.kind}
+        schedule = trainer.gates.schedule(**made_for, reuse=trainer.config.reuse, settings=settings)
+        schedule.save(path)
+        return path
+    info = PrunerInfo(
+        policy=policy.fingerprint,
+        sampler=policy.schedule.kind,
+        rate=trainer.config.rate,
+        rate_range=trainer.config.rate_range,
+        reuse=trainer.config.reuse,
+        settings=settings,
+    )
+    SAGPruner(trainer.gates, info).save_pretrained(out / "pruner")
+    return out / "pruner"
+
+
+def make_logger(config: DictConfig) -> Logger:
+    wandb = {
+        "project": "torchrl_sparse",
+        "mode": config.wandb_mode,
+        "config": OmegaConf.to_container(config, resolve=True),
+    }
+    return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""The design's collector line with a vision-language-action model and SpecPrune, on robosuite with two cameras."""
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType
+
+from tests.tokens.helpers import LAYERS, PER_CAMERA, SIZE
+from torchrl_sparse import ActionAwareController, ChunkExecutor, keys, make_env
+from torchrl_sparse.control.action_aware import Thresholds
+from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.specprune import SpecPrune
+
+HORIZON, FRAMES, N_ACTION_STEPS, WARMUP = 8, 10, 4, 6
+ANY_MOTION = Thresholds(9.0, 99.0, leave_translation=9.0, leave_rotation=99.0, leave_rise=9.0)
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make_env(
+        "Lift",
+        seeds=[0],
+        horizon=HORIZON,
+        action_mode="delta",
+        camera="agentview",
+        wrist_camera="robot0_eye_in_hand",
+        image_size=SIZE,
+        instruction=True,
+    )
+    try:
+        env.reset()
+    except RuntimeError as error:  # no GL library
+        pytest.skip(str(error))
+    return env
+
+
+def make_actor():
+    torch.manual_seed(0)
+    sizes = {"state_dim": 19, "chunk_size": N_ACTION_STEPS, "llm": TransformerSize(32, LAYERS, 2, 64)}
+    policy = VLAPolicy(VLANetwork(VLAConfig.tiny(image_size=SIZE, **sizes)))
+    policy.network.head.fc2.bias.data[2] = -2.0  # downwards
+    policy.pruner = SpecPrune(alpha=0.1, dynamic=False)
+    gate = ActionAwareController(thresholds=ANY_MOTION, warmup_steps=WARMUP)
+    return ChunkExecutor(policy, n_action_steps=N_ACTION_STEPS, gate=gate)
+
+
+def test_tokens_are_pruned_by_history_and_speed(env):
+    actor = make_actor()
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=FRAMES,
+        total_frames=FRAMES,
+        auto_register_policy_transforms=True,
+        exploration_type=ExplorationType.RANDOM,
+    )
+    steps = next(iter(collector)).clone()
+    collector.shutdown()
+    assert not set(actor.out_keys) - set(steps.keys(True, True))
+    check_episode(steps[:HORIZON])
+    assert steps[keys.KEPT][HORIZON] == 2 * PER_CAMERA  # the next episode knows nothing either
+
+
+def check_episode(steps):
+    """Queries at 0 and 4, and at 6, where fine mode begins, in mid-chunk."""
+    queries = steps[keys.QUERIED].squeeze(-1).nonzero().squeeze(-1).tolist()
+    assert queries == [0, 4, 6]
+    kept = steps[keys.KEPT].squeeze(-1)[queries]
+    assert kept[0] == 2 * PER_CAMERA  # nothing is known yet
+    assert (kept[1:] < 2 * PER_CAMERA).all()
+    # Carried, changed, and those of two layers: four sets of 2 tokens of each camera, or of 4, which overlap.
+    deepest = (steps[keys.TOKEN_DEPTH] == LAYERS).unflatten(-1, (2, -1)).sum(-1)[queries]
+    coarse, fine = deepest[1], deepest[2]
+    assert ((coarse >= 2) & (coarse <= 4 * 2)).all()
+    assert ((fine >= 4) & (fine <= 4 * 4)).all()
+    for step in range(len(steps)):
+        last = max(query for query in queries if query <= step)
+        for camera, key in enumerate((keys.IMAGE, keys.WRIST_IMAGE)):
+            assert torch.equal(steps[keys.TOKEN_FRAMES][step, camera], steps[key][last])

@@ -1,0 +1,68 @@
+"""Which patches changed, and what the comparison remembers."""
+
+import pytest
+import torch
+from torch.nn import functional
+
+from tests.tokens.helpers import SPEC, later, patch, query
+from torchrl_sparse import keys
+from torchrl_sparse.tokens.frames import compare_frames, patches, similarity
+
+
+def test_patches_are_cut_row_by_row_and_camera_by_camera():
+    frames = torch.stack([query()[camera] for camera in SPEC.cameras], 1)
+    cut = patches(frames, SPEC.grid)
+    assert cut.shape == (3, SPEC.num_visual, 3 * 14 * 14)
+    for camera in range(2):
+        for index in range(SPEC.per_camera):
+            expected = frames[:, camera][patch(camera, index)].flatten(1).double()
+            assert torch.equal(
+                cut[:, camera * SPEC.per_camera + index].sort(-1).values, expected.sort(-1).values
+            )
+
+
+def test_frames_that_patches_do_not_divide_are_named():
+    with pytest.raises(ValueError, match="a size that 4 x 4 patches divide, got 30 x 56"):
+        patches(torch.zeros(1, 2, 3, 30, 56, dtype=torch.uint8), (4, 4))
+
+
+def test_similarity_is_the_cosine():
+    previous, current = torch.rand(2, 50, 9, generator=torch.Generator().manual_seed(0)).double().unbind()
+    expected = functional.cosine_similarity(previous, current, dim=-1).float()
+    torch.testing.assert_close(similarity(previous, current), expected)
+    assert (similarity(previous, previous) > 1 - 1e-6).all()
+
+
+def test_black_patches_are_alike_and_unlike_all_others():
+    black, white = torch.zeros(1, 9), torch.full((1, 9), 255.0)
+    assert similarity(black, black).item() == 1
+    assert similarity(black, white).item() == similarity(white, black).item() == 0
+
+
+def test_only_what_changed_is_unlike():
+    td = query()
+    compare_frames(td, SPEC)
+    changed = [(0, 3), (0, 15), (1, 0), (1, 7)]
+    alike, first = compare_frames(later(td, changed), SPEC)
+    assert not first.any()
+    assert (alike < 0.99).nonzero()[:, 1].reshape(3, -1).tolist() == [[3, 15, 16, 23]] * 3
+
+
+def test_first_queries_are_told_apart_and_the_images_are_remembered():
+    td = query()
+    _, first = compare_frames(td, SPEC)
+    assert first.all()
+    assert torch.equal(td[keys.TOKEN_FRAMES][:, 1], td[keys.WRIST_IMAGE])
+    following = later(td)
+    following[keys.IS_INIT] = torch.tensor([[False], [True], [False]])
+    _, first = compare_frames(following, SPEC)
+    assert first.flatten().tolist() == [False, True, False]
+    assert torch.equal(following[keys.TOKEN_FRAMES][:, 0], following[keys.IMAGE])
+
+
+def test_without_a_history_there_is_nothing_to_compare_with():
+    td = query()
+    td[keys.IS_INIT] = torch.zeros(3, 1, dtype=torch.bool)  # a loop that starts in mid-episode
+    assert compare_frames(td, SPEC)[1].all()
+    with pytest.raises(KeyError, match="is_init"):
+        compare_frames(query().exclude(keys.IS_INIT), SPEC)

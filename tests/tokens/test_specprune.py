@@ -1,0 +1,284 @@
+"""SpecPrune's equations on examples worked out by hand, and its two stages on a small model."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Watch, later, make_policy, query
+from torchrl_sparse import keys
+from torchrl_sparse.policies.vla import decoder
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.decoder import pack
+from torchrl_sparse.policies.vla.flops import query_flops
+from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, VisualSpec
+from torchrl_sparse.tokens.specprune import (
+    SpecPrune,
+    confidence,
+    dynamic_set,
+    layer_score,
+    layer_set,
+    local_set,
+    rank_weight,
+    retain_set,
+    score,
+    updated_score,
+)
+
+ALIVE = torch.tensor([[True, True, False, True]])
+
+
+def ids(mask):
+    return mask[0].nonzero().flatten().tolist()
+
+
+def test_eq_1_is_the_mean_over_heads_and_words():
+    attention = torch.tensor(
+        [[[[0.1, 0.2], [0.3, 0.0]], [[0.5, 0.0], [0.1, 0.2]]]]
+    )  # 2 heads, 2 words, 2 tokens
+    torch.testing.assert_close(score(attention), torch.tensor([[0.25, 0.1]]))
+
+
+def test_eq_1_is_what_the_decoder_gives():
+    """The decoder's scores against the whole softmax of its own queries and keys."""
+    caught = []
+    watch = Watch(SpecPrune(budget=4))
+    inner, run_layer = watch.inner, decoder._run_layer
+
+    def spy(*args):
+        hidden, query_, key = run_layer(*args)
+        caught.append((query_, key))
+        return hidden, query_, key
+
+    def after_layer(index, state):
+        if index == 0:
+            query_, key = caught[0]
+            logits = query_ @ key.transpose(-1, -2) / math.sqrt(query_.shape[-1])
+            weights = logits.masked_fill(~state.alive[:, None, None], -torch.inf).softmax(-1)
+            for row in range(len(weights)):
+                words = state.task[row] & state.alive[row]
+                expected = score(weights[row][:, words][:, :, 1 : CONFIG.num_visual + 1])
+                torch.testing.assert_close(state.scores[row], expected)
+        return inner.after_layer(index, state)
+
+    watch.after_layer = after_layer
+    policy = make_policy(watch)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(decoder, "_run_layer", spy)
+        policy(query())
+    assert len(caught) == LAYERS
+
+
+def test_eqs_3_to_6_choose_within_cameras_and_unite():
+    counts = [torch.tensor([[1]]), torch.tensor([[2]])]
+    alike = torch.tensor([[0.99, 0.2, 0.5, 0.1, 1.0, 1.0, 0.9, 1.0]])
+    assert ids(dynamic_set(alike, counts, threshold=0.95)) == [
+        3,
+        6,
+    ]  # one candidate only in the second camera
+    attended = torch.tensor([[0.1, 0.9, 0.2, 0.3, 0.0, 0.4, 0.5, 0.6]])
+    alive = torch.tensor([[True, False, True, True] + [True] * 4])
+    first = layer_set(attended, counts, alive)
+    assert ids(first) == [3, 6, 7]
+    second = layer_set(-attended, counts, alive)
+    assert ids(second) == [0, 4, 5]
+    assert ids(local_set(first, second)) == [0, 3, 4, 5, 6, 7]
+    carried = torch.zeros(1, 8).bool().index_fill(1, torch.tensor([2]), True)
+    assert ids(retain_set(carried, first, second)) == [0, 2, 3, 4, 5, 6, 7]
+
+
+def test_eq_8_falls_with_rank_and_sums_to_one():
+    weight = rank_weight(torch.tensor([[1, 0, 3, 2]]), ALIVE, steepness=0.5)
+    sigmoid = [1 / (1 + math.exp(0.5 * rank)) for rank in (1, 0, 2)]
+    expected = [value / sum(sigmoid) for value in sigmoid]
+    torch.testing.assert_close(weight, torch.tensor([[expected[0], expected[1], 0.0, expected[2]]]))
+
+
+def test_eq_9_is_mean_over_deviation_of_the_living():
+    scores = torch.tensor([[1.0, 2.0, 77.0, 3.0]])
+    expected = 2.0 / (math.sqrt(2 / 3) + 1e-6)
+    assert confidence(scores, ALIVE).item() == pytest.approx(expected)
+    flat, peaked = torch.tensor([[1.0, 1.1, 0.0, 1.0]]), torch.tensor([[0.1, 3.0, 0.0, 0.0]])
+    assert confidence(flat, ALIVE) > confidence(peaked, ALIVE)
+
+
+def test_eqs_7_and_10_multiply_and_average():
+    now = layer_score(torch.tensor([[0.25, 0.75]]), torch.tensor([[2.0]]))
+    assert now.tolist() == [[0.5, 1.5]]
+    torch.testing.assert_close(
+        updated_score(torch.tensor([[1.0, 0.0]]), now, 0.2), torch.tensor([[0.9, 0.3]])
+    )
+
+
+# -- the method ------------------------------------------------------------------------------------------------------
+
+
+def lengths(pruner, td):
+    """Visual tokens that each layer worked on, [L][B]."""
+    watch = Watch(pruner)
+    make_policy(watch)(td)
+    visual = [
+        ((kind == TokenKind.PRIMARY) | (kind == TokenKind.WRIST)) & alive for _, kind, alive in watch.seen
+    ]
+    return [mask.sum(1).tolist() for mask in visual]
+
+
+def second_query(pruner, changed=(), **kwargs):
+    return later(make_policy(pruner)(query(**kwargs)), changed=list(changed))
+
+
+def test_static_pruning_alone_keeps_the_union_after_two_layers():
+    def pruner():
+        return SpecPrune(budget=2, dynamic=False)
+
+    policy = make_policy(pruner())
+    policy_dense = make_policy(SpecPrune(budget=PER_CAMERA, dynamic=False))  # keeps all, scores all
+    td = later(policy(query(1)), changed=[(0, 5), (1, 1)])
+    carried = td[keys.TOKEN_SCORE]
+    scores = []
+    watch = Watch(policy_dense.pruner)
+    watch.after_layer = lambda index, state: scores.append(state.scores)
+    policy_dense.pruner = watch
+    policy_dense(td.clone())
+    expected = {5, PER_CAMERA + 1}
+    for values in (carried, scores[0], scores[1]):
+        for camera in range(2):
+            part = values[0, camera * PER_CAMERA : (camera + 1) * PER_CAMERA]
+            expected |= {camera * PER_CAMERA + i for i in part.topk(2).indices.tolist()}
+    depth = policy(td)[keys.TOKEN_DEPTH][0]
+    assert set((depth == LAYERS).nonzero().flatten().tolist()) == expected
+    assert set(depth.tolist()) == {2, LAYERS}
+
+
+def test_first_query_of_an_episode_keeps_all_until_the_dynamic_layers():
+    assert lengths(SpecPrune(budget=2, dynamic=False), query(1)) == [[2 * PER_CAMERA]] * LAYERS
+
+
+def test_dynamic_layers_keep_their_share_of_what_is_left():
+    pruner = SpecPrune(budget=2, keep_share=0.5)
+    pruner.bind(SPEC)
+    assert sorted(pruner.layers_scored(LAYERS)) == [0, 1, 2, 3, 4]
+    assert lengths(pruner, query(1)) == [[32], [32], [32], [16], [8], [4]]  # layers 2, 3 and 4 prune
+
+
+def test_carried_scores_are_zero_where_tokens_were_gone():
+    policy = make_policy(SpecPrune(budget=2, keep_share=0.5))
+    td = policy(query())
+    gone = td[keys.TOKEN_DEPTH] < 4  # before the first layer whose scores are carried
+    assert gone.any()
+    assert (td[keys.TOKEN_SCORE][gone] == 0).all()
+    assert (td[keys.TOKEN_SCORE][~gone] > 0).all()
+
+
+def walk(pruner, spec, td, scores):
+    """Visual tokens [num_layers] that each layer of a decoder would see, for given scores of Eq. 1, without a network."""
+    kinds = [TokenKind.BOS, *[TokenKind.PRIMARY] * 256, *[TokenKind.WRIST] * 256, TokenKind.PROPRIO]
+    kinds = torch.tensor([kinds + [TokenKind.TEXT] * 34 + [TokenKind.ACTION] * 56 + [TokenKind.STOP]])
+    positions = torch.arange(kinds.shape[1])[None]
+    alive = torch.ones_like(kinds, dtype=torch.bool)
+    hidden = positions[..., None].float()
+    state = LayerState(0, hidden, alive, positions, kinds, kinds == TokenKind.TEXT, spec.num_visual, td)
+    pruner.begin(td)
+    seen = []
+    for layer in range(spec.num_layers):
+        seen.append(int(state.is_visual.sum()))
+        scored = layer in pruner.layers_scored(spec.num_layers)
+        state = replace(state, layer=layer, scores=scores[layer] * state.visual_alive if scored else None)
+        keep = pruner.after_layer(layer, state)
+        if keep is not None:
+            state, _ = pack(state, state.alive & keep)
+        assert torch.equal(state.hidden[..., 0].long(), state.positions)
+    pruner.end(td)
+    return seen
+
+
+def test_published_counts():
+    """Four disjoint sets of 24 in each camera: what was carried, what changed, and the picks of the first two layers."""
+    config = VLAConfig()
+    spec, pruner = config.visual_spec, SpecPrune()
+    pruner.bind(spec)
+    black = torch.zeros(1, 2, 3, 224, 224, dtype=torch.uint8)
+    frames, carried, scores = black + 9, torch.zeros(1, 512), torch.full((32, 1, 512), 0.5)
+    rows = slice(14, 28)  # patches 16 to 31, and eight of the next row
+    frames[..., rows, :], frames[..., 28:42, : 8 * 14] = black[..., rows, :], black[..., 28:42, : 8 * 14]
+    for camera in (0, 256):
+        carried[:, camera + 48 : camera + 72] = 1.0
+        scores[0, :, camera + 80 : camera + 104] = 1.0
+        scores[1, :, camera + 112 : camera + 136] = 1.0
+    td = TensorDict({keys.IS_INIT: torch.zeros(1, 1, dtype=torch.bool), keys.TOKEN_SCORE: carried}, [1])
+    td[keys.TOKEN_FRAMES] = black + 9
+    td[keys.IMAGE], td[keys.WRIST_IMAGE] = frames[:, 0], frames[:, 1]
+    seen = walk(pruner, spec, td, scores)
+    expected = [512] * 2 + [192] * 4 + [154] * 5 + [124] * 5 + [100] * 5 + [80] * 11
+    assert seen == expected
+    dense = torch.full((1, 32), 605)
+    sparse = dense - 512 + torch.tensor([seen])
+    none = torch.zeros(1, dtype=torch.int64)
+    ratio = query_flops(config, sparse, none) / query_flops(config, dense, none)
+    assert ratio.item() == pytest.approx(0.44, abs=0.005)
+
+
+def test_published_depth_prunes_where_the_paper_does():
+    pruner = SpecPrune()
+    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    assert sorted(pruner.layers_scored(32)) == [0, 1, 5, 10, 15, 20]
+    release = SpecPrune("release", dynamic=True)
+    release.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    assert sorted(release.layers_scored(32)) == [0, 1, 5, 10, 15, 20, 25]
+
+
+@pytest.mark.parametrize(("budget", "expected"), [(20, [16, 12]), (32, [25, 19])])
+def test_release_counts(budget, expected):
+    """int(20 r), int(15 r) coarse and int(40 r^2), int(30 r^2) fine at r = 0.8."""
+    pruner = SpecPrune("release")
+    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    td = query(1).set(keys.TOKEN_BUDGET, torch.tensor([[float(budget)]]))
+    assert [count.item() for count in pruner._counts(td)] == expected
+
+
+def test_release_keeps_whatever_is_not_static_and_prunes_twice():
+    pruner = SpecPrune("release", alpha=1.0, budget=1, early=2.0, static_share=(1.0, 0.5))
+    changed = [(0, i) for i in range(4)]
+    td = second_query(pruner, changed, batch=1)
+    sizes = [row[0] for row in lengths(pruner, td.clone())]
+    assert sizes[0] == 2 * PER_CAMERA
+    assert sizes[0] > sizes[1] >= sizes[2] >= len(changed)
+    td[keys.FINE] = torch.ones(1, 1, dtype=torch.bool)  # half of each camera may be static then
+    assert [row[0] for row in lengths(pruner, td)][-1] >= PER_CAMERA
+
+
+def test_budget_is_per_sample():
+    td = second_query(SpecPrune(budget=2, dynamic=False))
+    td[keys.TOKEN_BUDGET] = torch.tensor([[1.0], [4.0], [16.0]])
+    few, more, all_of_them = make_policy(SpecPrune(dynamic=False, budget=2))(td)[keys.KEPT].flatten().tolist()
+    assert few < more < all_of_them == CONFIG.num_visual
+
+
+def test_alpha_multiplies_the_budget():
+    td = second_query(SpecPrune(budget=2))
+    halved = make_policy(SpecPrune(budget=8, alpha=0.5))(td.clone())
+    assert torch.equal(
+        make_policy(SpecPrune(budget=4))(td.clone())[keys.TOKEN_DEPTH], halved[keys.TOKEN_DEPTH]
+    )
+
+
+def test_mistakes_are_named():
+    with pytest.raises(
+        ValueError, match=r"alpha \* budget: .* at most the model's 16 tokens per camera, got 24"
+    ):
+        make_policy(SpecPrune())
+    policy = make_policy(SpecPrune(budget=4))
+    with pytest.raises(
+        ValueError, match=r"alpha \* budget: .* at most the model's 16 tokens per camera, got 17"
+    ):
+        policy(query().set(keys.TOKEN_BUDGET, torch.tensor([[4.0], [17.0], [4.0]])))
+    with pytest.raises(ValueError, match="preset: expected 'paper' or 'release', got 'both'"):
+        SpecPrune("both")
+    with pytest.raises(ValueError, match="keep_share: expected more than 0 and at most 1, got 0"):
+        SpecPrune(keep_share=0)
+    with pytest.raises(ValueError, match="expected more than 2 layers, got 2"):
+        SpecPrune().bind(VisualSpec(2, SPEC.cameras, (16, 16), 224))
+    with pytest.raises(TypeError, match="beta_"):
+        SpecPrune(beta_=0.1)

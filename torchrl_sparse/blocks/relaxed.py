@@ -1,0 +1,206 @@
+"""Denoising under gates that gradients flow to: what trains the methods that learn where to prune.
+
+Its values are those of :func:`torchrl_sparse.blocks.engine.reference.denoise` under the hard mask. Its
+gradients are those of the mixture of SAG (arXiv:2601.12894), with the gate ``M`` a real number::
+
+    out_b = (1 - M) d_b + M tau      tau <- out_b      x <- x + out_b
+
+so that a gate is told how the final actions would change if its block were computed or reused, also through
+what later blocks then reuse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from torchrl_sparse.blocks.engine.reference import ComputedRows, check_query
+from torchrl_sparse.blocks.mask import Reuse, num_buffers
+
+if TYPE_CHECKING:
+    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
+
+
+def straight_through_gate(logits: Tensor) -> Tensor:
+    """Hard gates with the gradient of ``sigmoid(logits)`` (straight-through estimator, arXiv:1308.3432).
+
+    Args:
+        logits: f32 [*B, K, 3L], positive where pruning is preferred.
+
+    Returns:
+        f32 of the same shape, exactly 0 or 1 (1 = pruned); row 0 is 0 and has no gradient.
+
+    >>> straight_through_gate(torch.tensor([[3.0, -3.0], [3.0, -3.0]]))
+    tensor([[0., 0.],
+            [1., 0.]])
+    """
+    probability = logits.sigmoid()
+    # The bracket is exactly zero, so that the sum is exactly the hard value.
+    return _spare_first((logits > 0).to(logits.dtype) + (probability - probability.detach()))
+
+
+def gumbel_gate(logits: Tensor, temperature: float) -> Tensor:
+    """Hard gates drawn with probability ``sigmoid(logits)``, straight-through Gumbel-softmax (arXiv:1611.01144).
+
+    Args:
+        logits: f32 [*B, K, 3L].
+        temperature: of the relaxation that the gradient is taken of, > 0.
+    """
+    uniform = torch.rand_like(logits).clamp(1e-6, 1 - 1e-6)
+    return straight_through_gate((logits + uniform.logit()) / temperature)  # the difference of two Gumbels
+
+
+def _spare_first(gate: Tensor) -> Tensor:
+    return torch.cat([torch.zeros_like(gate[..., :1, :]), gate[..., 1:, :]], dim=-2)
+
+
+def denoise_relaxed(
+    network: TransformerForDiffusion,
+    schedule: NoiseSchedule,
+    noise: Tensor,
+    cond: Tensor,
+    gate: Tensor,
+    *,
+    reuse: Reuse = "type",
+    explore: float = 1.0,
+    checkpointed: bool = False,
+) -> Tensor:
+    """Normalised actions [B, H, A], differentiable with respect to the gates.
+
+    Args:
+        network, schedule, noise, cond, reuse: as in :func:`~torchrl_sparse.blocks.engine.reference.denoise`.
+        gate: f32 [B, K, 3L] of 0 and 1 (1 = pruned), row 0 all 0, as the functions above make them.
+        explore: probability in (0, 1] with which a pruned block is evaluated all the same, to learn what
+            computing it would change; drawn for the whole batch from torch's global generator. The gradient
+            of those that are drawn is divided by it, so that its expectation stays that of evaluating all.
+        checkpointed: recompute each denoising step in the backward pass instead of keeping its activations:
+            the memory of one step instead of K, for about a third more time.
+
+    Raises:
+        ValueError: as ``denoise`` does.
+    """
+    chain = _chain(
+        network, schedule, noise, cond, gate, reuse=reuse, explore=explore, checkpointed=checkpointed
+    )
+    *_, (_, actions) = chain
+    return actions
+
+
+def step_errors(
+    network: TransformerForDiffusion,
+    schedule: NoiseSchedule,
+    noise: Tensor,
+    cond: Tensor,
+    gate: Tensor,
+    *,
+    reuse: Reuse = "type",
+    explore: float = 1.0,
+) -> Tensor:
+    """What each denoising step alone does wrong: the chain with its gradients cut between the steps.
+
+    Every step starts from the sample and the buffers that the pruned chain reached, detached, and its result
+    is compared with a dense step from the same sample. A backward pass then holds one step, but a gate no
+    longer learns what its buffer is worth to later steps, nor how much of an early error the rest of the chain
+    repairs.
+
+    Returns:
+        f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
+    """
+    chain = _chain(network, schedule, noise, cond, gate, reuse=reuse, explore=explore, cut=True)
+    errors = []
+    for k, (before, after) in enumerate(chain):
+        if k == 0:  # dense by definition
+            continue
+        with torch.no_grad():
+            eps = network(before, int(schedule.timesteps[k]), cond)
+            dense = schedule.step(eps, k, before, _transition_noise(noise, k))
+        errors.append((after - dense).abs())
+    return torch.stack(errors, dim=1)
+
+
+def _chain(
+    network,
+    schedule,
+    noise: Tensor,
+    cond: Tensor,
+    gate: Tensor,
+    *,
+    reuse: Reuse,
+    explore: float,
+    checkpointed: bool = False,
+    cut: bool = False,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The samples before and after each denoising step."""
+    pruned = gate.detach().bool()
+    check_query(network, schedule, noise, cond, pruned, reuse)
+    if not 0 < explore <= 1:
+        raise ValueError(f"explore: expected a probability in (0, 1], got {explore}")
+    explored = torch.rand(gate.shape[1:], device=gate.device) < explore
+    computed = ComputedRows(pruned & ~explored)
+    gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))
+    slots, buffers = num_buffers(reuse, network.num_blocks), ()
+    sample = noise[:, 0]
+    for k in range(schedule.num_inference_steps):
+        if cut:
+            sample, buffers = sample.detach(), tuple(buffer.detach() for buffer in buffers)
+        run = _Step(network, schedule, k, cond, _transition_noise(noise, k), computed, slots)
+        arguments = (sample, gate[:, k], *buffers)
+        after, *buffers = (
+            checkpoint(run, *arguments, use_reentrant=False) if checkpointed else run(*arguments)
+        )
+        yield sample, after
+        sample = after
+
+
+class _Step:
+    """One denoising step as a function of tensors, so that it can be run again in the backward pass."""
+
+    def __init__(
+        self,
+        network,
+        schedule,
+        k: int,
+        cond: Tensor,
+        noise: Tensor | None,
+        computed: ComputedRows,
+        slots: int,
+    ) -> None:
+        self._network, self._schedule, self._k = network, schedule, k
+        self._cond, self._noise = cond, noise
+        self._computed, self._slots = computed, slots
+
+    def __call__(self, sample: Tensor, gate: Tensor, *buffers: Tensor) -> tuple[Tensor, ...]:
+        """The next sample and the buffers after the step; ``gate`` is [B, 3L]."""
+        network, latest = self._network, list(buffers) or [None] * self._slots
+        memory = network.memory(int(self._schedule.timesteps[self._k]), self._cond)
+        x = network.embed(sample)
+        for block in range(network.num_blocks):
+            slot = block % self._slots
+            latest[slot] = output = self._output(block, x, memory, gate[:, block, None, None], latest[slot])
+            x = x + output
+        return self._schedule.step(network.head_out(x), self._k, sample, self._noise), *latest
+
+    def _output(self, block: int, x: Tensor, memory: Tensor, gate: Tensor, latest: Tensor | None) -> Tensor:
+        rows = self._computed.at(self._k, block)
+        if rows is False:
+            return latest
+        if rows is True:
+            fresh = self._network.block(block, x, memory)
+        else:
+            fresh = latest.index_copy(0, rows, self._network.block(block, x[rows], memory[rows]))
+        return fresh if latest is None else gate * latest + (1 - gate) * fresh
+
+
+def _scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
+    return value.detach() + factor * (value - value.detach())
+
+
+def _transition_noise(noise: Tensor, k: int) -> Tensor | None:
+    return noise[:, k + 1] if k + 1 < noise.shape[1] else None

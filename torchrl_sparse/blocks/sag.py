@@ -1,0 +1,327 @@
+"""Sparse ActionGen (SAG, arXiv:2601.12894): a pruner that looks at the observation, then decides what to skip.
+
+One small network reads the encoded observation and the coordinates of all K x 3L blocks, and predicts the whole
+mask of a query before its first denoising step (Section 3.2 of the paper)::
+
+    z = Encoder([sin(timestep k) ; sin(block b)])         one token per block of every step
+    I = MLP([W_o obs ; z])                                two logits per block: keep, prune
+    M = argmax I                                          the first step is always kept
+
+``z`` does not depend on the observation: in evaluation mode it is computed once and kept, already multiplied by
+its half of the first MLP layer, so that a query costs the rest of the MLP alone. Pruned blocks reuse the latest
+output of their type ("one-for-all"). The paper does not publish sizes; those here keep the pruner below 0.3 % of
+the dense FLOPs. :mod:`torchrl_sparse.blocks.pruner_training` trains it.
+
+Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
+query through ``("diffusion", "prune_rate")``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
+from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
+from torchrl_sparse.keys import COND, PRUNE_RATE
+from torchrl_sparse.policies.checkpoints.files import (
+    check_tensors,
+    read_config,
+    read_tensors,
+    write_config,
+    write_tensors,
+)
+from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
+
+__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner"]
+
+FORMAT = "torchrl_sparse.sag/1"
+_FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
+
+
+class PrunerNetwork(nn.Module):
+    """Logits of every block of every denoising step from an encoded observation.
+
+    Args:
+        timesteps: diffusion timesteps of the sampler in execution order, K of them.
+        num_blocks: blocks 3L of a denoising step.
+        cond_shape: (To, D) of the encoded observations.
+        width: of a coordinate's token z, a multiple of ``n_head`` and at least 4.
+        obs_width: of the observation's embedding.
+        hidden: of the MLP.
+        n_layer, n_head: of the transformer encoder over the coordinates.
+        rate_input: whether the target prune rate is an input.
+
+    Examples:
+        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
+        >>> network(torch.zeros(7, 2, 5)).shape
+        torch.Size([7, 4, 6, 2])
+    """
+
+    def __init__(
+        self,
+        timesteps: Sequence[int],
+        num_blocks: int,
+        cond_shape: tuple[int, int],
+        *,
+        width: int = 64,
+        obs_width: int = 64,
+        hidden: int = 64,
+        n_layer: int = 1,
+        n_head: int = 4,
+        rate_input: bool = False,
+    ) -> None:
+        super().__init__()
+        self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
+        self.rate_input = rate_input
+        self.config: dict[str, Any] = {
+            "timesteps": self.timesteps,
+            "num_blocks": num_blocks,
+            "cond_shape": list(cond_shape),
+            "width": width,
+            "obs_width": obs_width,
+            "hidden": hidden,
+            "n_layer": n_layer,
+            "n_head": n_head,
+            "rate_input": rate_input,
+        }
+        self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
+        self.token = nn.Linear(2 * width, width)
+        layer = nn.TransformerEncoderLayer(
+            width, n_head, 2 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
+        )
+        self.encoder = nn.TransformerEncoder(layer, n_layer, enable_nested_tensor=False)
+        self.obs = nn.Linear(cond_shape[0] * cond_shape[1] + rate_input, obs_width)
+        # The first layer of the MLP on [obs ; z], as its two halves.
+        self.fuse_obs = nn.Linear(obs_width, hidden)
+        self.fuse_z = nn.Linear(width, hidden, bias=False)
+        self.mlp = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2))
+        self._cells: Tensor | None = None
+
+    def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Logits (keep, prune) f32 [B, K, 3L, 2].
+
+        Args:
+            cond: encoded observations f32 [B, To, D].
+            rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
+        """
+        features = cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate], dim=-1)
+        fused = self.fuse_obs(self.obs(features))[:, None] + self.cells()
+        return self.mlp(fused).unflatten(1, (len(self.timesteps), self.num_blocks))
+
+    def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """f32 [B, K, 3L]: by how much pruning is preferred to keeping."""
+        keep, prune = self(cond, rate).unbind(-1)
+        return prune - keep
+
+    def cells(self) -> Tensor:
+        """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
+        if self.training or torch.is_grad_enabled():
+            return self._encode()
+        if self._cells is None:
+            self._cells = self._encode()
+        return self._cells
+
+    def train(self, mode: bool = True) -> PrunerNetwork:
+        """Training changes the weights that the kept ``z`` was made with."""
+        self._cells = None
+        return super().train(mode)
+
+    @property
+    def macs_per_query(self) -> int:
+        """Multiply-accumulates of one query in evaluation mode, where ``z`` is there already."""
+        hidden, obs = self.fuse_obs.out_features, self.obs
+        return (
+            obs.in_features * obs.out_features
+            + obs.out_features * hidden
+            + len(self.coordinates) * (hidden * hidden + 2 * hidden)
+        )
+
+    def _encode(self) -> Tensor:
+        return self.fuse_z(self.encoder(self.token(self.coordinates)[None])[0])
+
+    def _coordinates(self, code: SinusoidalPosEmb) -> Tensor:
+        """[K * 3L, 2 * width]: step and block codes, concatenated as in the paper, not added."""
+        steps = code(torch.tensor(self.timesteps)).repeat_interleave(self.num_blocks, dim=0)
+        return torch.cat([steps, code(torch.arange(self.num_blocks)).repeat(len(self.timesteps), 1)], dim=-1)
+
+
+@dataclass(frozen=True)
+class PrunerInfo:
+    """What a pruner was trained for.
+
+    Attributes:
+        policy: fingerprint of the policy.
+        sampler: kind of its denoising schedule, ``"ddpm"`` or ``"ddim"``.
+        rate: prune rate that it is asked for where the TensorDict says nothing, in (0, 1).
+        rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
+        reuse: what pruned blocks reuse.
+        settings: how it was trained, for people and reports.
+
+    Raises:
+        ValueError: if a field does not hold what is described here.
+    """
+
+    policy: str
+    sampler: str
+    rate: float
+    rate_range: tuple[float, float] | None = None
+    reuse: Reuse = "type"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate < 1:
+            raise ValueError(f"rate: expected a prune rate in (0, 1), got {self.rate}")
+        check_reuse(self.reuse)
+        if self.rate_range is not None:
+            low, high = self.rate_range
+            if not 0 < low <= self.rate <= high < 1:
+                raise ValueError(
+                    f"rate_range: expected 0 < low <= rate={self.rate} <= high < 1, got {low}, {high}"
+                )
+            object.__setattr__(self, "rate_range", (low, high))
+
+
+class SAGPruner(Planner):
+    """Predicts the mask of every query from its observation; serves only the policy that it was trained for.
+
+    Reads ``("diffusion", "cond")`` and, if the rate is an input, ``("diffusion", "prune_rate")`` f32 [*B, 1] where
+    it is there; ``rate`` stands in for it where it is not.
+
+    Args:
+        network: the trained network.
+        info: what it was trained for.
+
+    Attributes:
+        rate: prune rate of the queries that do not bring their own. Assign another within ``info.rate_range``.
+
+    Examples:
+        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
+        >>> pruner = SAGPruner(network, PrunerInfo(policy="a policy", sampler="ddim", rate=0.7))
+        >>> pruner.bind(PlanSpec(4, 2, "a policy", sampler="ddim"))
+        >>> pruner.masks(torch.zeros(3, 2, 5)).shape
+        torch.Size([3, 4, 6])
+    """
+
+    def __init__(self, network: PrunerNetwork, info: PrunerInfo) -> None:
+        super().__init__()
+        if network.rate_input != (info.rate_range is not None):
+            raise ValueError(
+                f"rate_range: expected one if and only if the network reads the rate, "
+                f"got {info.rate_range} and rate_input={network.rate_input}"
+            )
+        self.network, self.info, self.reuse = network.eval(), info, info.reuse
+        self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
+        self._rate = info.rate
+
+    @property
+    def rate(self) -> float:
+        return self._rate
+
+    @rate.setter
+    def rate(self, value: float) -> None:
+        self._check_rates(torch.tensor(value), "rate")
+        self._rate = value
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the weights and the rate."""
+        return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
+
+    def bind(self, spec: PlanSpec) -> None:
+        """See :meth:`Planner.bind`.
+
+        Raises:
+            ValueError: if the pruner was trained for another policy or another sampler.
+        """
+        trained_for = PlanSpec(
+            len(self.network.timesteps),
+            self.network.num_blocks // len(BLOCK_TYPES),
+            self.info.policy,
+            self.info.sampler,
+        )
+        for name, expected in asdict(trained_for).items():
+            if (asked := getattr(spec, name)) != expected:
+                label = "policy fingerprint" if name == "policy" else name
+                raise ValueError(f"SAG pruner: trained for {label} {expected!r}, got {asked!r}")
+        super().bind(spec)
+
+    def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
+        """The rate of every query, if it is an input.
+
+        Raises:
+            ValueError: if a rate is out of the range that the pruner was trained for.
+        """
+        if not self.network.rate_input:
+            return {}
+        rate = tensordict.get(PRUNE_RATE, None)
+        if rate is None:
+            return {"rate": torch.full((rows, 1), self.rate, device=tensordict.get(COND).device)}
+        self._check_rates(rate, PRUNE_RATE)
+        return {"rate": rate.reshape(rows, 1)}
+
+    @torch.no_grad()
+    def masks(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Masks bool [B, K, 3L].
+
+        Args:
+            cond: encoded observations f32 [B, To, D].
+            rate: prune rates f32 [B, 1], if they are an input.
+
+        Raises:
+            ValueError: if the observations do not have the shape that the pruner was trained on.
+        """
+        if tuple(cond.shape[1:]) != self.network.cond_shape:
+            raise ValueError(
+                f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
+                f"got {list(cond.shape)}"
+            )
+        masks = self.network.prune_logits(cond, rate) > 0
+        masks[:, 0] = False
+        return masks
+
+    def save_pretrained(self, path: str | os.PathLike) -> None:
+        """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""
+        path = Path(path)
+        write_tensors(path / "pruner.safetensors", self.network.state_dict())
+        write_config(
+            path / "config.json", {"format": FORMAT, **asdict(self.info), "network": self.network.config}
+        )
+
+    @classmethod
+    def from_pretrained(cls, path: str | os.PathLike) -> SAGPruner:
+        """Read what :meth:`save_pretrained` wrote. Nothing in the files is executed.
+
+        Raises:
+            FileNotFoundError: if a file is not there.
+            ValueError: naming the file, what was expected in it and what came.
+        """
+        path = Path(path)
+        config = read_config(path / "config.json", FORMAT, _FIELDS)
+        del config["format"]
+        try:
+            network = PrunerNetwork(**config.pop("network"))
+            info = PrunerInfo(**config)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path / 'config.json'}: {error}") from error
+        where, expected = path / "pruner.safetensors", network.state_dict()
+        tensors = read_tensors(where)
+        check_tensors(where, "", tensors, {name: tuple(value.shape) for name, value in expected.items()})
+        network.load_state_dict(tensors)
+        return cls(network, info)
+
+    def _check_rates(self, rates: Tensor, name: Any) -> None:
+        if self.info.rate_range is None:
+            raise ValueError(f"{name}: this pruner was trained for the rate {self.info.rate} alone")
+        low, high = self.info.rate_range
+        if not ((rates >= low) & (rates <= high)).all():
+            raise ValueError(
+                f"{name}: expected prune rates in [{low}, {high}], got {rates.min():.3g} to {rates.max():.3g}"
+            )

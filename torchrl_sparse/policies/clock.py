@@ -1,0 +1,19 @@
+"""A clock that waits for the device."""
+
+import time
+
+import torch
+
+__all__ = ["synchronised_clock"]
+
+
+def synchronised_clock(device: torch.device) -> float:
+    """Seconds of a monotonic clock, read when everything that was queued on ``device`` is done.
+
+    >>> start = synchronised_clock(torch.device("cpu"))
+    >>> synchronised_clock(torch.device("cpu")) >= start
+    True
+    """
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

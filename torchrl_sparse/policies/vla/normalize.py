@@ -1,0 +1,95 @@
+"""Quantile normalisation of states and actions, as OpenVLA-OFT (arXiv:2502.19645) does it for LIBERO."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["QuantileNormalizer"]
+
+_EPS = 1e-8
+
+
+class QuantileNormalizer(nn.Module):
+    """Maps the range between the 1 % and the 99 % quantile to [-1, 1], per dimension.
+
+    Both are clipped to [-1, 1]. Gripper dimensions have no range: the policy says how open the gripper shall be, from 0
+    (closed) to 1, the environment takes -1 (open) or 1 (close).
+
+    Args:
+        state_low, state_high: f32 [Ds], the quantiles.
+        action_low, action_high: f32 [A].
+        gripper: bool [A], which actions are grippers.
+
+    Raises:
+        ValueError: if shapes differ, a number is not finite, or a high quantile is below a low one.
+
+    Examples:
+        >>> low, high = torch.zeros(2), torch.tensor([4.0, 1.0])
+        >>> normalizer = QuantileNormalizer(low, high, low, high, torch.tensor([False, True]))
+        >>> normalizer.normalize_state(torch.tensor([3.0, 9.0])).tolist()
+        [0.5, 1.0]
+        >>> normalizer.unnormalize_action(torch.tensor([0.5, 0.9])).tolist()
+        [3.0, -1.0]
+    """
+
+    def __init__(
+        self, state_low: Tensor, state_high: Tensor, action_low: Tensor, action_high: Tensor, gripper: Tensor
+    ):
+        super().__init__()
+        _check_range("state", state_low, state_high)
+        _check_range("action", action_low, action_high)
+        if gripper.dtype != torch.bool or gripper.shape != action_low.shape:
+            raise ValueError(
+                f"gripper: expected bool {list(action_low.shape)}, got {gripper.dtype} {list(gripper.shape)}"
+            )
+        self.register_buffer("state_low", state_low.float().clone())
+        self.register_buffer("state_high", state_high.float().clone())
+        self.register_buffer("action_low", action_low.float().clone())
+        self.register_buffer("action_high", action_high.float().clone())
+        self.register_buffer("gripper", gripper)
+
+    @classmethod
+    def identity(cls, state_dim: int, action_dim: int) -> QuantileNormalizer:
+        """Leaves actions as they are, and states between -1 and 1."""
+        state, action = torch.ones(state_dim), torch.ones(action_dim)
+        return cls(-state, state, -action, action, torch.zeros(action_dim, dtype=torch.bool))
+
+    @classmethod
+    def fit(cls, state: Tensor, action: Tensor, *, gripper: Sequence[int] = (6,)) -> QuantileNormalizer:
+        """Normaliser of a data set: states [N, Ds], actions [N, A] with ``gripper`` dimensions from -1 (open) to 1 (close)."""
+        ranges = [torch.quantile(x.double(), q, dim=0) for x in (state, action) for q in (0.01, 0.99)]
+        is_gripper = torch.zeros(action.shape[1], dtype=torch.bool)
+        is_gripper[list(gripper)] = True
+        return cls(*ranges, is_gripper)
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """States [..., Ds] in environment units to the policy's."""
+        return _to_unit(state, self.state_low, self.state_high).clamp(-1, 1)
+
+    def normalize_action(self, action: Tensor) -> Tensor:
+        """Actions [..., A] in environment units to the policy's."""
+        unit = _to_unit(action, self.action_low, self.action_high)
+        return torch.where(self.gripper, (1 - action) / 2, unit.clamp(-1, 1))
+
+    def unnormalize_action(self, action: Tensor) -> Tensor:
+        """Actions [..., A] of the policy to environment units; grippers become -1 or 1, 0 exactly between."""
+        real = (action + 1) / 2 * (self.action_high - self.action_low + _EPS) + self.action_low
+        return torch.where(self.gripper, (1 - 2 * action).sign(), real)
+
+
+def _to_unit(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return 2 * (x - low) / (high - low + _EPS) - 1
+
+
+def _check_range(name: str, low: Tensor, high: Tensor) -> None:
+    if low.ndim != 1 or low.shape != high.shape:
+        raise ValueError(
+            f"{name}: expected two vectors of one size, got {list(low.shape)} and {list(high.shape)}"
+        )
+    if not (low.isfinite().all() and high.isfinite().all() and (low <= high).all()):
+        raise ValueError(
+            f"{name}: expected finite quantiles with low <= high, got {low.tolist()}, {high.tolist()}"
+        )

@@ -1,0 +1,182 @@
+"""OpenVLA-OFT as a TorchRL policy: camera images, state and an instruction in, a chunk of actions and its costs out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.modules.vla import VLAWrapperBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.policies.checkpoints.vla_pretrained import read_vla, write_vla
+from torchrl_sparse.policies.clock import synchronised_clock
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.decoder import Decoded
+from torchrl_sparse.policies.vla.flops import query_flops
+from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
+from torchrl_sparse.policies.vla.pruning import TokenPruner
+from torchrl_sparse.policies.vla.text import InstructionTokenizer, WordTokenizer
+
+__all__ = ["VLAPolicy"]
+
+
+class VLAPolicy(VLAWrapperBase):
+    """A vision-language-action policy of the OpenVLA-OFT architecture (arXiv:2502.19645).
+
+    Reads the images of ``config.cameras``, u8 [*B, 3, image_size, image_size], upright; ``("observation", "state")``, f32
+    [*B, Ds]; ``"language_instruction"``, text; and, where it is there, ``("tokens", "keep_mask")``. Writes the chunk in
+    environment units, ``("tokens", "depth")``, ``("tokens", "kept")``, FLOPs actually spent, latency, and what the pruner
+    declares.
+
+    Args:
+        network: the network.
+        normalizer: of states and actions; by default none is done.
+        tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
+
+    Attributes:
+        pruner: what drops visual tokens between the decoder's layers; None (dense) at first. Assign another to change the
+            method, see `torchrl_sparse.policies.vla.pruning`.
+
+    Raises:
+        KeyError: if a camera or the state is missing; the message names the key and those that are there.
+        TypeError: if an instruction is not text.
+        ValueError: if an image, the state or a mask has a wrong shape or type, or the tokenizer has more ids than the network.
+
+    Examples:
+        >>> policy = VLAPolicy(VLANetwork(VLAConfig.tiny()))
+        >>> image = torch.zeros(4, 3, 28, 28, dtype=torch.uint8)
+        >>> observation = {"image": image, "wrist_image": image, "state": torch.zeros(4, 8)}
+        >>> td = TensorDict({"observation": observation, "language_instruction": ["lift the cube"] * 4}, [4])
+        >>> policy(td)["vla_action", "chunk"].shape
+        torch.Size([4, 2, 7])
+    """
+
+    def __init__(
+        self,
+        network: VLANetwork,
+        normalizer: QuantileNormalizer | None = None,
+        tokenizer: InstructionTokenizer | None = None,
+    ):
+        config = network.config
+        primary, *others = config.cameras
+        super().__init__(
+            action_dim=config.action_dim,
+            chunk_size=config.chunk_size,
+            return_vla_action_container=False,
+            image_key=primary,
+            wrist_image_key=others[0] if others else None,
+        )
+        self.network = network
+        self.normalizer = (
+            QuantileNormalizer.identity(config.state_dim, config.action_dim)
+            if normalizer is None
+            else normalizer
+        )
+        self.tokenizer = WordTokenizer(()) if tokenizer is None else tokenizer
+        if self.tokenizer.vocab_size > config.vocab_size:
+            raise ValueError(
+                f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
+            )
+        self.pruner = None
+        self.eval()
+
+    # -- what prunes ---------------------------------------------------------------------------------------------------
+
+    @property
+    def pruner(self) -> TokenPruner | None:
+        return self._pruner
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # nn.Module registers any module that is assigned, so a property with a setter never sees a pruner that is one.
+        if name == "pruner":
+            if value is not None:
+                value.bind(self.network.config.visual_spec)
+            name = "_pruner"
+        super().__setattr__(name, value)
+        if name == "_pruner":
+            self._update_keys()
+
+    def _update_keys(self) -> None:
+        """TorchRL's keys, and ours beside them."""
+        super()._update_keys()
+        pruner = getattr(self, "_pruner", None)
+        wrist = self.tensor_keys.wrist_image
+        reads = [*([] if wrist is None else [wrist]), keys.KEEP_MASK, *(pruner.in_keys if pruner else ())]
+        writes = [keys.TOKEN_DEPTH, keys.KEPT, *(pruner.out_keys if pruner else ())]
+        self.in_keys = list(dict.fromkeys([*self.in_keys, *reads]))
+        self.out_keys = list(dict.fromkeys([*self.out_keys, *writes, keys.FLOPS, keys.LATENCY]))
+
+    # -- running it ----------------------------------------------------------------------------------------------------
+
+    def forward(
+        self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None, **kwargs
+    ) -> TensorDictBase:
+        device = next(self.network.parameters()).device
+        start = synchronised_clock(device)
+        query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
+        actions, decoded = self._run(query)
+        answer = self._answer(query, actions, decoded)
+        answer.set(keys.LATENCY, torch.full_like(answer.get(keys.FLOPS), synchronised_clock(device) - start))
+        return self._output_tensordict(tensordict, answer.reshape(tensordict.batch_size), tensordict_out)
+
+    def _predict_chunk(self, tensordict: TensorDictBase) -> Tensor:
+        query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
+        chunk = self.normalizer.unnormalize_action(self._run(query)[0])
+        return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
+
+    def _run(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
+        """Normalised actions [B, H, A] of a flat query, and what the decoder did; the pruner writes into ``query``."""
+        config, names = self.network.config, self.tensor_keys
+        cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
+        images = read_images(query, cameras, config.image_size)
+        state = read_state(query, names.state, config.state_dim)
+        prompts = self.tokenizer.encode(read_instructions(query, names.instruction))
+        if self.pruner is not None:
+            self.pruner.begin(query)
+        actions, decoded = self.network(
+            images,
+            self.normalizer.normalize_state(state),
+            prompts.to(images.device),
+            keep_mask=read_keep_mask(query, config.num_visual),
+            pruner=self.pruner,
+            td=query,
+        )
+        if self.pruner is not None:
+            self.pruner.end(query)
+        return actions, decoded
+
+    def _answer(self, query: TensorDictBase, actions: Tensor, decoded: Decoded) -> TensorDict:
+        """Everything but the latency, [B]."""
+        answer = TensorDict({}, query.batch_size, device=query.device)
+        answer.set(self.tensor_keys.action_chunk, self.normalizer.unnormalize_action(actions))
+        answer.set(keys.TOKEN_DEPTH, decoded.depth)
+        ran = (decoded.tokens > 0).sum(1, keepdim=True)
+        answer.set(keys.KEPT, decoded.depth.sum(1, keepdim=True) / ran.clamp(min=1))
+        answer.set(keys.FLOPS, query_flops(self.network.config, decoded.tokens, decoded.scored)[:, None])
+        for key in self.pruner.out_keys if self.pruner is not None else ():
+            answer.set(key, keys.read(query, key))
+        return answer
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def save_pretrained(self, path: str | Path) -> None:
+        """Writes ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
+        write_vla(Path(path), network=self.network, normalizer=self.normalizer, tokenizer=self.tokenizer)
+
+    @classmethod
+    def from_pretrained(cls, path: str | Path, *, config: VLAConfig | None = None) -> VLAPolicy:
+        """Reads what `save_pretrained` wrote. Nothing in the files is executed.
+
+        Args:
+            path: the folder.
+            config: the architecture that it must hold, for instance with two cameras; any by default.
+
+        Raises:
+            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+        """
+        return cls(*read_vla(Path(path), config))

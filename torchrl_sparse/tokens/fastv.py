@@ -1,0 +1,60 @@
+"""FastV: after a few layers, keep the visual tokens to which the last token attends (Chen et al., arXiv:2403.06764)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec
+from torchrl_sparse.tokens.selection import best, check_share
+
+
+def last_text_token(kind: Tensor, alive: Tensor) -> Tensor:
+    """The last token of each row's prompt, bool [B, S].
+
+    Args:
+        kind: i64 [B, S], `TokenKind`.
+        alive: bool [B, S].
+
+    Examples:
+        >>> kind = torch.tensor([[0, 1, 4, 4, 5]])
+        >>> last_text_token(kind, torch.ones_like(kind, dtype=torch.bool)).int().tolist()
+        [[0, 0, 0, 1, 0]]
+    """
+    text = alive & (kind == TokenKind.TEXT)
+    return text & (text.cumsum(-1) == text.sum(-1, keepdim=True))
+
+
+class FastVPruner(TokenPruner):
+    """Drops visual tokens once, after ``layer`` layers, by the attention of the last prompt token in the layer before.
+
+    FastV's last token is the one that predicts the first output; with parallel action slots that is the last of the prompt.
+
+    Args:
+        share: of all visual tokens that stay (the paper's 1 - R), in (0, 1].
+        layer: layers that see every token (the paper's K).
+    """
+
+    def __init__(self, share: float = 0.5, layer: int = 2):
+        check_share("share", share)
+        if layer < 1:
+            raise ValueError(f"layer: expected at least 1, got {layer}")
+        self.share = share
+        self.layer = layer
+
+    def bind(self, spec: VisualSpec) -> None:
+        if self.layer >= spec.num_layers:
+            raise ValueError(
+                f"layer: expected less than the model's {spec.num_layers} layers, got {self.layer}"
+            )
+
+    def layers_scored(self, num_layers: int) -> set[int]:
+        return {self.layer - 1}
+
+    def score_rows(self, state: LayerState) -> Tensor:
+        return last_text_token(state.kind, state.alive)
+
+    def after_layer(self, index: int, state: LayerState) -> Tensor | None:
+        if state.scores is None:
+            return None
+        count = round(self.share * state.num_visual)
+        return state.keep_visual(best(state.scores, count, state.visual_alive))
