@@ -117,7 +117,7 @@ BROKEN_PAYLOADS = {
     ),
     "another policy": (
         put_config("policy._target_", "diffusion_policy.policy.DiffusionUnetLowdimPolicy"),
-        "policy._target_: expected .*TransformerLowdimPolicy, got DiffusionUnetLowdimPolicy",
+        "policy._target_: expected one of .*TransformerLowdimPolicy.*, got DiffusionUnetLowdimPolicy",
     ),
     "another noise schedule": (
         put_config("policy.noise_scheduler.beta_schedule", "linear"),

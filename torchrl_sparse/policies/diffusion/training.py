@@ -22,13 +22,14 @@ from torch import Tensor, nn
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
-__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "read_checkpoint", "step_seed"]
+__all__ = ["PolicyTrainer", "TrainConfig", "batch_indices", "step_seed"]
 
 _VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
 
@@ -272,41 +273,6 @@ def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Te
     return index
 
 
-def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
-    """What a trainer saved. Nothing in the file is executed.
-
-    Args:
-        path: the file.
-        fields: names of everything that it must hold.
-        header: those that must be equal, since a training can only go on as it was begun.
-
-    Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: naming the file, what was expected and what came.
-    """
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        # torch reports damaged and unsafe files through many exception types.
-        raise ValueError(
-            f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
-        ) from error
-    if not isinstance(state, dict) or set(state) != fields:
-        found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
-    for name, expected in header.items():
-        if state[name] != expected:
-            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
-    return state
-
-
 def _checksum(value: Tensor) -> float:
     """Sum of all entries; images are summed without a copy of them in another type."""
     return float(value.double().sum() if value.is_floating_point() else value.sum(dtype=torch.int64))
-
-
-def _difference(expected: dict, found: dict) -> str:
-    names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
-    return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)
