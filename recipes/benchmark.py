@@ -32,6 +32,7 @@ from torchrl_sparse.evaluation.methods import (
     answer,
     calibrate_policy,
     check_method,
+    env_options,
     make_method,
     method_identity,
     record_queries,
@@ -55,7 +56,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
-    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
+    environment = partial(make_env, task.name, **env_options(policy), horizon=config.horizon)
 
     @cache
     def calibration():

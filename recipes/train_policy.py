@@ -21,13 +21,14 @@ from tqdm import tqdm
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.trainer import TrainConfig
 
 
@@ -42,27 +43,50 @@ def main(config: DictConfig) -> None:
         print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
     stop = StopSignal()
     train(trainer, config, make_logger(config), stop)
-    save(trainer, out)
+    save(trainer, config)
     how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
     print(f"{out / 'policy'}: step {trainer.step} of {trainer.config.max_steps}, {how}")
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Reads the demonstrations and builds an untrained network that fits them."""
-    demos = read_demos(config.demos, get_task(config.task).state_keys)
+    task, cameras = get_task(config.task), chosen_cameras(config)
+    demos = read_demos(
+        config.demos,
+        task.proprioception_keys if cameras else task.state_keys,
+        cameras=cameras,
+        image_folder=Path(config.out) / "images",
+    )
     state, action = demos.data[keys.STATE], demos.data[keys.ACTION]
     normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization).to(config.device)
     torch.manual_seed(config.seed)
+    vision = make_vision(demos, cameras, config) if cameras else None
+    features = 0 if vision is None else vision.feature_dim
     network = TransformerForDiffusion(
-        input_dim=action.shape[-1], output_dim=action.shape[-1], cond_dim=state.shape[-1], **config.network
+        input_dim=action.shape[-1],
+        output_dim=action.shape[-1],
+        cond_dim=features + state.shape[-1],
+        **config.network,
     ).to(config.device)
-    trainer = PolicyTrainer(network, normalizer, demos, TrainConfig(**config.train))
+    trainer = PolicyTrainer(network, normalizer, demos, TrainConfig(**config.train), vision)
     print(
         f"{config.demos}: {len(demos)} demonstrations, {len(state)} steps, "
         f"{len(trainer.train_rows)} training windows; "
         f"{sum(p.numel() for p in network.parameters()):,} parameters"
     )
     return trainer
+
+
+def chosen_cameras(config: DictConfig) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations."""
+    return {name: key for name, key in config.cameras.items() if key is not None}
+
+
+def make_vision(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> VisionEncoder:
+    image_size = demos.data["observation", next(iter(cameras))].shape[-2:]
+    crop_size = [round(config.vision.crop * size) for size in image_size]
+    vision = VisionEncoder([*cameras], image_size=image_size, crop_size=crop_size, width=config.vision.width)
+    return vision.to(config.device)
 
 
 def train(trainer: PolicyTrainer, config: DictConfig, logger: Logger, stop: StopSignal) -> None:
@@ -80,15 +104,25 @@ def train(trainer: PolicyTrainer, config: DictConfig, logger: Logger, stop: Stop
                 logger.log_metrics(metrics, step=trainer.step)
                 losses, last = [], now
             if trainer.step % config.checkpoint_every == 0:
-                save(trainer, Path(config.out))
+                save(trainer, config)
                 logger.log_metrics({"val/loss": trainer.validate()}, step=trainer.step)
             if config.eval_every and trainer.step % config.eval_every == 0:
                 evaluate(trainer, config, logger)
 
 
-def save(trainer: PolicyTrainer, out: Path) -> None:
-    trainer.save(out / "checkpoint.pt")
-    DiffusionPolicy(trainer.ema_network(), trainer.normalizer).save_pretrained(out / "policy")
+def save(trainer: PolicyTrainer, config: DictConfig) -> None:
+    trainer.save(Path(config.out) / "checkpoint.pt")
+    averaged_policy(trainer, config).save_pretrained(Path(config.out) / "policy")
+
+
+def averaged_policy(
+    trainer: PolicyTrainer, config: DictConfig, schedule: NoiseSchedule | None = None
+) -> DiffusionPolicy:
+    """With a note of the cameras, for whoever makes an environment for it."""
+    policy = trainer.ema_policy(schedule)
+    if cameras := chosen_cameras(config):
+        policy.source = {"task": get_task(config.task).alias, "cameras": cameras}
+    return policy
 
 
 def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None:
@@ -97,13 +131,14 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None
         return
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.envs.transforms import make_env
+    from torchrl_sparse.evaluation.methods import env_options
     from torchrl_sparse.evaluation.paired import rollout_episodes
 
     schedule = NoiseSchedule("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else NoiseSchedule()
-    policy = DiffusionPolicy(trainer.ema_network(), trainer.normalizer, schedule=schedule)
+    policy = averaged_policy(trainer, config, schedule)
     episodes = rollout_episodes(
         ChunkExecutor(policy, trainer.config.n_action_steps),
-        partial(make_env, get_task(config.task).name, n_obs_steps=policy.n_obs_steps),
+        partial(make_env, get_task(config.task).name, **env_options(policy)),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,

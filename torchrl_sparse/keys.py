@@ -15,6 +15,7 @@ constant                          shape, dtype           meaning
 ``EPISODE_SEED``                  i64 [*B, 1]            the seed that fixed this episode's initial state
 ``EPISODE_STEP``                  i64 [*B, 1]            environment steps since the reset
 ``HISTORY_STATE``                 f32 [*B, To, Ds]       the last To states, oldest first
+``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
 ``COND``                          f32 [*B, To, D]        encoded observations that condition the denoiser
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
@@ -88,6 +89,15 @@ HOLD = ("control", "hold")
 
 FLOPS = ("cost", "flops")
 LATENCY = ("cost", "latency")
+
+
+def history(name: str) -> tuple[str, str]:
+    """Key of the last entries of ``("observation", name)``.
+
+    >>> history("image")
+    ('history', 'image')
+    """
+    return ("history", name)
 
 
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:

@@ -27,8 +27,9 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.trainer import batch_indices, read_checkpoint, step_seed
+from torchrl_sparse.policies.trainer import batch_indices, step_seed
 
 __all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "make_reference", "sparsity_loss"]
 

@@ -1,13 +1,14 @@
 """Demonstrations from robomimic's HDF5 layout (arXiv:2108.03298), cut into training windows.
 
 Layout: ``data/demo_<i>/actions`` [T, 7 * arms] absolute poses (position, rotation vector, gripper),
-``data/demo_<i>/obs/<key>`` [T, n], and the attribute ``num_samples`` = T on every demonstration.
-Writing is in `torchrl_sparse.data.hdf5_writer`.
+``data/demo_<i>/obs/<key>`` [T, n], images u8 [T, h, w, 3] among them, and the attribute ``num_samples`` = T on every
+demonstration. Writing is in `torchrl_sparse.data.hdf5_writer`. Images are streamed: one demonstration at a time is in
+memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.images import read_images
 from torchrl_sparse.envs.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "read_demos"]
@@ -28,8 +30,9 @@ class Demonstrations:
     """Episodes laid end to end.
 
     Attributes:
-        data: [N] with ``("observation", "state")`` f32 [N, Ds] and ``"action"`` f32 [N, 10 * arms], the
-            action taken in that state. It can be memory-mapped: ``data.memmap(folder)``.
+        data: [N] with ``("observation", "state")`` f32 [N, Ds], images ``("observation", name)`` u8 [N, 3, h, w] if
+            they were asked for, and ``"action"`` f32 [N, 10 * arms], the action taken in that state. It can be
+            memory-mapped: ``data.memmap(folder)``.
         starts: i64 [E + 1]; episode e is rows ``starts[e]`` up to, not including, ``starts[e + 1]``.
     """
 
@@ -78,24 +81,31 @@ class Demonstrations:
         """Training samples [B] of windows ``rows`` i64 [B, H].
 
         Returns:
-            ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A]; action ``To - 1`` belongs to the
-            last observation.
+            ``("history", name)`` [B, To, ...] of each observation, and ``"action"`` [B, H, A]; action ``To - 1``
+            belongs to the last observation.
         """
-        return TensorDict(
-            {
-                keys.HISTORY_STATE: self.data.get(keys.STATE)[rows[:, :n_obs_steps]],
-                keys.ACTION: self.data.get(keys.ACTION)[rows],
-            },
-            batch_size=[len(rows)],
-        )
+        observed = rows[:, :n_obs_steps]
+        windows = {
+            keys.history(name): value[observed] for name, value in self.data.get("observation").items()
+        }
+        return TensorDict(windows | {keys.ACTION: self.data.get(keys.ACTION)[rows]}, batch_size=[len(rows)])
 
 
-def read_demos(path: str | Path, state_keys: Sequence[str]) -> Demonstrations:
+def read_demos(
+    path: str | Path,
+    state_keys: Sequence[str],
+    *,
+    cameras: Mapping[str, str] | None = None,
+    image_folder: str | Path | None = None,
+) -> Demonstrations:
     """All demonstrations of a robomimic file, in the order of their numbers.
 
     Args:
         path: HDF5 file.
         state_keys: observations that make up the state, concatenated in this order.
+        cameras: images to read: the name here -> the observation there, e.g. ``{"image": "agentview_image"}``.
+        image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
+            memory by default.
 
     Returns:
         f32 demonstrations; actions are converted from rotation vectors to 6-D rotations.
@@ -118,17 +128,22 @@ def read_demos(path: str | Path, state_keys: Sequence[str]) -> Demonstrations:
         with h5py.File(path, "r") as file:
             names = _demo_names(path, file)
             episodes = [_read_episode(path, file["data"], name, state_keys) for name in names]
+            lengths = [len(action) for _, action in episodes]
+            steps = dict(zip(names, lengths, strict=True))
+            images = {
+                ("observation", name): read_images(path, file["data"], steps, key, image_folder)
+                for name, key in (cameras or {}).items()
+            }
     except OSError as error:
         raise ValueError(
             f"{path}: expected a complete HDF5 file, got one that h5py cannot open ({error})"
         ) from error
-    lengths = torch.tensor([0] + [len(action) for _, action in episodes])
     widths = sorted({(state.shape[1], action.shape[1]) for state, action in episodes})
     if len(widths) > 1:
         raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
     state, action = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*episodes, strict=True))
-    data = TensorDict({keys.STATE: state, keys.ACTION: action}, batch_size=[len(state)])
-    return Demonstrations(data, lengths.cumsum(0))
+    data = TensorDict({keys.STATE: state, keys.ACTION: action, **images}, batch_size=[len(state)])
+    return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0))
 
 
 def _demo_names(path: Path, file: h5py.File) -> list[str]:

@@ -50,6 +50,7 @@ class RobosuiteEnv(EnvBase):
         camera: camera of ``("observation", "image")``, e.g. "agentview"; none by default.
         wrist_camera: camera of ``("observation", "wrist_image")``, e.g. "robot0_eye_in_hand".
         image_size: height and width of the images, pixels.
+        object_state: False leaves the objects out of the state, as in image tasks: cameras show them.
         fast_render: see `CameraRenderer`.
         instruction: write ``"language_instruction"``; True for the task's own words.
         reward_shaping: robosuite's dense reward instead of 1 on success.
@@ -75,6 +76,7 @@ class RobosuiteEnv(EnvBase):
         camera: str | None = None,
         wrist_camera: str | None = None,
         image_size: int = 84,
+        object_state: bool = True,
         fast_render: bool = True,
         instruction: bool | str = False,
         reward_shaping: bool = False,
@@ -91,6 +93,7 @@ class RobosuiteEnv(EnvBase):
         self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
         self._image_size = image_size
+        self._state_keys = self.task.state_keys if object_state else self.task.proprioception_keys
         self._fast_render = fast_render
         self._instruction = self.task.instruction if instruction is True else instruction
         self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
@@ -108,8 +111,9 @@ class RobosuiteEnv(EnvBase):
 
     def _make_specs(self) -> None:
         size = self._image_size
+        slices = [self.task.state_slice(key) for key in self._state_keys]
         observation = Composite(
-            state=Unbounded((self.task.state_dim,), device=self.device),
+            state=Unbounded((sum(part.stop - part.start for part in slices),), device=self.device),
             eef_vel=Unbounded((6 * self.task.arms,), device=self.device),
         )
         for _, name in self._cameras:
@@ -219,9 +223,9 @@ class RobosuiteEnv(EnvBase):
 
     def _observe(self) -> TensorDict:
         out = TensorDict(device=self.device)
-        out[keys.STATE] = torch.as_tensor(
-            np.concatenate([*self.raw_observation().values()]), dtype=torch.float32
-        )
+        parts = self.raw_observation()
+        state = np.concatenate([parts[key] for key in self._state_keys])
+        out[keys.STATE] = torch.as_tensor(state, dtype=torch.float32)
         out[keys.EEF_VEL] = torch.as_tensor(self._eef_velocity(), dtype=torch.float32)
         for key, camera in self._cameras.items():
             image = self.render(camera, self._image_size, self._image_size)

@@ -33,8 +33,12 @@ class Task:
     @property
     def state_keys(self) -> tuple[str, ...]:
         """robosuite observations whose concatenation is the state."""
-        per_arm = (f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
-        return ("object", *per_arm)
+        return ("object", *self.proprioception_keys)
+
+    @property
+    def proprioception_keys(self) -> tuple[str, ...]:
+        """Those of the arms: the state of image tasks, where cameras show the objects."""
+        return tuple(f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
 
     @property
     def state_dim(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,17 +18,20 @@ from torchrl_sparse.envs.tasks import Task
 
 
 def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
-    """A robosuite task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: the state's history and ``"is_init"``.
+    """A robosuite task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
 
     Args:
-        task: see `RobosuiteEnv`, as are ``kwargs``.
-        n_obs_steps: states in the history; the first of an episode is repeated at its start.
+        task: see `RobosuiteEnv`, as are ``kwargs``; cameras asked for there get a history too.
+        n_obs_steps: entries of a history; the first of an episode is repeated at its start.
 
     Examples:
         >>> make_env("Lift").reset()["history", "state"].shape
         torch.Size([2, 19])
     """
-    return TransformedEnv(RobosuiteEnv(task, **kwargs), Compose(InitTracker(), *state_history(n_obs_steps)))
+    env = RobosuiteEnv(task, **kwargs)
+    cameras = [key for key in (keys.IMAGE, keys.WRIST_IMAGE) if key in env.observation_spec.keys(True)]
+    histories = [*state_history(n_obs_steps), *image_history(n_obs_steps, cameras)]
+    return TransformedEnv(env, Compose(InitTracker(), *histories))
 
 
 def state_history(n_obs_steps: int) -> list[Transform]:
@@ -37,6 +41,17 @@ def state_history(n_obs_steps: int) -> list[Transform]:
     return [
         UnsqueezeTransform(dim=-2, in_keys=[keys.STATE], out_keys=[keys.HISTORY_STATE]),
         CatFrames(N=n_obs_steps, dim=-2, in_keys=[keys.HISTORY_STATE]),
+    ]
+
+
+def image_history(n_obs_steps: int, cameras: Sequence[tuple[str, str]]) -> list[Transform]:
+    """Transforms that write ``("history", name)``, u8 [*B, n_obs_steps, 3, h, w], of images ``("observation", name)``."""
+    if not cameras:
+        return []
+    histories = [keys.history(name) for _, name in cameras]
+    return [
+        UnsqueezeTransform(dim=-4, in_keys=list(cameras), out_keys=histories),
+        CatFrames(N=n_obs_steps, dim=-4, in_keys=histories),
     ]
 
 

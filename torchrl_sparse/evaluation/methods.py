@@ -26,6 +26,7 @@ from torchrl_sparse.evaluation.latency import Latency, measure_latency
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
+_CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 METHODS = "dense, ddim<N>, uniform, " + ", ".join(SCHEDULES)
 
 
@@ -108,7 +109,12 @@ def make_method(
     if method.rates:
         _set_rates(name, plan, method.rates)
     return DiffusionPolicy(
-        policy.network, policy.normalizer, schedule=schedule, plan=plan, engine=policy.engine
+        policy.network,
+        policy.normalizer,
+        vision=policy.vision,
+        schedule=schedule,
+        plan=plan,
+        engine=policy.engine,
     )
 
 
@@ -145,6 +151,23 @@ def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
     return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
 
 
+def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
+    """Arguments of `make_env` for an environment that shows what ``policy`` observes.
+
+    Raises:
+        ValueError: if the policy has cameras and its ``source`` does not say which.
+    """
+    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
+    if policy.vision is None:
+        return options
+    named = policy.source.get("cameras", {})
+    cameras = {name: named.get(name, "").removesuffix("_image") for name in policy.vision.cameras}
+    if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
+        raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
+    options |= {_CAMERA_OPTIONS[name]: camera for name, camera in cameras.items()}
+    return options | {"image_size": policy.vision.image_size[0], "object_state": False}
+
+
 def calibrate_policy(
     policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
 ) -> Calibration:
@@ -171,7 +194,7 @@ def record_queries(
 def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:
     """Asks another method the same: same observations, same noise."""
     with torch.no_grad():
-        return policy(queries.select(keys.HISTORY_STATE, keys.EPISODE_SEED, keys.EPISODE_STEP))
+        return policy(queries.select(*policy.in_keys, strict=False))
 
 
 def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:

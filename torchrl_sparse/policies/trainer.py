@@ -21,8 +21,9 @@ from torch import Tensor, nn
 
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 
-__all__ = ["TrainConfig", "Trainer", "batch_indices", "read_checkpoint", "split_windows", "step_seed"]
+__all__ = ["TrainConfig", "Trainer", "batch_indices", "split_windows", "step_seed"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Trainer:
     """Base of trainings on windows of demonstrations; a subclass says what the loss of a batch is.
 
     Args:
-        network: the network, trained in place.
+        trained: the module, trained in place.
         config: how to train.
         groups: parameter groups of the optimiser.
         train_rows: i64 [W, H], rows of the training windows.
@@ -85,16 +86,16 @@ class Trainer:
 
     def __init__(
         self,
-        network: nn.Module,
+        trained: nn.Module,
         config: TrainConfig,
         groups: list[dict[str, Any]],
         train_rows: Tensor,
         val_rows: Tensor | None,
     ) -> None:
-        self.network, self.config = network, config
+        self.trained, self.config = trained, config
         self.train_rows, self.val_rows = train_rows, val_rows
         self._ema = EMAModel(
-            network.parameters(),
+            trained.parameters(),
             decay=config.ema_max_decay,
             power=config.ema_power,
             update_after_step=0,
@@ -125,17 +126,17 @@ class Trainer:
         """
         torch.manual_seed(step_seed(self.config.seed, self.step))
         index = batch_indices(len(self.train_rows), self.config.batch_size, self.step, self.config.seed)
-        self.network.train()
+        self.trained.train()
         self._optimizer.zero_grad(set_to_none=True)
         loss = self.batch_loss(self.train_rows[index])
         if not math.isfinite(value := loss.item()):
             raise FloatingPointError(f"step {self.step}: loss is {value}")
         loss.backward()
         if self.config.max_grad_norm > 0:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.max_grad_norm)
+            torch.nn.utils.clip_grad_norm_(self.trained.parameters(), self.config.max_grad_norm)
         self._optimizer.step()
         self._schedule.step()
-        self._ema.step(self.network.parameters())
+        self._ema.step(self.trained.parameters())
         self.step += 1
         return value
 
@@ -144,17 +145,17 @@ class Trainer:
         """Loss of the averaged weights on held-out episodes and fixed noise; nan if none is held out."""
         if self.val_rows is None:
             return float("nan")
-        self.network.eval()
+        self.trained.eval()
         with torch.random.fork_rng(devices=[]), self._averaged_weights():
             torch.manual_seed(self.config.seed)
             rows = self.val_rows[torch.randperm(len(self.val_rows))[:max_windows]]
             return self.batch_loss(rows.repeat(math.ceil(max_windows / len(rows)), 1)).item()
 
-    def ema_network(self) -> nn.Module:
-        """A copy of the network with the averaged weights, in evaluation mode."""
-        network = copy.deepcopy(self.network).eval()
-        self._ema.copy_to(network.parameters())
-        return network
+    def averaged(self) -> nn.Module:
+        """A copy of the module with the averaged weights, in evaluation mode."""
+        module = copy.deepcopy(self.trained).eval()
+        self._ema.copy_to(module.parameters())
+        return module
 
     def save(self, path: str | Path) -> None:
         """Writes a checkpoint. A kill leaves the old file or the new one, never a part of one."""
@@ -170,21 +171,21 @@ class Trainer:
         """
         header = self.header()
         state = read_checkpoint(path, {*header, "step", "network", "ema", "optimizer"}, header)
-        self.network.load_state_dict(state["network"])
+        self.trained.load_state_dict(state["network"])
         self._ema.load_state_dict(state["ema"])
-        self._ema.to(next(self.network.parameters()).device)
+        self._ema.to(next(self.trained.parameters()).device)
         self._optimizer.load_state_dict(state["optimizer"])
         self.step = state["step"]
         self._set_schedule()
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:
-        self._ema.store(self.network.parameters())
-        self._ema.copy_to(self.network.parameters())
+        self._ema.store(self.trained.parameters())
+        self._ema.copy_to(self.trained.parameters())
         try:
             yield
         finally:
-            self._ema.restore(self.network.parameters())
+            self._ema.restore(self.trained.parameters())
 
     def _set_schedule(self) -> None:
         for group in self._optimizer.param_groups:
@@ -197,7 +198,7 @@ class Trainer:
         return {
             **self.header(),
             "step": self.step,
-            "network": self.network.state_dict(),
+            "network": self.trained.state_dict(),
             "ema": self._ema.state_dict(),
             "optimizer": self._optimizer.state_dict(),
         }
@@ -254,38 +255,3 @@ def batch_indices(num_windows: int, batch_size: int, step: int, seed: int) -> Te
         chosen = epoch == number
         index[chosen] = torch.randperm(num_windows, generator=generator)[offset[chosen]]
     return index
-
-
-def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
-    """What a trainer saved. Nothing in the file is executed.
-
-    Args:
-        path: the file.
-        fields: names of everything that it must hold.
-        header: those that must be equal, since a training can only go on as it was begun.
-
-    Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: naming the file, what was expected and what came.
-    """
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        # torch reports damaged and unsafe files through many exception types.
-        raise ValueError(
-            f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
-        ) from error
-    if not isinstance(state, dict) or set(state) != fields:
-        found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
-    for name, expected in header.items():
-        if state[name] != expected:
-            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
-    return state
-
-
-def _difference(expected: dict, found: dict) -> str:
-    names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
-    return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)

@@ -51,17 +51,18 @@ def finish(process):
     return output
 
 
-def train_unbroken(arguments, out):
+def train_unbroken(arguments):
     """The same training in this process, without the recipe's loop."""
     spec = importlib.util.spec_from_file_location("train_policy", RECIPE)
     recipe = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(recipe)
     with hydra.initialize_config_dir(str(RECIPE.parent), version_base=None):
-        trainer = recipe.make_trainer(hydra.compose("train_policy", arguments))
+        config = hydra.compose("train_policy", arguments)
+    trainer = recipe.make_trainer(config)
     with num_threads(1):
         while trainer.step < 400:
             trainer.train_step()
-    recipe.save(trainer, out)
+    recipe.save(trainer, config)
 
 
 def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
@@ -79,7 +80,7 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     assert "step 400 of 400, finished" in output
     assert len((broken / "log/scalars/train/lr.csv").read_text().splitlines()) >= 39
 
-    train_unbroken(settings(demos, unbroken), unbroken)
+    train_unbroken(settings(demos, unbroken))
     models = [(out / "policy/model.safetensors").read_bytes() for out in (broken, unbroken)]
     assert models[0] == models[1]
     policy = DiffusionPolicy.from_pretrained(broken / "policy")

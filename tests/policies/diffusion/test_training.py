@@ -31,7 +31,7 @@ def run(trainer, until):
 
 
 def weights(trainer):
-    return [*trainer.network.state_dict().values(), *trainer.ema_network().state_dict().values()]
+    return [*trainer.network.state_dict().values(), *trainer.ema_policy().network.state_dict().values()]
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
@@ -87,7 +87,7 @@ def test_averaged_weights_follow_diffusers(make_trainer):
     for _ in range(6):
         trainer.train_step()
         average.step(trainer.network.parameters())
-    parameters = [*trainer.ema_network().parameters()]
+    parameters = [*trainer.ema_policy().network.parameters()]
     for ours, theirs in zip(parameters, average.shadow_params, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-7, rtol=1e-6)
     assert any(not torch.equal(a, b) for a, b in zip(parameters, trainer.network.parameters(), strict=True))

@@ -97,7 +97,7 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
     first.save(tmp_path / "checkpoint.pt")
     second.load(tmp_path / "checkpoint.pt")
     assert begun + run(second, 6) == losses
-    for ours, theirs in ((second.network, unbroken.network), (second.ema_network(), unbroken.ema_network())):
+    for ours, theirs in ((second.trained, unbroken.trained), (second.averaged(), unbroken.averaged())):
         assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
 
 

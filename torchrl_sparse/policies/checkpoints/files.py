@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +43,11 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path}: expected a complete JSON file, got: {error}") from error
 
 
-def read_config(path: Path, file_format: str, fields: set[str]) -> dict[str, Any]:
-    """The JSON object in ``path``, with exactly ``fields``, of which ``"format"`` is ``file_format``.
+def read_config(
+    path: Path, file_format: str, fields: set[str], optional: Set[str] = frozenset()
+) -> dict[str, Any]:
+    """The JSON object in ``path``, with exactly ``fields``, of which ``"format"`` is ``file_format``; fields that
+    are ``optional`` may be there too.
 
     Raises:
         FileNotFoundError, ValueError: naming the file, what was expected and what came.
@@ -53,7 +56,7 @@ def read_config(path: Path, file_format: str, fields: set[str]) -> dict[str, Any
     if not isinstance(config, dict) or config.get("format") != file_format:
         found = config.get("format") if isinstance(config, dict) else type(config).__name__
         raise ValueError(f"{path}: format: expected {file_format!r}, got {found!r}")
-    if set(config) != fields:
+    if set(config) - optional != fields:
         raise ValueError(f"{path}: expected the fields {sorted(fields)}, got {sorted(config)}")
     return config
 

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-__all__ = ["check_finite", "check_shapes", "take"]
+__all__ = ["check_finite", "check_shapes", "check_tensors", "take"]
 
 T = TypeVar("T")
 
@@ -40,3 +40,9 @@ def check_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
     for name, value in tensors.items():
         if not value.isfinite().all():
             raise ValueError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
+
+
+def check_tensors(where: str, found: Mapping[str, Tensor], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """:func:`check_shapes` and :func:`check_finite`."""
+    check_shapes(where, found, expected)
+    check_finite(where, found)

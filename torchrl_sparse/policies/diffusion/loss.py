@@ -9,8 +9,10 @@ from torchrl.objectives import LossModule
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.encoder import ConditionEncoder
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
 __all__ = ["DiffusionLoss", "noise_prediction_loss"]
 
@@ -40,13 +42,14 @@ def noise_prediction_loss(
 class DiffusionLoss(LossModule):
     """Chunked noise-prediction loss.
 
-    Reads ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A], both in environment units; writes
-    ``"loss"``. Timestep and noise are drawn from torch's global generator.
+    Reads ``("history", "state")`` [B, To, Ds] and ``"action"`` [B, H, A], both in environment units, with
+    ``vision`` also the cameras' histories; writes ``"loss"``. Timestep and noise are drawn from torch's global generator.
 
     Args:
         network: the network to train; its parameters are the loss module's.
         normalizer: of states and actions.
         schedule: gives the noise levels; DDPM with 100 by default.
+        vision: encoder of the cameras, if the policy has any; trained with the network.
 
     Examples:
         >>> network = TransformerForDiffusion(
@@ -59,15 +62,20 @@ class DiffusionLoss(LossModule):
         torch.Size([])
     """
 
-    in_keys = [keys.HISTORY_STATE, keys.ACTION]
     out_keys = ["loss"]
 
     def __init__(
-        self, network: TransformerForDiffusion, normalizer: Normalizer, schedule: NoiseSchedule | None = None
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        schedule: NoiseSchedule | None = None,
+        vision: VisionEncoder | None = None,
     ) -> None:
         super().__init__()
         self.network = network
         self.normalizer = normalizer
+        self.condition = ConditionEncoder(normalizer, vision)
+        self.in_keys = [*self.condition.in_keys, keys.ACTION]
         self.schedule = NoiseSchedule() if schedule is None else schedule
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -83,7 +91,7 @@ class DiffusionLoss(LossModule):
                 f"{keys.ACTION}: expected shape [B, {chunk[0]}, {chunk[1]}], got {list(action.shape)}"
             )
         action = self.normalizer.normalize_action(action)
-        cond = self.normalizer.normalize_state(tensordict.get(keys.HISTORY_STATE))
+        cond = self.condition(tensordict)
         timestep = torch.randint(self.schedule.num_train_timesteps, (len(action),), device=action.device)
         noise = torch.randn_like(action)
         loss = noise_prediction_loss(self.network, self.schedule, action, cond, noise, timestep)

@@ -23,23 +23,28 @@ from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import Reuse, query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.checkpoints.pretrained import read_pretrained, write_pretrained
+from torchrl_sparse.policies.checkpoints.diffusion_policy import read_diffusion_policy
+from torchrl_sparse.policies.checkpoints.pretrained import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.policies.clock import synchronised_clock
-from torchrl_sparse.policies.diffusion.noise import query_seed, sample_noise
+from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.noise import sample_noise
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 
 
 class DiffusionPolicy(TensorDictSequential):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
-    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds]. The noise of a query follows from ``("episode", "seed")`` and
-    ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does), else from torch's global generator.
-    Writes the chunk, from the present step on, and everything that a table needs: see ``out_keys``.
+    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise
+    of a query follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them
+    (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
+    everything that a table needs: see ``out_keys``.
 
     Args:
         network: the denoiser.
         normalizer: of states and actions.
+        vision: encoder of the cameras; their features come before the state in the network's condition.
         schedule: sampler; DDPM with all training steps by default.
         plan: what to skip; nothing by default.
         engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
@@ -50,6 +55,7 @@ class DiffusionPolicy(TensorDictSequential):
     Attributes:
         plan: the planner. Assign another to change the method: ``policy.plan = planner``.
         schedule: the sampler. Assign another to change it: ``policy.schedule = NoiseSchedule("ddim", 10)``.
+        source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -65,6 +71,7 @@ class DiffusionPolicy(TensorDictSequential):
         network: TransformerForDiffusion,
         normalizer: Normalizer,
         *,
+        vision: VisionEncoder | None = None,
         schedule: NoiseSchedule | None = None,
         plan: Planner | None = None,
         engine: EngineName = "auto",
@@ -72,12 +79,13 @@ class DiffusionPolicy(TensorDictSequential):
         schedule = NoiseSchedule() if schedule is None else schedule
         plan = Dense() if plan is None else plan
         stages = OrderedDict(
-            encode=ObservationEncoder(network, normalizer),
+            encode=ObservationEncoder(network, normalizer, vision),
             plan=plan,
             denoise=ActionDenoiser(network, normalizer, schedule, engine),
         )
         super().__init__(stages)
         self.plan = plan  # binds it to this network and sampler
+        self.source: dict[str, Any] = {}
         self.eval()
 
     # -- the parts -----------------------------------------------------------------------------------------------------
@@ -89,6 +97,11 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def normalizer(self) -> Normalizer:
         return self.module["denoise"].normalizer
+
+    @property
+    def vision(self) -> VisionEncoder | None:
+        """Encoder of the cameras."""
+        return self.module["encode"].condition.vision
 
     @property
     def plan(self) -> Planner:
@@ -142,9 +155,12 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def fingerprint(self) -> str:
         """Names these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
-        digest = hashlib.sha256(repr(sorted(self.network.config.items())).encode())
-        for name, value in sorted(self.network.state_dict().items()):
-            digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
+        digest = hashlib.sha256()
+        for part in (self.network, self.vision):
+            if part is not None:
+                digest.update(repr(sorted(part.config.items())).encode())
+                for name, value in sorted(part.state_dict().items()):
+                    digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
         return digest.hexdigest()[:16]
 
     @property
@@ -191,11 +207,10 @@ class DiffusionPolicy(TensorDictSequential):
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
-    def save_pretrained(self, path: str | Path) -> None:
-        """Writes ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
-        write_pretrained(
-            Path(path), network=self.network, normalizer=self.normalizer, schedule=self.schedule.config
-        )
+    def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
+        """Writes ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
+        stored = StoredPolicy(self.network, self.normalizer, self.schedule, self.vision, self.source)
+        write_pretrained(Path(path), stored, half=half)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
@@ -204,45 +219,33 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        network, normalizer, schedule = read_pretrained(Path(path))
-        return cls(network, normalizer, schedule=NoiseSchedule(**schedule), engine=engine)
+        return cls._assemble(read_pretrained(Path(path)), engine)
 
+    @classmethod
+    def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
+        """Reads a ``.ckpt`` of the published code (`torchrl_sparse.policies.checkpoints.diffusion_policy`).
 
-class ObservationEncoder(TensorDictModuleBase):
-    """Normalised observations as the denoiser's condition, and the seed of the query's noise."""
+        The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
+        what the policy was trained for. Nothing in the file is executed.
 
-    in_keys = [keys.HISTORY_STATE, keys.EPISODE_SEED, keys.EPISODE_STEP]
-    out_keys = [keys.COND, keys.SEED]
+        Raises:
+            FileNotFoundError: if there is no file.
+            CheckpointError: a ValueError that names the file, what was expected in it and what was found.
 
-    def __init__(self, network: TransformerForDiffusion, normalizer: Normalizer):
-        super().__init__()
-        self.normalizer = normalizer
-        self._state_shape = (network.n_obs_steps, network.cond_dim)
+        Examples:
+            >>> policy = DiffusionPolicy.from_diffusion_policy("latest.ckpt")  # doctest: +SKIP
+            >>> policy.source["state_keys"]  # doctest: +SKIP
+            ['object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos']
+        """
+        return cls._assemble(read_diffusion_policy(path), engine)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        state = keys.read(tensordict, keys.HISTORY_STATE)
-        self._check(state)
-        tensordict.set(keys.COND, self.normalizer.normalize_state(state))
-        return tensordict.set(keys.SEED, self._seed(tensordict))
-
-    def _check(self, state: Tensor) -> None:
-        if tuple(state.shape[-2:]) != self._state_shape:
-            raise ValueError(
-                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self._state_shape[0]}, "
-                f"{self._state_shape[1]}], got {list(state.shape)}"
-            )
-        if not state.isfinite().all():
-            bad = (~state.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
-                f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
-            )
-
-    @staticmethod
-    def _seed(tensordict: TensorDictBase) -> Tensor:
-        seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
-        if seed is None or step is None:
-            return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
-        return query_seed(seed, step)
+    @classmethod
+    def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
+        policy = cls(
+            stored.network, stored.normalizer, vision=stored.vision, schedule=stored.schedule, engine=engine
+        )
+        policy.source = stored.source
+        return policy
 
 
 class ActionDenoiser(TensorDictModuleBase):

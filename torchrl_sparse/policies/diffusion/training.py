@@ -5,16 +5,20 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.loss import DiffusionLoss
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.trainer import TrainConfig, Trainer, split_windows
 
 __all__ = ["PolicyTrainer"]
+
+_VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
 
 
 class PolicyTrainer(Trainer):
@@ -25,6 +29,7 @@ class PolicyTrainer(Trainer):
         normalizer: of states and actions.
         demos: demonstrations.
         config: how to train.
+        vision: encoder of the cameras that the demonstrations have images of, trained in place.
 
     Attributes:
         step: optimiser steps taken.
@@ -40,12 +45,25 @@ class PolicyTrainer(Trainer):
         normalizer: Normalizer,
         demos: Demonstrations,
         config: TrainConfig,
+        vision: VisionEncoder | None = None,
     ) -> None:
-        self.normalizer, self.demos = normalizer, demos
-        self.loss = DiffusionLoss(network, normalizer, NoiseSchedule())
+        self.network, self.normalizer, self.demos, self.vision = network, normalizer, demos, vision
+        self.loss = DiffusionLoss(network, normalizer, NoiseSchedule(), vision)
+        self._data_checksum = sum(_checksum(value) for value in demos.data.values(True, True))
         sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
-        groups = optimizer_groups(network, config.weight_decay)
-        super().__init__(network, config, groups, *split_windows(demos, sizes, config.val_ratio))
+        groups, trained = optimizer_groups(network, config.weight_decay), network
+        if vision is not None:
+            groups.append({"params": [*vision.parameters()], "weight_decay": _VISION_WEIGHT_DECAY})
+            trained = nn.ModuleDict({"network": network, "vision": vision})
+        super().__init__(trained, config, groups, *split_windows(demos, sizes, config.val_ratio))
+
+    def ema_policy(self, schedule: NoiseSchedule | None = None) -> DiffusionPolicy:
+        """The policy with copies of the networks and the averaged weights in them; ``schedule`` is its sampler."""
+        averaged = self.averaged()
+        network, vision = (
+            (averaged, None) if self.vision is None else (averaged["network"], averaged["vision"])
+        )
+        return DiffusionPolicy(network, self.normalizer, vision=vision, schedule=schedule)
 
     def batch_loss(self, rows: Tensor) -> Tensor:
         batch = self.demos.windows(rows, self.network.n_obs_steps)
@@ -54,12 +72,14 @@ class PolicyTrainer(Trainer):
             return self.loss(batch.to(device)).get("loss")
 
     def header(self) -> dict[str, dict]:
-        data = self.demos.data
-        return {
+        header = {
             "config": asdict(self.config),
             "network_config": dict(self.network.config),
-            "data": {
-                "windows": len(self.train_rows),
-                "checksum": sum(float(v.double().sum()) for v in data.values(True, True)),
-            },
+            "data": {"windows": len(self.train_rows), "checksum": self._data_checksum},
         }
+        return header if self.vision is None else header | {"vision_config": dict(self.vision.config)}
+
+
+def _checksum(value: Tensor) -> float:
+    """Sum of all entries; images are summed without a copy of them in another type."""
+    return float(value.double().sum() if value.is_floating_point() else value.sum(dtype=torch.int64))

@@ -82,8 +82,8 @@ class VLATrainer(Trainer):
         super().__init__(policy.network, config, groups, *rows)
 
     def batch_loss(self, rows: Tensor) -> Tensor:
-        observed = [*self.network.config.cameras, keys.STATE]
-        device = next(self.network.parameters()).device
+        observed = [*self.trained.config.cameras, keys.STATE]
+        device = next(self.trained.parameters()).device
         batch = self.demos.windows(rows, observed).to(device)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             return self.loss(batch).get("loss")
@@ -91,12 +91,12 @@ class VLATrainer(Trainer):
     def header(self) -> dict[str, dict]:
         data = self.demos.episodes.data
         numbers = {
-            "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.network.config.cameras
+            "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.trained.config.cameras
         }
         numbers |= {name: float(data[name].double().sum()) for name in (keys.ACTION,)}
         return {
             "config": asdict(self.config),
-            "network_config": self.network.config.to_dict(),
+            "network_config": self.trained.config.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
                 "instructions": list(self.demos.instructions),

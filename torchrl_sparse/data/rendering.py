@@ -1,0 +1,59 @@
+"""Camera images for demonstrations that were recorded without."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from tqdm import tqdm
+
+from torchrl_sparse.data.demos import read_initial_state
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.files import atomic_path
+
+__all__ = ["render_demos"]
+
+
+def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, image_size: int = 84) -> None:
+    """Copies a demonstration file and adds ``obs/<camera>_image``, u8 [T, h, w, 3], to every demonstration.
+
+    Images are rendered from the simulator states that were recorded, so experts run once and cameras can be
+    chosen later. Pictures of a running episode are one physics step, 2 ms, behind its states; these are not.
+    ``out`` appears when it is complete.
+
+    Args:
+        path: a file of `torchrl_sparse.data.demos.collect`.
+        out: the file to write.
+        cameras: robosuite's names, e.g. "agentview" and "robot0_eye_in_hand".
+        image_size: height and width, pixels.
+
+    Raises:
+        RuntimeError: if no GL library is installed.
+        ValueError: if there is no such camera, or ``out`` is ``path``.
+    """
+    if Path(path).resolve() == Path(out).resolve():
+        raise ValueError(f"out: expected another file than the demonstrations, got {out}")
+    with atomic_path(Path(out)) as temporary, h5py.File(path) as source, h5py.File(temporary, "w") as file:
+        source.copy("data", file)
+        env = RobosuiteEnv(json.loads(file["data"].attrs["env_args"])["env_name"])
+        for index in tqdm(range(len(file["data"])), unit="demo"):
+            env.reset(initial_state=read_initial_state(path, index))
+            demo = file[f"data/demo_{index}"]
+            for camera, images in _render(env, demo["states"][:], cameras, image_size).items():
+                demo.create_dataset(f"obs/{camera}_image", data=images, compression="lzf")
+        env.close()
+
+
+def _render(
+    env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int
+) -> dict[str, np.ndarray]:
+    images: dict[str, list[np.ndarray]] = {camera: [] for camera in cameras}
+    for state in states:
+        env.sim_env.sim.set_state_from_flattened(state)
+        env.sim_env.sim.forward()
+        for camera in cameras:
+            images[camera].append(env.render(camera, size, size))
+    return {camera: np.stack(frames) for camera, frames in images.items()}

@@ -1,0 +1,107 @@
+"""What a policy observes as the denoiser's condition: normalised states, with features of the cameras before them."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.noise import query_seed
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.vision import VisionEncoder
+
+__all__ = ["ConditionEncoder", "ObservationEncoder"]
+
+
+class ConditionEncoder(nn.Module):
+    """The condition f32 [*B, To, D] of what a TensorDict observes; D is the features' size and the state's together.
+
+    Args:
+        normalizer: of states.
+        vision: encoder of the cameras; None reads the state alone.
+
+    Attributes:
+        in_keys: what it reads: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
+            u8 [*B, To, 3, h, w] of each camera.
+    """
+
+    def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
+        super().__init__()
+        self.normalizer, self.vision = normalizer, vision
+        self.in_keys: list[NestedKey] = [keys.HISTORY_STATE]
+        if vision is not None:
+            self.in_keys += [keys.history(name) for name in vision.cameras]
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """Encodes one batch.
+
+        Raises:
+            KeyError: if an observation is missing.
+            ValueError: if images do not fit the encoder.
+        """
+        state = self.normalizer.normalize_state(keys.read(tensordict, keys.HISTORY_STATE))
+        if self.vision is None:
+            return state
+        images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
+        return torch.cat([self.vision(images), state], dim=-1)
+
+
+class ObservationEncoder(TensorDictModuleBase):
+    """Writes the denoiser's condition, and the seed of the query's noise.
+
+    Args:
+        network: the denoiser, for the sizes.
+        normalizer: of states.
+        vision: encoder of the cameras, if there are any.
+
+    Raises:
+        ValueError: if features and state together are not what the network expects.
+    """
+
+    out_keys = [keys.COND, keys.SEED]
+
+    def __init__(
+        self, network: TransformerForDiffusion, normalizer: Normalizer, vision: VisionEncoder | None = None
+    ) -> None:
+        super().__init__()
+        self.condition = ConditionEncoder(normalizer, vision)
+        self.in_keys = [*self.condition.in_keys, keys.EPISODE_SEED, keys.EPISODE_STEP]
+        features = 0 if vision is None else vision.feature_dim
+        state = len(normalizer.state_scale)
+        if features + state != network.cond_dim:
+            raise ValueError(
+                f"network: expected cond_dim {features + state} (image features {features}, state {state}), "
+                f"got {network.cond_dim}"
+            )
+        self._state_shape = (network.n_obs_steps, state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check(keys.read(tensordict, keys.HISTORY_STATE))
+        # In use, weights of the cameras' networks are no reason to keep a graph; observations still are.
+        encoder = self.condition.vision
+        frozen = encoder is not None and not self.training
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
+            tensordict.set(keys.COND, self.condition(tensordict))
+        return tensordict.set(keys.SEED, self._seed(tensordict))
+
+    def _check(self, state: Tensor) -> None:
+        if tuple(state.shape[-2:]) != self._state_shape:
+            raise ValueError(
+                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self._state_shape[0]}, "
+                f"{self._state_shape[1]}], got {list(state.shape)}"
+            )
+        if not state.isfinite().all():
+            bad = (~state.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
+            )
+
+    @staticmethod
+    def _seed(tensordict: TensorDictBase) -> Tensor:
+        seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
+        if seed is None or step is None:
+            return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
+        return query_seed(seed, step)
