@@ -155,7 +155,9 @@ def collect(
     _claim(parts, settings)
     kept: list[Path] = []
     tally = Summary(0, 0, 0, 0.0)
-    make = partial(_make_part, parts, collection.task, collection.quality, env if workers == 1 else None)
+    own = cache(lambda: RobosuiteEnv(collection.task) if env is None else env)
+    environment = own if workers == 1 else partial(_worker_env, collection.task)
+    make = partial(_make_part, parts, collection.quality, environment)
     first = collection.seed
     seeds = in_order(make, first, workers) if workers > 1 else (make(seed) for seed in itertools.count(first))
     with closing(seeds):
@@ -175,16 +177,16 @@ def _part(parts: Path, seed: int) -> Path:
     return parts / f"{seed:010d}.h5"
 
 
-def _make_part(parts: Path, task: str, quality: str, env: RobosuiteEnv | None, seed: int) -> int:
+def _make_part(parts: Path, quality: str, environment: Callable[[], RobosuiteEnv], seed: int) -> int:
     """Makes the episode of a seed, unless it is there; returns the seed."""
     if not _part(parts, seed).exists():
-        write_episode(_part(parts, seed), demonstrate(env or _own_env(task), seed, quality))
+        write_episode(_part(parts, seed), demonstrate(environment(), seed, quality))
     return seed
 
 
 @cache
-def _own_env(task: str) -> RobosuiteEnv:
-    """The environment of this process: making one takes longer than an episode."""
+def _worker_env(task: str) -> RobosuiteEnv:
+    """The environment of a worker process: making one takes longer than an episode."""
     return RobosuiteEnv(task)
 
 

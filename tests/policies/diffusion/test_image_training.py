@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torchrl_sparse import DiffusionPolicy, Normalizer, TransformerForDiffusion, keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer
-from torchrl_sparse.policies.trainer import TrainConfig
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
+from torchrl_sparse.policies.trainer import TrainConfig
 
 
 @pytest.fixture
