@@ -18,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
-from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
@@ -31,6 +30,7 @@ from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.training_loop import make_logger
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -108,7 +108,8 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
 
 def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
     """Updates until the end or a signal, logging and saving on the way."""
-    logger = make_logger(config)
+    settings = OmegaConf.to_container(config, resolve=True)
+    logger = make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode)
     with tqdm(total=trainer.total, initial=trainer.step, unit="update", mininterval=2) as bar:
         while trainer.step < trainer.total and stop.name is None:
             metrics = trainer.train_step()
@@ -143,15 +144,6 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     )
     SAGPruner(trainer.gates, info).save_pretrained(out / "pruner")
     return out / "pruner"
-
-
-def make_logger(config: DictConfig) -> Logger:
-    wandb = {
-        "project": "torchrl_sparse",
-        "mode": config.wandb_mode,
-        "config": OmegaConf.to_container(config, resolve=True),
-    }
-    return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,145 @@
+"""Three cubes, one of them named: scene and words follow from the seed, and only the named cube counts."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import SerialEnv
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.realtime_executor import HoldPose
+from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_initial_state
+from torchrl_sparse.data.instructions import read_instructions
+from torchrl_sparse.envs.named_lift import COLOURS, SPACING, X_RANGE, Y_RANGE
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.tasks import get_task
+
+WORDS = [f"lift the {colour} cube" for colour in COLOURS]
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = RobosuiteEnv("lift_named", instruction=True)
+    yield env
+    env.close()
+
+
+def start(env, seed):
+    env.set_seed(seed)
+    return env.reset()
+
+
+def places(env):
+    """f64 [3, 3] of the cubes, m."""
+    sim = env.sim_env.sim
+    return np.stack(
+        [sim.data.body_xpos[sim.model.body_name2id(cube.root_body)] for cube in env.sim_env.cubes.values()]
+    )
+
+
+def succeeds_with(env, state, colour):
+    """Whether the episode from ``state`` ends in success when this cube is up in the air."""
+    td = env.reset(initial_state=state)
+    sim, joint = env.sim_env.sim, env.sim_env.cubes[colour].joints[0]
+    pose = sim.data.get_joint_qpos(joint).copy()
+    sim.data.set_joint_qpos(joint, [*pose[:2], 1.2, *pose[3:]])
+    sim.forward()
+    td = env.step(td.set(keys.ACTION, HoldPose(env.task)(td.clone())[keys.HOLD]))["next"]
+    return bool(td[keys.SUCCESS])
+
+
+def test_a_seed_fixes_scene_and_instruction(env):
+    first = [(start(env, seed)[keys.INSTRUCTION], places(env)) for seed in range(8)]
+    again = [(start(env, seed)[keys.INSTRUCTION], places(env)) for seed in range(8)]
+    assert {words for words, _ in first} == set(WORDS)
+    for (words, scene), (other, same) in zip(first, again, strict=True):
+        assert words == other
+        np.testing.assert_array_equal(scene, same)
+    assert all(np.abs(one - two).max() > 0.01 for (_, one), (_, two) in combinations(first, 2))
+
+
+def test_cubes_lie_apart_on_the_table(env):
+    low, high = np.transpose([X_RANGE, Y_RANGE])
+    for seed in range(8):
+        start(env, seed)
+        centres = places(env)[:, :2]
+        assert (centres >= low).all()
+        assert (centres <= high).all()
+        assert min(np.linalg.norm(a - b) for a, b in combinations(centres, 2)) >= SPACING
+
+
+def test_the_instruction_decides_which_cube_counts_in_the_same_scene(env):
+    start(env, 3)
+    state = env.get_initial_state()
+    won = [[succeeds_with(env, replace(state, instruction=w), c) for c in COLOURS] for w in WORDS]
+    np.testing.assert_array_equal(won, np.eye(3, dtype=bool))
+
+
+def test_words_of_the_caller_replace_those_drawn_and_nothing_else(env):
+    start(env, 4)
+    scene = places(env)
+    for words in WORDS:
+        fixed = RobosuiteEnv("LiftNamed", instruction=words, seeds=[4])
+        assert fixed.reset()[keys.INSTRUCTION] == words
+        np.testing.assert_array_equal(places(fixed), scene)
+        fixed.close()
+
+
+def test_a_saved_start_keeps_its_instruction(env):
+    words = [start(env, seed)[keys.INSTRUCTION] for seed in range(8)]
+    other = next(seed for seed in range(8) if words[seed] != words[0])
+    start(env, 0)
+    state = env.get_initial_state()
+    start(env, other)
+    assert env.reset(initial_state=state)[keys.INSTRUCTION] == words[0]
+
+
+def test_the_state_is_that_of_the_named_cube(env):
+    td = start(env, 5)
+    named = places(env)[WORDS.index(td[keys.INSTRUCTION])]
+    np.testing.assert_allclose(td[keys.STATE][:3], named, atol=1e-6)
+    assert td[keys.STATE].shape == (get_task("LiftNamed").state_dim,)
+
+
+def test_unknown_words_are_refused(env):
+    with pytest.raises(ValueError, match="instruction: expected one of 'lift the red cube'.* got 'lift it'"):
+        RobosuiteEnv("LiftNamed", instruction="lift it")
+    start(env, 0)
+    state = replace(env.get_initial_state(), instruction="lift the pink cube")
+    with pytest.raises(ValueError, match="got 'lift the pink cube'"):
+        env.reset(initial_state=state)
+
+
+def test_each_environment_of_a_batch_has_its_own_words(env):
+    words = [start(env, seed)[keys.INSTRUCTION] for seed in range(8)]
+    other = next(seed for seed in range(8) if words[seed] != words[0])
+    options = [{"seeds": [0, other]}, {"seeds": [other, 0]}]
+    batch = SerialEnv(2, lambda seeds: RobosuiteEnv("LiftNamed", instruction=True, seeds=seeds), options)
+    assert batch.reset()[keys.INSTRUCTION] == [words[0], words[other]]
+    td = batch.reset()
+    assert td[keys.INSTRUCTION] == [words[other], words[0]]
+    td = batch.step(td.set(keys.ACTION, torch.zeros(2, 10)))["next"]
+    assert td[keys.INSTRUCTION] == [words[other], words[0]]
+    batch.close()
+
+
+def test_the_expert_lifts_the_named_cube_and_leaves_the_others(env):
+    for seed in range(30_000, 30_003):
+        assert demonstrate(env, seed).success
+        named = WORDS.index(env.instruction)
+        heights = places(env)[:, 2]
+        assert heights[named] > 0.84
+        assert np.delete(heights, named).max() < 0.83
+
+
+def test_demonstrations_tell_what_they_were_asked(env, tmp_path):
+    path = tmp_path / "named.h5"
+    collect(path, Collection("LiftNamed", episodes=2, seed=50), env=env)
+    found = read_instructions(path)
+    with h5py.File(path) as file:
+        seeds = [int(file[f"data/demo_{index}"].attrs["seed"]) for index in range(2)]
+    assert found == [start(env, seed)[keys.INSTRUCTION] for seed in seeds]
+    assert read_initial_state(path, 1).instruction == found[1]
