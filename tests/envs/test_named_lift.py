@@ -105,7 +105,7 @@ def test_the_state_is_that_of_the_named_cube(env):
 
 
 def test_unknown_words_are_refused(env):
-    with pytest.raises(ValueError, match="instruction: expected one of 'lift the red cube'.* got 'lift it'"):
+    with pytest.raises(ValueError, match=r"instruction: expected one of 'lift the red cube'.* got 'lift it'"):
         RobosuiteEnv("LiftNamed", instruction="lift it")
     start(env, 0)
     state = replace(env.get_initial_state(), instruction="lift the pink cube")
