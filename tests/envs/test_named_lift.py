@@ -6,7 +6,6 @@ from itertools import combinations
 import h5py
 import numpy as np
 import pytest
-import torch
 from torchrl.envs import SerialEnv
 
 from torchrl_sparse import keys
@@ -114,15 +113,21 @@ def test_unknown_words_are_refused(env):
 
 
 def test_each_environment_of_a_batch_has_its_own_words(env):
-    words = [start(env, seed)[keys.INSTRUCTION] for seed in range(8)]
-    other = next(seed for seed in range(8) if words[seed] != words[0])
-    options = [{"seeds": [0, other]}, {"seeds": [other, 0]}]
-    batch = SerialEnv(2, lambda seeds: RobosuiteEnv("LiftNamed", instruction=True, seeds=seeds), options)
-    assert batch.reset()[keys.INSTRUCTION] == [words[0], words[other]]
-    td = batch.reset()
-    assert td[keys.INSTRUCTION] == [words[other], words[0]]
-    td = batch.step(td.set(keys.ACTION, torch.zeros(2, 10)))["next"]
-    assert td[keys.INSTRUCTION] == [words[other], words[0]]
+    words = {seed: start(env, seed)[keys.INSTRUCTION] for seed in range(8)}
+
+    def make(**options):
+        return RobosuiteEnv("LiftNamed", instruction=True, action_mode="delta", **options)
+
+    # One ends at every step, the other at every second, so that resets are partial ones too.
+    options = [{"seeds": [0, 1, 2, 3], "horizon": 1}, {"seeds": [4, 5, 6, 7], "horizon": 2}]
+    batch = SerialEnv(2, make, create_env_kwargs=options)
+    steps = batch.rollout(4, break_when_any_done=False)
+    seeds = steps[keys.EPISODE_SEED].squeeze(-1)
+    assert seeds.tolist() == [[0, 1, 2, 3], [4, 4, 5, 5]]
+    for index, row in enumerate(steps.unbind(0)):
+        for step, td in enumerate(row.unbind(0)):
+            assert td[keys.INSTRUCTION] == words[int(seeds[index, step])]
+            assert td["next", keys.INSTRUCTION] == words[int(seeds[index, step])]
     batch.close()
 
 

@@ -187,6 +187,13 @@ class RobosuiteEnv(EnvBase):
         self._episode_seed, self._restored_xml = state.seed, state.model_xml
         self._ask_for(state.instruction)
 
+    def get_initial_state(self) -> InitialState:
+        """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
+        # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
+        model_xml = self._restored_xml or self.sim_env.model.get_xml()
+        state = self.sim_env.sim.get_state().flatten()
+        return InitialState(model_xml, state, self._episode_seed, self.instruction)
+
     # -- what is asked for ---------------------------------------------------------------------------------------------
 
     @property
@@ -206,13 +213,6 @@ class RobosuiteEnv(EnvBase):
             self.sim_env.instruction = words
 
     # -- steps ---------------------------------------------------------------------------------------------------------
-
-    def get_initial_state(self) -> InitialState:
-        """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
-        # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
-        model_xml = self._restored_xml or self.sim_env.model.get_xml()
-        state = self.sim_env.sim.get_state().flatten()
-        return InitialState(model_xml, state, self._episode_seed, self.instruction)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._check_action(tensordict.get(keys.ACTION))
