@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -173,6 +174,34 @@ def test_a_killed_sweep_goes_on_and_ends_with_every_trial(work):
 def test_report_makes_one_page_of_what_was_measured(work):
     assert "report.html: " in run("report", "runs=assets", f"out={work}/report.html")
     assert "lift/results.json" in (work / "report.html").read_text()
+
+
+def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedules):
+    training = (
+        f"policy={policy}", f"demos={demos}", "sampler={kind: ddim, num_inference_steps: 5}", "reference.share=0.3",
+        "rate=0.5", "train.max_updates=2", "train.batch_size=4", "log_every=1", "checkpoint_every=1",
+    )  # fmt: skip
+    output = run("train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]")
+    assert "update 2 of 2, finished" in output
+    assert "going on from update 2" in run(
+        "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
+    )
+    assert iio.imread(work / "sag" / "curves.png").std() > 5
+    run("train_pruner", "method=l2c", "reuse=block", *training, f"out={work}/l2c")
+    plans = shutil.copytree(schedules, work / "plans")
+    shutil.copytree(work / "sag" / "pruner", plans / "sag")
+    shutil.copy(work / "l2c" / "l2c.json", plans)
+
+    methods = ("dense", "l2c", "sag@0.5", "sag@0.6-0.4")
+    output = run(
+        "benchmark", f"policy={policy}", f"schedules={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
+        "episodes=1", "horizon=16", "latency_repeats=2", "probe_episodes=1", "videos=[sag@0.5]", f"out={work}/sparse",
+    )  # fmt: skip
+    assert tuple(load_results(work / "sparse" / "results.json")["methods"]) == methods
+    for name in methods[2:]:
+        assert iio.imread(work / "sparse" / f"strip_{name}.png").std() > 5
+        assert iio.imread(work / "sparse" / f"masks_{name}.png").std() > 5
+    assert (work / "sparse" / "rollout_sag@0.5.mp4").exists() or "rendering needs a GL library" in output
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):

@@ -28,6 +28,7 @@ _HOME = {
     "Schedule": "blocks.static",
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
+    "SAGPruner": "blocks.sag",
     "make_engine": "blocks.engine.factory",
     "SpecPrune": "tokens.specprune",
     "ActionAwareController": "control.action_aware",
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.bac import BAC
     from torchrl_sparse.blocks.engine.factory import make_engine
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
+    from torchrl_sparse.blocks.sag import SAGPruner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform
     from torchrl_sparse.control.action_aware import ActionAwareController
