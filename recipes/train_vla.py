@@ -61,7 +61,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     episodes = read_demos(
         config.demos,
         get_task(config.task).proprioception_keys,
-        cameras=config.cameras,
+        cameras=chosen_cameras(config),
         image_folder=Path(config.out) / "images",
     )
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos))
@@ -83,11 +83,16 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     return trainer
 
 
+def chosen_cameras(config: DictConfig) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations."""
+    return {name: key for name, key in config.cameras.items() if key is not None}
+
+
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:
     """The size that was asked for, with what the demonstrations decide."""
     if config.size not in SIZES:
         raise ValueError(f"size: expected one of {', '.join(SIZES)}, got {config.size!r}")
-    cameras = [["observation", name] for name in config.cameras]
+    cameras = [["observation", name] for name in chosen_cameras(config)]
     decided = {
         "cameras": cameras,
         "image_size": data[tuple(cameras[0])].shape[-1],
@@ -116,7 +121,7 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
     from torchrl_sparse.evaluation.paired import rollout_episodes
 
     options = {"image": "camera", "wrist_image": "wrist_camera"}
-    cameras = {options[name]: key.removesuffix("_image") for name, key in config.cameras.items()}
+    cameras = {options[name]: key.removesuffix("_image") for name, key in chosen_cameras(config).items()}
     size = trainer.policy.network.config.image_size
     episodes = rollout_episodes(
         ChunkExecutor(averaged_policy(trainer), config.n_action_steps),

@@ -50,21 +50,30 @@ def succeeds_with(env, state, colour):
     return bool(td[keys.SUCCESS])
 
 
-def test_a_seed_fixes_scene_and_instruction(env):
-    first = [(start(env, seed)[keys.INSTRUCTION], places(env)) for seed in range(8)]
-    again = [(start(env, seed)[keys.INSTRUCTION], places(env)) for seed in range(8)]
-    assert {words for words, _ in first} == set(WORDS)
-    for (words, scene), (other, same) in zip(first, again, strict=True):
-        assert words == other
-        np.testing.assert_array_equal(scene, same)
-    assert all(np.abs(one - two).max() > 0.01 for (_, one), (_, two) in combinations(first, 2))
+@pytest.fixture(scope="module")
+def drawn(env):
+    """What a dozen seeds draw: instruction, and f64 [3, 3] of the cubes."""
+    return [(start(env, seed)[keys.INSTRUCTION], places(env)) for seed in range(12)]
 
 
-def test_cubes_lie_apart_on_the_table(env):
+@pytest.fixture(scope="module")
+def other(drawn):
+    """A seed that asks for something else than seed 0."""
+    return next(seed for seed, (words, _) in enumerate(drawn) if words != drawn[0][0])
+
+
+def test_a_seed_fixes_scene_and_instruction(env, drawn):
+    for seed in (7, 2, 0):
+        assert start(env, seed)[keys.INSTRUCTION] == drawn[seed][0]
+        np.testing.assert_array_equal(places(env), drawn[seed][1])
+    assert {words for words, _ in drawn} == set(WORDS)
+    assert all(np.abs(one - two).max() > 0.01 for (_, one), (_, two) in combinations(drawn, 2))
+
+
+def test_cubes_lie_apart_on_the_table(drawn):
     low, high = np.transpose([X_RANGE, Y_RANGE])
-    for seed in range(8):
-        start(env, seed)
-        centres = places(env)[:, :2]
+    for _, scene in drawn:
+        centres = scene[:, :2]
         assert (centres >= low).all()
         assert (centres <= high).all()
         assert min(np.linalg.norm(a - b) for a, b in combinations(centres, 2)) >= SPACING
@@ -87,13 +96,11 @@ def test_words_of_the_caller_replace_those_drawn_and_nothing_else(env):
         fixed.close()
 
 
-def test_a_saved_start_keeps_its_instruction(env):
-    words = [start(env, seed)[keys.INSTRUCTION] for seed in range(8)]
-    other = next(seed for seed in range(8) if words[seed] != words[0])
+def test_a_saved_start_keeps_its_instruction(env, drawn, other):
     start(env, 0)
     state = env.get_initial_state()
-    start(env, other)
-    assert env.reset(initial_state=state)[keys.INSTRUCTION] == words[0]
+    assert start(env, other)[keys.INSTRUCTION] != drawn[0][0]
+    assert env.reset(initial_state=state)[keys.INSTRUCTION] == drawn[0][0]
 
 
 def test_the_state_is_that_of_the_named_cube(env):
@@ -112,9 +119,7 @@ def test_unknown_words_are_refused(env):
         env.reset(initial_state=state)
 
 
-def test_each_environment_of_a_batch_has_its_own_words(env):
-    words = {seed: start(env, seed)[keys.INSTRUCTION] for seed in range(8)}
-
+def test_each_environment_of_a_batch_has_its_own_words(drawn):
     def make(**options):
         return RobosuiteEnv("LiftNamed", instruction=True, action_mode="delta", **options)
 
@@ -126,8 +131,8 @@ def test_each_environment_of_a_batch_has_its_own_words(env):
     assert seeds.tolist() == [[0, 1, 2, 3], [4, 4, 5, 5]]
     for index, row in enumerate(steps.unbind(0)):
         for step, td in enumerate(row.unbind(0)):
-            assert td[keys.INSTRUCTION] == words[int(seeds[index, step])]
-            assert td["next", keys.INSTRUCTION] == words[int(seeds[index, step])]
+            assert td[keys.INSTRUCTION] == drawn[seeds[index, step]][0]
+            assert td["next", keys.INSTRUCTION] == drawn[seeds[index, step]][0]
     batch.close()
 
 
