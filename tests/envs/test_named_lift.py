@@ -132,7 +132,6 @@ def test_each_environment_of_a_batch_has_its_own_words(drawn):
     for index, row in enumerate(steps.unbind(0)):
         for step, td in enumerate(row.unbind(0)):
             assert td[keys.INSTRUCTION] == drawn[seeds[index, step]][0]
-            assert td["next", keys.INSTRUCTION] == drawn[seeds[index, step]][0]
     batch.close()
 
 
