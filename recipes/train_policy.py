@@ -16,13 +16,14 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torchrl.record.loggers import Logger, get_logger
+from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.evaluation.tracking import training_logger
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -42,7 +43,14 @@ def main(config: DictConfig) -> None:
         trainer.load(out / "checkpoint.pt")
         print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
     stop = StopSignal()
-    train(trainer, config, make_logger(config), stop)
+    train(
+        trainer,
+        config,
+        training_logger(
+            config.logger, config.out, config.wandb_mode, OmegaConf.to_container(config, resolve=True)
+        ),
+        stop,
+    )
     save(trainer, config)
     how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
     print(f"{out / 'policy'}: step {trainer.step} of {trainer.config.max_steps}, {how}")
@@ -146,15 +154,6 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None
     rate = sum(episode.success for episode in episodes) / len(episodes)
     tqdm.write(f"step {trainer.step}: success rate {rate:.2f} of {len(episodes)} episodes")
     logger.log_metrics({"eval/success": rate}, step=trainer.step)
-
-
-def make_logger(config: DictConfig) -> Logger:
-    wandb = {
-        "project": "torchrl_sparse",
-        "mode": config.wandb_mode,
-        "config": OmegaConf.to_container(config, resolve=True),
-    }
-    return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDict
-from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
@@ -26,6 +25,7 @@ from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, m
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.evaluation.tracking import training_logger
 from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
@@ -108,7 +108,9 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
 
 def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
     """Updates until the end or a signal, logging and saving on the way."""
-    logger = make_logger(config)
+    logger = training_logger(
+        config.logger, config.out, config.wandb_mode, OmegaConf.to_container(config, resolve=True)
+    )
     with tqdm(total=trainer.total, initial=trainer.step, unit="update", mininterval=2) as bar:
         while trainer.step < trainer.total and stop.name is None:
             metrics = trainer.train_step()
@@ -143,15 +145,6 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     )
     SAGPruner(trainer.gates, info).save_pretrained(out / "pruner")
     return out / "pruner"
-
-
-def make_logger(config: DictConfig) -> Logger:
-    wandb = {
-        "project": "torchrl_sparse",
-        "mode": config.wandb_mode,
-        "config": OmegaConf.to_container(config, resolve=True),
-    }
-    return get_logger(config.logger, str(Path(config.out).resolve()), "log", wandb_kwargs=wandb)
 
 
 if __name__ == "__main__":
