@@ -9,21 +9,17 @@
 from __future__ import annotations
 
 import importlib.util
-import time
 from functools import partial
 from pathlib import Path
 
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torchrl.record.loggers import Logger
-from tqdm import tqdm
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.evaluation.tracking import training_logger
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -31,6 +27,7 @@ from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.trainer import TrainConfig
+from torchrl_sparse.policies.training_loop import make_logger, resume, train
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")
@@ -38,22 +35,19 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    out = Path(config.out)
-    if (out / "checkpoint.pt").exists():
-        trainer.load(out / "checkpoint.pt")
-        print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
-    stop = StopSignal()
-    train(
+    resume(trainer, config.out)
+    settings = OmegaConf.to_container(config, resolve=True)
+    how = train(
         trainer,
-        config,
-        training_logger(
-            config.logger, config.out, config.wandb_mode, OmegaConf.to_container(config, resolve=True)
-        ),
-        stop,
+        make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode),
+        StopSignal(),
+        save=partial(save, trainer, config),
+        evaluate=partial(evaluate, trainer, config),
+        log_every=config.log_every,
+        checkpoint_every=config.checkpoint_every,
+        eval_every=config.eval_every,
     )
-    save(trainer, config)
-    how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
-    print(f"{out / 'policy'}: step {trainer.step} of {trainer.config.max_steps}, {how}")
+    print(f"{Path(config.out) / 'policy'}: {how}")
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
@@ -97,27 +91,6 @@ def make_vision(demos: Demonstrations, cameras: dict[str, str], config: DictConf
     return vision.to(config.device)
 
 
-def train(trainer: PolicyTrainer, config: DictConfig, logger: Logger, stop: StopSignal) -> None:
-    """Steps until the end or a signal, logging, evaluating and saving on the way."""
-    total, losses, last = trainer.config.max_steps, [], time.perf_counter()
-    with tqdm(total=total, initial=trainer.step, unit="step", mininterval=2) as bar:
-        while trainer.step < total and stop.name is None:
-            losses.append(trainer.train_step())
-            bar.update()
-            if trainer.step % config.log_every == 0:
-                now = time.perf_counter()
-                metrics = {"train/loss": sum(losses) / len(losses), "train/lr": trainer.lr}
-                metrics["train/seconds_per_step"] = (now - last) / len(losses)
-                bar.set_postfix(loss=f"{metrics['train/loss']:.4f}")
-                logger.log_metrics(metrics, step=trainer.step)
-                losses, last = [], now
-            if trainer.step % config.checkpoint_every == 0:
-                save(trainer, config)
-                logger.log_metrics({"val/loss": trainer.validate()}, step=trainer.step)
-            if config.eval_every and trainer.step % config.eval_every == 0:
-                evaluate(trainer, config, logger)
-
-
 def save(trainer: PolicyTrainer, config: DictConfig) -> None:
     trainer.save(Path(config.out) / "checkpoint.pt")
     averaged_policy(trainer, config).save_pretrained(Path(config.out) / "policy")
@@ -133,10 +106,10 @@ def averaged_policy(
     return policy
 
 
-def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None:
-    """Logs the success rate of the averaged weights on episodes that no demonstration was made from."""
+def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
+    """Success rate of the averaged weights on episodes that no demonstration was made from; None without robosuite."""
     if importlib.util.find_spec("robosuite") is None:
-        return
+        return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.envs.transforms import make_env
     from torchrl_sparse.evaluation.methods import env_options
@@ -151,9 +124,7 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig, logger: Logger) -> None
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )
-    rate = sum(episode.success for episode in episodes) / len(episodes)
-    tqdm.write(f"step {trainer.step}: success rate {rate:.2f} of {len(episodes)} episodes")
-    logger.log_metrics({"eval/success": rate}, step=trainer.step)
+    return sum(episode.success for episode in episodes) / len(episodes)
 
 
 if __name__ == "__main__":

@@ -25,12 +25,12 @@ from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, m
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.evaluation.tracking import training_logger
 from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.training_loop import make_logger
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -108,9 +108,8 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
 
 def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
     """Updates until the end or a signal, logging and saving on the way."""
-    logger = training_logger(
-        config.logger, config.out, config.wandb_mode, OmegaConf.to_container(config, resolve=True)
-    )
+    settings = OmegaConf.to_container(config, resolve=True)
+    logger = make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode)
     with tqdm(total=trainer.total, initial=trainer.step, unit="update", mininterval=2) as bar:
         while trainer.step < trainer.total and stop.name is None:
             metrics = trainer.train_step()

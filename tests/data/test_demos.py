@@ -59,6 +59,7 @@ class FakeExpert:
         return Episode(
             seed,
             "fake",
+            "lift the fake",
             success,
             "<xml/>",
             arrays,
@@ -90,6 +91,7 @@ def test_layout_is_the_documented_one(collected):
         for index, demo in enumerate(data.values()):
             steps = demo.attrs["num_samples"]
             assert (demo.attrs["seed"], demo.attrs["operator"]) == (50 + index, "proficient")
+            assert json.loads(demo.attrs["ep_meta"]) == {"lang": "lift the red cube"}
             assert demo["actions"].shape == demo["executed_actions"].shape == (steps, 7)
             assert demo["states"].shape == (steps, 32)
             assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == [0] * (steps - 1) + [1]

@@ -23,6 +23,7 @@ import torch
 from torchrl_sparse import keys
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
+from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
@@ -108,6 +109,7 @@ def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Ep
     return Episode(
         seed=seed,
         operator=operator.name,
+        instruction=start.instruction,
         success=bool(succeeded[-1]),
         model_file=start.model_xml,
         states=np.stack([step["state"] for step in steps]),
@@ -200,7 +202,10 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
     with h5py.File(path, "r") as file:
         demo = file[f"data/demo_{index}"]
         return InitialState(
-            str(demo.attrs["model_file"]), np.asarray(demo["states"][0]), int(demo.attrs["seed"])
+            model_xml=str(demo.attrs["model_file"]),
+            sim_state=np.asarray(demo["states"][0]),
+            seed=int(demo.attrs["seed"]),
+            instruction=read_instruction(demo),
         )
 
 

@@ -6,7 +6,8 @@ in the file                   shape, type            meaning
 ``data`` attributes           ``env_args`` json,     how the environment was made; number of samples of all
                               ``total`` int          demonstrations; ``collection`` json, how they were made
 ``data/demo_<i>`` attributes  int, str, bool         ``num_samples``, ``model_file`` (MuJoCo xml), ``seed``,
-                                                     ``operator``, ``success``
+                                                     ``operator``, ``success``; ``ep_meta`` json, its ``lang`` is
+                                                     the instruction (the convention of RoboCasa's files)
 ``states``                    f64 [T, S]             simulator state before each action; the first restores
                                                      the episode's start
 ``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m;
@@ -37,6 +38,7 @@ class Episode:
 
     seed: int
     operator: str
+    instruction: str
     success: bool
     model_file: str
     states: np.ndarray
@@ -86,6 +88,7 @@ def _fill(group: h5py.Group, episode: Episode) -> None:
     group.attrs["model_file"] = episode.model_file
     group.attrs["seed"] = episode.seed
     group.attrs["operator"] = episode.operator
+    group.attrs["ep_meta"] = json.dumps({"lang": episode.instruction})
     group.attrs["success"] = episode.success
     for name in ("states", "actions", "executed_actions", "rewards", "dones"):
         group[name] = getattr(episode, name)

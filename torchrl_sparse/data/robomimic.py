@@ -126,7 +126,7 @@ def read_demos(
         raise ValueError("state_keys: expected at least one observation key, got none")
     try:
         with h5py.File(path, "r") as file:
-            names = _demo_names(path, file)
+            names = demo_names(path, file)
             episodes = [_read_episode(path, file["data"], name, state_keys) for name in names]
             lengths = [len(action) for _, action in episodes]
             steps = dict(zip(names, lengths, strict=True))
@@ -146,7 +146,8 @@ def read_demos(
     return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0))
 
 
-def _demo_names(path: Path, file: h5py.File) -> list[str]:
+def demo_names(path: Path, file: h5py.File) -> list[str]:
+    """Names of the demonstrations of an open file, in the order of their numbers; ValueError if there are none."""
     if "data" not in file or not isinstance(file["data"], h5py.Group):
         raise ValueError(f"{path}: expected a group 'data', got {sorted(file)}")
     names = [name for name in file["data"] if name.startswith("demo_") and name[5:].isdigit()]

@@ -28,11 +28,13 @@ class InitialState:
         model_xml: the MuJoCo model; robosuite randomises sizes, so it belongs to the state.
         sim_state: f64 [1 + nq + nv] time, positions, velocities.
         seed: the seed it came from.
+        instruction: what the episode asked for, one of the task's instructions; None leaves it open.
     """
 
     model_xml: str
     sim_state: np.ndarray
     seed: int
+    instruction: str | None = None
 
 
 class RobosuiteEnv(EnvBase):
@@ -52,11 +54,12 @@ class RobosuiteEnv(EnvBase):
         image_size: height and width of the images, pixels.
         object_state: False leaves the objects out of the state, as in image tasks: cameras show them.
         fast_render: see `CameraRenderer`.
-        instruction: write ``"language_instruction"``; True for the task's own words.
+        instruction: write ``"language_instruction"``; True for the episode's own words. Words of your own are written as
+            they are; for a task with several instructions they have to be one of those, and that one counts in every episode.
         reward_shaping: robosuite's dense reward instead of 1 on success.
 
     Raises:
-        ValueError: for an unknown task or action mode, or an action of a wrong size or that is not finite.
+        ValueError: for an unknown task, action mode or instruction, or an action of a wrong size or that is not finite.
 
     Examples:
         >>> env = RobosuiteEnv("Lift", seeds=[7])
@@ -95,7 +98,9 @@ class RobosuiteEnv(EnvBase):
         self._image_size = image_size
         self._state_keys = self.task.state_keys if object_state else self.task.proprioception_keys
         self._fast_render = fast_render
-        self._instruction = self.task.instruction if instruction is True else instruction
+        self._instruction = instruction
+        if isinstance(instruction, str) and self.task.has_choice:
+            self.task.check_instruction(instruction)
         self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
         self._next_seed = int(torch.randint(2**31, ()))
         self._episode_seed = self._next_seed
@@ -124,9 +129,8 @@ class RobosuiteEnv(EnvBase):
             episode=Composite(seed=self._count_spec(), step=self._count_spec()),
         )
         if self._instruction:
-            self.observation_spec[keys.INSTRUCTION] = NonTensor(
-                (), example_data=self._instruction, device=self.device
-            )
+            example = self.task.instructions[0]
+            self.observation_spec[keys.INSTRUCTION] = NonTensor((), example_data=example, device=self.device)
         if self.action_mode == "absolute":
             self.action_spec = Unbounded((ABSOLUTE_DIM * self.task.arms,), device=self.device)
         else:
@@ -170,6 +174,7 @@ class RobosuiteEnv(EnvBase):
         self.sim_env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
         self._episode_seed, self._restored_xml = seed, None
         self.sim_env.reset()
+        self._ask_for(None)
 
     def _start_from_state(self, state: InitialState) -> None:
         sim_env = self.sim_env
@@ -180,12 +185,34 @@ class RobosuiteEnv(EnvBase):
             joints = sim_env.sim.data.qpos[robot._ref_joint_pos_indexes]
             robot.part_controllers["right"].update_initial_joints(joints)
         self._episode_seed, self._restored_xml = state.seed, state.model_xml
+        self._ask_for(state.instruction)
 
     def get_initial_state(self) -> InitialState:
         """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
         # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
         model_xml = self._restored_xml or self.sim_env.model.get_xml()
-        return InitialState(model_xml, self.sim_env.sim.get_state().flatten(), self._episode_seed)
+        state = self.sim_env.sim.get_state().flatten()
+        return InitialState(model_xml, state, self._episode_seed, self.instruction)
+
+    # -- what is asked for ---------------------------------------------------------------------------------------------
+
+    @property
+    def instruction(self) -> str:
+        """What this episode asks for, in words."""
+        if isinstance(self._instruction, str):
+            return self._instruction
+        return self.sim_env.instruction if self.task.has_choice else self.task.instructions[0]
+
+    def _ask_for(self, recorded: str | None) -> None:
+        """Tells the simulator what counts: the caller's words, else the recorded ones, else those that the seed drew."""
+        if not self.task.has_choice:
+            return
+        words = self._instruction if isinstance(self._instruction, str) else recorded
+        if words is not None:
+            self.task.check_instruction(words)
+            self.sim_env.instruction = words
+
+    # -- steps ---------------------------------------------------------------------------------------------------------
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._check_action(tensordict.get(keys.ACTION))
@@ -231,7 +258,7 @@ class RobosuiteEnv(EnvBase):
             image = self.render(camera, self._image_size, self._image_size)
             out[key] = torch.from_numpy(image).permute(2, 0, 1).contiguous()
         if self._instruction:
-            out[keys.INSTRUCTION] = self._instruction
+            out[keys.INSTRUCTION] = self.instruction
         out[keys.SUCCESS] = torch.tensor([bool(self.sim_env._check_success())])
         out[keys.EPISODE_SEED] = torch.tensor([self._episode_seed])
         out[keys.EPISODE_STEP] = torch.tensor([self._elapsed])

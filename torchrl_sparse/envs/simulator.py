@@ -42,7 +42,7 @@ def make_simulator(
         control_freq: actions a second.
     """
     robosuite = import_robosuite()
-    from torchrl_sparse.envs import moving_lift  # noqa: F401  (registers its task)
+    from torchrl_sparse.envs import moving_lift, named_lift  # noqa: F401  (they register their tasks)
 
     return robosuite.make(
         task.name,

@@ -15,12 +15,12 @@ class Task:
     """One robosuite task.
 
     Attributes:
-        name: robosuite's name, or ours for a variant (`torchrl_sparse.envs.moving_lift`).
+        name: robosuite's name, or ours for a variant (`torchrl_sparse.envs.moving_lift`, `torchrl_sparse.envs.named_lift`).
         alias: robomimic's short name; folders and command lines use it.
         arms: number of Panda arms.
         object_dim: size of robosuite's ``object-state``.
         horizon: steps after which an episode is truncated, as in Diffusion Policy's evaluation (20 Hz).
-        instruction: the task in words.
+        instructions: the task in words; where there are several, each episode asks for one of them.
     """
 
     name: str
@@ -28,7 +28,18 @@ class Task:
     arms: int
     object_dim: int
     horizon: int
-    instruction: str
+    instructions: tuple[str, ...]
+
+    @property
+    def has_choice(self) -> bool:
+        """Whether episodes differ in what they ask for."""
+        return len(self.instructions) > 1
+
+    def check_instruction(self, words: str) -> None:
+        """Raises ValueError unless ``words`` are one of `instructions`."""
+        if words not in self.instructions:
+            expected = ", ".join(map(repr, self.instructions))
+            raise ValueError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -56,14 +67,27 @@ _PROPRIOCEPTION = {"eef_pos": 3, "eef_quat_site": 4, "gripper_qpos": 2}
 TASKS = {
     task.name: task
     for task in (
-        Task("Lift", "lift", 1, 10, 400, "lift the red cube"),
-        Task("LiftMoving", "lift_moving", 1, 10, 400, "lift the moving red cube"),
-        Task("PickPlaceCan", "can", 1, 14, 400, "put the can into its bin"),
-        Task("NutAssemblySquare", "square", 1, 14, 400, "put the square nut on the square peg"),
+        Task("Lift", "lift", 1, 10, 400, ("lift the red cube",)),
+        Task("LiftMoving", "lift_moving", 1, 10, 400, ("lift the moving red cube",)),
         Task(
-            "TwoArmTransport", "transport", 2, 41, 700, "hand the hammer over and put it into the target bin"
+            "LiftNamed",
+            "lift_named",
+            1,
+            10,
+            200,
+            tuple(f"lift the {c} cube" for c in ("red", "green", "blue")),
         ),
-        Task("ToolHang", "tool_hang", 1, 44, 700, "assemble the frame and hang the tool on it"),
+        Task("PickPlaceCan", "can", 1, 14, 400, ("put the can into its bin",)),
+        Task("NutAssemblySquare", "square", 1, 14, 400, ("put the square nut on the square peg",)),
+        Task(
+            "TwoArmTransport",
+            "transport",
+            2,
+            41,
+            700,
+            ("hand the hammer over and put it into the target bin",),
+        ),
+        Task("ToolHang", "tool_hang", 1, 44, 700, ("assemble the frame and hang the tool on it",)),
     )
 }
 

@@ -6,17 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl.record.loggers import Logger, get_logger
-
 from torchrl_sparse.evaluation.report import results_rows
 
-__all__ = ["log_benchmark", "tested_method", "training_logger", "trial_metrics"]
-
-
-def training_logger(kind: str, out: str, wandb_mode: str, config: Mapping[str, Any]) -> Logger:
-    """TorchRL's logger of a training, ``kind`` being "csv" or "wandb", in the folder ``out``/log."""
-    wandb = {"project": "torchrl_sparse", "mode": wandb_mode, "config": dict(config)}
-    return get_logger(kind, str(Path(out).resolve()), "log", wandb_kwargs=wandb)
+__all__ = ["log_benchmark", "tested_method", "trial_metrics"]
 
 
 def tested_method(results: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from torchrl_sparse.envs.experts.pick_place_can import PickPlaceCanExpert
 EXPERTS: Mapping[str, type[Expert]] = {
     "Lift": LiftExpert,
     "LiftMoving": LiftMovingExpert,
+    "LiftNamed": LiftExpert,
     "PickPlaceCan": PickPlaceCanExpert,
     "NutAssemblySquare": NutAssemblySquareExpert,
 }

@@ -12,7 +12,7 @@ _LAG = 0.17  # s; the hand covers about a sixth of a second's way to its target 
 
 
 class LiftExpert(Expert):
-    """Approaches the cube from above with the finger axis along its nearest side, grasps and lifts."""
+    """Approaches the cube, of several the named one, from above with the finger axis along its nearest side, and lifts."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()

@@ -1,0 +1,145 @@
+"""Trains a vision-language-action policy. Stop it at any moment; the same command goes on, equal to the last bit.
+
+    python recipes/collect_demos.py task=lift_named episodes=500 out=data/lift_named_proficient.h5
+    python recipes/render_demos.py task=lift_named image_size=112
+    python recipes/train_vla.py task=lift_named max_steps=20000 batch_size=64 device=cuda precision=bf16
+
+``out/policy``, renewed at each checkpoint, is the policy with averaged weights for `VLAPolicy.from_pretrained`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import partial
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.instructions import read_instructions
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.rotations import ABSOLUTE_DIM
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.interrupt import StopSignal
+from torchrl_sparse.policies.trainer import TrainConfig
+from torchrl_sparse.policies.training_loop import make_logger, resume, train
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.policies.vla.text import WordTokenizer
+from torchrl_sparse.policies.vla.training import InstructedDemonstrations, VLATrainer
+
+SIZES = {"tiny": VLAConfig.tiny, "small": VLAConfig.small, "published": VLAConfig}
+
+
+@hydra.main(version_base=None, config_path=".", config_name="train_vla")
+def main(config: DictConfig) -> None:
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    trainer = make_trainer(config)
+    resume(trainer, config.out)
+    settings = OmegaConf.to_container(config, resolve=True)
+    how = train(
+        trainer,
+        make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode),
+        StopSignal(),
+        save=partial(save, trainer, config),
+        evaluate=partial(evaluate, trainer, config),
+        log_every=config.log_every,
+        checkpoint_every=config.checkpoint_every,
+        eval_every=config.eval_every,
+    )
+    print(f"{Path(config.out) / 'policy'}: {how}")
+
+
+def make_trainer(config: DictConfig) -> VLATrainer:
+    """Reads the demonstrations and builds an untrained policy that fits them."""
+    episodes = read_demos(
+        config.demos,
+        get_task(config.task).proprioception_keys,
+        cameras=chosen_cameras(config),
+        image_folder=Path(config.out) / "images",
+    )
+    demos = InstructedDemonstrations(episodes, read_instructions(config.demos))
+    state, action = episodes.data[keys.STATE], episodes.data[keys.ACTION]
+    grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
+    words = sorted({word for text in demos.instructions for word in text.lower().split()})
+    torch.manual_seed(config.seed)
+    policy = VLAPolicy(
+        VLANetwork(make_config(config, episodes.data)),
+        QuantileNormalizer.fit(state, action, gripper=grippers),
+        WordTokenizer(words),
+    ).to(config.device)
+    trainer = VLATrainer(policy, demos, TrainConfig(**config.train))
+    print(
+        f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
+        f"{len(state)} steps, {len(trainer.train_rows)} training windows; "
+        f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
+    )
+    return trainer
+
+
+def chosen_cameras(config: DictConfig) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations."""
+    return {name: key for name, key in config.cameras.items() if key is not None}
+
+
+def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:
+    """The size that was asked for, with what the demonstrations decide."""
+    if config.size not in SIZES:
+        raise ValueError(f"size: expected one of {', '.join(SIZES)}, got {config.size!r}")
+    cameras = [["observation", name] for name in chosen_cameras(config)]
+    decided = {
+        "cameras": cameras,
+        "image_size": data[tuple(cameras[0])].shape[-1],
+        "state_dim": data[keys.STATE].shape[-1],
+        "action_dim": data[keys.ACTION].shape[-1],
+    }
+    fields = OmegaConf.merge(SIZES[config.size]().to_dict(), config.network, decided)
+    return VLAConfig.from_dict(OmegaConf.to_container(fields, resolve=True))
+
+
+def save(trainer: VLATrainer, config: DictConfig) -> None:
+    trainer.save(Path(config.out) / "checkpoint.pt")
+    averaged_policy(trainer).save_pretrained(Path(config.out) / "policy")
+
+
+def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
+    return VLAPolicy(trainer.averaged(), trainer.policy.normalizer, trainer.policy.tokenizer)
+
+
+def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
+    """Success rate of the averaged weights on episodes that no demonstration was made from; None without robosuite."""
+    if importlib.util.find_spec("robosuite") is None:
+        return None
+    from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.envs.transforms import make_env
+    from torchrl_sparse.evaluation.paired import rollout_episodes
+
+    options = {"image": "camera", "wrist_image": "wrist_camera"}
+    cameras = {options[name]: key.removesuffix("_image") for name, key in chosen_cameras(config).items()}
+    size = trainer.policy.network.config.image_size
+    episodes = rollout_episodes(
+        ChunkExecutor(averaged_policy(trainer), config.n_action_steps),
+        partial(
+            make_env,
+            get_task(config.task).name,
+            n_obs_steps=1,
+            image_size=size,
+            object_state=False,
+            instruction=True,
+            **cameras,
+        ),
+        range(config.eval_seed, config.eval_seed + config.eval_episodes),
+        num_envs=min(5, config.eval_episodes),
+        policy_device=config.device,
+    )
+    return sum(episode.success for episode in episodes) / len(episodes)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""What demonstrations were asked to do, as their files tell it."""
+
+import json
+
+import h5py
+import pytest
+
+from torchrl_sparse.data.instructions import read_instruction, read_instructions
+
+
+def write(path, metas):
+    with h5py.File(path, "w") as file:
+        for index, meta in enumerate(metas):
+            demo = file.create_group(f"data/demo_{index}")
+            if meta is not None:
+                demo.attrs["ep_meta"] = meta
+    return path
+
+
+def test_they_come_in_the_order_of_the_demonstrations_numbers(tmp_path):
+    words = [f"lift cube {index}" for index in range(12)]
+    path = write(tmp_path / "demos.h5", [json.dumps({"lang": each, "layout": 3}) for each in words])
+    assert read_instructions(path) == words
+
+
+@pytest.mark.parametrize("meta", [None, "{}", '{"lang": ""}'])
+def test_a_demonstration_without_one_is_named(tmp_path, meta):
+    path = write(tmp_path / "demos.h5", ['{"lang": "lift"}', meta])
+    with pytest.raises(ValueError, match=r"demos.h5, /data/demo_1: expected an instruction"):
+        read_instructions(path)
+
+
+@pytest.mark.parametrize("meta", ["{", "[3]", "4", '{"lang": 4}'])
+def test_a_damaged_one_is_named(tmp_path, meta):
+    path = write(tmp_path / "demos.h5", [meta])
+    with pytest.raises(ValueError, match=r"demos.h5: /data/demo_0, ep_meta: expected a .* got "):
+        read_instructions(path)
+
+
+def test_older_files_have_none(tmp_path):
+    with h5py.File(write(tmp_path / "demos.h5", [None])) as file:
+        assert read_instruction(file["data/demo_0"]) is None
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="demonstrations: no file"):
+        read_instructions(tmp_path / "demos.h5")

@@ -1,0 +1,62 @@
+"""The recipe that trains a vision-language-action policy: stopped, run again, and its policy loaded and asked."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.policies.training_runs import stop_and_go_on, train_unbroken
+from torchrl_sparse import keys
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+
+STATE = {"robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
+COLOURS = ("red", "green", "blue")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "images.h5"
+    random = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for index in range(3):
+            demo = file.create_group(f"data/demo_{index}")
+            demo.attrs["num_samples"] = 9
+            demo.attrs["ep_meta"] = json.dumps({"lang": f"lift the {COLOURS[index]} cube"})
+            demo["actions"] = random.uniform(-1, 1, (9, 7))
+            for key, size in STATE.items():
+                demo[f"obs/{key}"] = random.uniform(-1, 1, (9, size))
+            for camera in ("agentview", "robot0_eye_in_hand"):
+                demo[f"obs/{camera}_image"] = random.integers(256, size=(9, 28, 28, 3), dtype=np.uint8)
+    return path
+
+
+def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
+    broken, unbroken = tmp_path / "broken", tmp_path / "unbroken"
+    sizes = ["size=tiny", "network.chunk_size=3", "+network.llm.layers=2", "batch_size=2", "max_steps=160"]
+    settings = [f"demos={demos}", *sizes, "checkpoint_every=40", "lr_warmup_steps=2", "threads=1"]
+    step, first, second = stop_and_go_on("train_vla", broken, settings)
+    assert "3 demonstrations of 3 instructions, 27 steps" in first
+    assert "stopped by SIGTERM, run again to go on" in first
+    assert 40 <= step < 160
+    assert f"going on from step {step}" in second
+    assert "step 160 of 160, finished" in second
+
+    train_unbroken("train_vla", unbroken, settings)
+    models = [(out / "policy/model.safetensors").read_bytes() for out in (broken, unbroken)]
+    assert models[0] == models[1]
+    check_policy(VLAPolicy.from_pretrained(broken / "policy"))
+
+
+def check_policy(policy):
+    """It knows the instructions' words, and grippers as such."""
+    assert set(COLOURS) <= set(policy.tokenizer.words)
+    image = torch.zeros(2, 3, 28, 28, dtype=torch.uint8)
+    observation = {"image": image, "wrist_image": image, "state": torch.zeros(2, 9)}
+    query = TensorDict({"observation": observation, keys.INSTRUCTION: ["lift the red cube"] * 2}, [2])
+    chunk = policy(query)[keys.CHUNK]
+    assert chunk.shape == (2, 3, 10)
+    assert set(chunk[..., 9].flatten().tolist()) <= {-1.0, 0.0, 1.0}
+    assert policy.network.config.llm.layers == 2

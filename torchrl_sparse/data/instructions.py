@@ -1,0 +1,56 @@
+"""What each demonstration of a file was asked to do: ``lang`` of its json attribute ``ep_meta``, as in RoboCasa's files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+
+from torchrl_sparse.data.robomimic import demo_names
+
+__all__ = ["read_instruction", "read_instructions"]
+
+
+def read_instruction(demo: h5py.Group) -> str | None:
+    """The instruction of one demonstration; None if it has none.
+
+    Raises:
+        ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
+    """
+    text = demo.attrs.get("ep_meta", "{}")
+    try:
+        words = dict(json.loads(text)).get("lang")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {text!r}") from error
+    if words is None or isinstance(words, str):
+        return words
+    raise ValueError(f"{demo.name}, ep_meta: expected a text as 'lang', got {words!r}")
+
+
+def read_instructions(path: str | Path) -> list[str]:
+    """The instruction of every demonstration of a robomimic file, in the order of `read_demos`.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming file and demonstration, if one has no instruction.
+
+    Examples:
+        >>> read_instructions("data/lift_named_proficient.h5")[0]  # doctest: +SKIP
+        'lift the green cube'
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"demonstrations: no file {path}")
+    with h5py.File(path, "r") as file:
+        return [_required(path, file["data"][name]) for name in demo_names(path, file)]
+
+
+def _required(path: Path, demo: h5py.Group) -> str:
+    try:
+        words = read_instruction(demo)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not words:
+        raise ValueError(f"{path}, {demo.name}: expected an instruction, ep_meta['lang'], got none")
+    return words
