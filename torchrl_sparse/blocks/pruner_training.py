@@ -25,6 +25,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
+from torchrl_sparse.blocks.sag import check_rates
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.training import read_checkpoint
@@ -109,15 +110,9 @@ class PrunerConfig:
             if (value := getattr(self, name)) not in allowed:
                 raise ValueError(f"{name}: expected one of {list(allowed)}, got {value!r}")
         check_reuse(self.reuse)
-        if not 0 < self.rate < 1:
-            raise ValueError(f"rate: expected a prune rate in (0, 1), got {self.rate}")
-        if self.rate_range is not None:
-            low, high = self.rate_range
-            if not 0 < low <= self.rate <= high < 1:
-                raise ValueError(
-                    f"rate_range: expected 0 < low <= rate={self.rate} <= high < 1, got {low}, {high}"
-                )
-            object.__setattr__(self, "rate_range", (low, high))
+        check_rates(self.rate, self.rate_range)
+        if self.rate_range is not None:  # YAML brings a list
+            object.__setattr__(self, "rate_range", tuple(self.rate_range))
         for name in ("epochs", "batch_size", "lr", "temperature"):
             if not (value := getattr(self, name)) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {value}")

@@ -35,7 +35,7 @@ from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors,
 from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes
 from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
 
-__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner"]
+__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner", "check_rates"]
 
 FORMAT = "torchrl_sparse.sag/1"
 _FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
@@ -172,16 +172,20 @@ class PrunerInfo:
     settings: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not 0 < self.rate < 1:
-            raise ValueError(f"rate: expected a prune rate in (0, 1), got {self.rate}")
         check_reuse(self.reuse)
-        if self.rate_range is not None:
-            low, high = self.rate_range
-            if not 0 < low <= self.rate <= high < 1:
-                raise ValueError(
-                    f"rate_range: expected 0 < low <= rate={self.rate} <= high < 1, got {low}, {high}"
-                )
-            object.__setattr__(self, "rate_range", (low, high))
+        check_rates(self.rate, self.rate_range)
+        if self.rate_range is not None:  # JSON brings a list
+            object.__setattr__(self, "rate_range", tuple(self.rate_range))
+
+
+def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
+    """Raise ValueError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
+    if not 0 < rate < 1:
+        raise ValueError(f"rate: expected a prune rate in (0, 1), got {rate}")
+    if rate_range is not None:
+        low, high = rate_range
+        if not 0 < low <= rate <= high < 1:
+            raise ValueError(f"rate_range: expected 0 < low <= rate={rate} <= high < 1, got {low}, {high}")
 
 
 class SAGPruner(Planner):

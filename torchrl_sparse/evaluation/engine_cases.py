@@ -43,6 +43,7 @@ QUICK = {"n_layer": 2, "n_emb": 32}
 _PRUNE_RATE = 0.91
 _SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
 _NUM_UPDATES = 10
+_HALF_RUNNERS = {"native-fp16": "float16", "native-bf16": "bfloat16"}
 _HALF_KINDS = ("dense", "random91", "bac10")
 _DRAWN_SEED = 1
 
@@ -131,16 +132,16 @@ class EngineCase:
         runners = {"torch": TorchEngine}
         if native_supports(self.network)[0]:
             runners["native"] = NativeEngine
-            runners["native-fp16"] = partial(NativeEngine, weights="float16")
+            runners |= {name: partial(NativeEngine, weights=dtype) for name, dtype in _HALF_RUNNERS.items()}
         for runner, make in runners.items():
             engines = {}
             for kind, query in self.queries.items():
-                if runner == "native-fp16" and kind not in _HALF_KINDS:
+                if runner in _HALF_RUNNERS and kind not in _HALF_KINDS:
                     continue
                 if query.schedule not in engines:
                     engines[query.schedule] = make(self.network, query.schedule)
                 call = partial(self._denoise, engines[query.schedule], query)
-                weight_bytes = 2 if runner == "native-fp16" else 4
+                weight_bytes = 2 if runner in _HALF_RUNNERS else 4
                 variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes)
         return variants
 

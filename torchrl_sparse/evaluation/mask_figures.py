@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_sparse.evaluation.canvas import make_figure, save_figure
-from torchrl_sparse.evaluation.plots import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS, block_labels
+from torchrl_sparse.evaluation.plots import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS, block_labels, type_legend
 
 __all__ = ["mask_panel", "plot_mask_statistics", "plot_mask_strip"]
 
@@ -25,8 +25,6 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
     Raises:
         ValueError: if ``masks`` is not such an array.
     """
-    from matplotlib.patches import Patch
-
     masks = _check_masks(masks)
     shown = np.unique(np.linspace(0, len(masks) - 1, _PANELS).round().astype(int))
     figure, grid = make_figure(9, 4.6, rows=1, columns=len(shown))
@@ -41,13 +39,7 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
     panels[0].set_ylabel("denoising step (0 is the first)")
     panels[len(panels) // 2].set_xlabel(f"blocks, layer 0 to {masks.shape[2] // 3 - 1} from left to right")
     figure.suptitle(f"{name}: masks along a rollout, environment step and share pruned", fontsize=12)
-    handles = [
-        Patch(color=color, label=f"{kind} computed")
-        for kind, color in zip(BLOCK_TYPES, TYPE_COLORS, strict=True)
-    ]
-    figure.legend(
-        handles=[*handles, Patch(color=REUSED_COLOR, label="reused")], ncols=4, loc="outside lower center"
-    )
+    type_legend(figure)
     return save_figure(figure, path)
 
 

@@ -122,7 +122,6 @@ def plot_schedule(
         ValueError: if ``mask`` is not a bool matrix with a multiple of three columns.
     """
     from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
 
     mask = _check_mask(mask, "mask")
     num_blocks = mask.shape[1]
@@ -145,6 +144,14 @@ def plot_schedule(
     axes.set_xlabel("denoising step, in execution order (0 is the first call of the network)")
     cost = "" if flops_ratio is None else f", {100 * flops_ratio:.1f} % of dense FLOPs"
     axes.set_title(f"{name}: {100 * mask.mean():.1f} % pruned{cost}", loc="left")
+    type_legend(figure)
+    return save_figure(figure, path)
+
+
+def type_legend(figure: "Figure") -> None:
+    """What the colours of a mask mean, under the figure."""
+    from matplotlib.patches import Patch
+
     handles = [
         Patch(color=color, label=f"{kind} computed")
         for kind, color in zip(BLOCK_TYPES, TYPE_COLORS, strict=True)
@@ -152,7 +159,6 @@ def plot_schedule(
     figure.legend(
         handles=[*handles, Patch(color=REUSED_COLOR, label="reused")], ncols=4, loc="outside lower center"
     )
-    return save_figure(figure, path)
 
 
 def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
