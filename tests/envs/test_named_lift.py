@@ -128,7 +128,7 @@ def test_each_environment_of_a_batch_has_its_own_words(drawn):
     batch = SerialEnv(2, make, create_env_kwargs=options)
     steps = batch.rollout(4, break_when_any_done=False)
     seeds = steps[keys.EPISODE_SEED].squeeze(-1)
-    assert seeds.tolist() == [[0, 1, 2, 3], [4, 4, 5, 5]]
+    assert [len(row.unique()) for row in seeds] == [4, 2]
     for index, row in enumerate(steps.unbind(0)):
         for step, td in enumerate(row.unbind(0)):
             assert td[keys.INSTRUCTION] == drawn[seeds[index, step]][0]
