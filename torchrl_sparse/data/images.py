@@ -62,4 +62,6 @@ def _allocate(shape: tuple[int, ...], folder: str | Path | None, key: str) -> Te
     if folder is None:
         return torch.empty(shape, dtype=torch.uint8)
     Path(folder).mkdir(parents=True, exist_ok=True)
-    return MemoryMappedTensor.empty(shape, dtype=torch.uint8, filename=str(Path(folder) / f"{key}.memmap"))
+    # What an earlier run left is written anew: it may be of other demonstrations, or half of them.
+    filename = str(Path(folder) / f"{key}.memmap")
+    return MemoryMappedTensor.empty(shape, dtype=torch.uint8, filename=filename, existsok=True)
