@@ -37,7 +37,6 @@ class PlanSpec:
     num_layers: int
     policy: str
     sampler: str = "ddpm"
-    sampler: str = "ddpm"
 
     @property
     def num_blocks(self) -> int:
@@ -49,8 +48,8 @@ class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
-    A subclass writes :meth:`masks`; one that reads more keys overrides :meth:`inputs` too, and one that cannot
-    serve every policy :meth:`bind`, and raises ValueError there. ``policy.plan = planner`` binds it.
+    A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that
+    cannot serve every policy :meth:`bind`, and raises ValueError there. ``policy.plan = planner`` binds it.
 
     Attributes:
         reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see

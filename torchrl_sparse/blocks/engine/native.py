@@ -202,9 +202,8 @@ class NativeEngine:
                 self._run(packed, programs[row], slots, noise[row], cond[row], actions[row], scratch)
 
         helpers = min(self.threads or torch.get_num_threads(), len(cond)) - 1
-        with ThreadPoolExecutor(
-            max(helpers, 1)
-        ) as pool:  # starts a thread for each task, none without a task
+        # It starts a thread for each task, and none for a single row.
+        with ThreadPoolExecutor(max(helpers, 1)) as pool:
             tasks = [pool.submit(work) for _ in range(helpers)]
             work()
         for task in tasks:
