@@ -299,6 +299,7 @@ class PrunerTrainer:
         state = {
             **self._header(),
             "step": self.step,
+            "weight": self.weight,
             "gates": self.gates.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "schedule": self._schedule.state_dict(),
@@ -313,7 +314,8 @@ class PrunerTrainer:
             ValueError: if it is none, or was made for another policy, reference set or configuration.
         """
         header = self._header()
-        state = read_checkpoint(path, {*header, "step", "gates", "optimizer", "schedule"}, header)
+        state = read_checkpoint(path, {*header, "step", "weight", "gates", "optimizer", "schedule"}, header)
+        self.weight = state["weight"]  # seconds are measured anew in every process
         self.gates.load_state_dict(state["gates"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
@@ -342,11 +344,15 @@ class PrunerTrainer:
             policy.sample_noise(batch[keys.SEED].squeeze(-1)),
             batch[keys.COND],
         )
-        options = {"reuse": config.reuse, "explore": config.explore}
+        options = {
+            "reuse": config.reuse,
+            "explore": config.explore,
+            "checkpointed": config.checkpointed,
+        }
         if config.gradient == "step":
             error = step_errors(*query, gate, **options)
         else:
-            actions = denoise_relaxed(*query, gate, **options, checkpointed=config.checkpointed)
+            actions = denoise_relaxed(*query, gate, **options)
             error = (actions - batch["target"]).abs()
         return error.mean() if config.norm == "l1" else error.square().mean()
 
@@ -368,8 +374,12 @@ def _block_weights(policy: DiffusionPolicy, cost: Cost) -> Tensor:
     """Cost of each block, f32 [3L]."""
     if cost == "blocks":
         return torch.ones(policy.num_blocks)
-    costs = [getattr(policy.block_costs()[kind], cost) for kind in BLOCK_TYPES]
-    return torch.tensor(costs).float().repeat(policy.network.n_layer)
+    costs = policy.block_costs()
+    return (
+        torch.tensor([getattr(costs[kind], cost) for kind in BLOCK_TYPES])
+        .float()
+        .repeat(policy.network.n_layer)
+    )
 
 
 def _rates(gate: Tensor, weight: Tensor) -> dict[str, float]:

@@ -86,10 +86,8 @@ def denoise_relaxed(
     Raises:
         ValueError: as ``denoise`` does.
     """
-    chain = _chain(
-        network, schedule, noise, cond, gate, reuse=reuse, explore=explore, checkpointed=checkpointed
-    )
-    *_, (_, actions) = chain
+    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
+    *_, (_, actions) = _chain(network, schedule, noise, cond, gate, **options)
     return actions
 
 
@@ -102,18 +100,20 @@ def step_errors(
     *,
     reuse: Reuse = "type",
     explore: float = 1.0,
+    checkpointed: bool = False,
 ) -> Tensor:
     """What each denoising step alone does wrong: the chain with its gradients cut between the steps.
 
     Every step starts from the sample and the buffers that the pruned chain reached, detached, and its result
-    is compared with a dense step from the same sample. A backward pass then holds one step, but a gate no
-    longer learns what its buffer is worth to later steps, nor how much of an early error the rest of the chain
-    repairs.
+    is compared with a dense step from the same sample, which costs one more forward pass. No gradient runs
+    through more than one step, but a gate no longer learns what its buffer is worth to later steps, nor how
+    much of an early error the rest of the chain repairs. The arguments are those of :func:`denoise_relaxed`.
 
     Returns:
         f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
     """
-    chain = _chain(network, schedule, noise, cond, gate, reuse=reuse, explore=explore, cut=True)
+    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
+    chain = _chain(network, schedule, noise, cond, gate, **options, cut=True)
     errors = []
     for k, (before, after) in enumerate(chain):
         if k == 0:  # dense by definition
@@ -134,7 +134,7 @@ def _chain(
     *,
     reuse: Reuse,
     explore: float,
-    checkpointed: bool = False,
+    checkpointed: bool,
     cut: bool = False,
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """The samples before and after each denoising step."""

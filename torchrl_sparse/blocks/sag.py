@@ -98,7 +98,8 @@ class PrunerNetwork(nn.Module):
         self.fuse_obs = nn.Linear(obs_width, hidden)
         self.fuse_z = nn.Linear(width, hidden, bias=False)
         self.mlp = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2))
-        self._cells: Tensor | None = None
+        # Not persistent, since it follows from the weights; a buffer, since it has to move with them.
+        self.register_buffer("_cells", None, persistent=False)
 
     def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Logits (keep, prune) f32 [B, K, 3L, 2].
