@@ -64,7 +64,9 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     else:
         policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
     policy.to(config.device)
-    trainer = PolicyTrainer(policy.network, policy.normalizer, demos, TrainConfig(**config.train), policy.vision)
+    trainer = PolicyTrainer(
+        policy.network, policy.normalizer, demos, TrainConfig(**config.train), policy.vision
+    )
     print(
         f"{config.demos}: {len(demos)} demonstrations, {len(demos.data)} steps, "
         f"{len(trainer.train_rows)} training windows; "

@@ -10,7 +10,13 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, make_reference, sparsity_loss
+from torchrl_sparse.blocks.pruner_training import (
+    PrunerConfig,
+    PrunerTrainer,
+    imitate,
+    make_reference,
+    sparsity_loss,
+)
 from torchrl_sparse.blocks.sag import PrunerNetwork
 from torchrl_sparse.blocks.static import StaticSchedule
 from torchrl_sparse.data.normalize import Normalizer
@@ -111,6 +117,21 @@ def test_training_reaches_the_rate_and_beats_a_random_mask_of_it(policy, referen
         actions = policy.denoise(noise, held_out[keys.COND], masks, reuse="type")
         errors.append((actions - held_out["target"]).abs().mean().item())
     assert learned["error"] < min(errors)
+
+
+@pytest.mark.parametrize("rates", [None, (0.5, 0.9)])
+def test_gates_learn_a_mask_to_begin_from(policy, reference, rates):
+    mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.5
+    mask[0] = False
+    gates = sag_gates(policy, rate_input=rates is not None)
+    imitate(gates, mask, reference, rates, updates=1200)
+    cond = torch.randn(5, OBS_STEPS, COND_DIM)
+    rate = None if rates is None else torch.linspace(*rates, 5)[:, None]
+    logits = gates.prune_logits(cond, rate)[:, 1:]
+    assert ((logits > 0) == mask[1:]).float().mean() > 0.98
+    assert logits.abs().max() < 4  # or gradients would not reach them
+    with pytest.raises(ValueError, match=r"mask: expected \[K, 3L\] = \[\d+, \d+\] as the gates have, got"):
+        imitate(gates, mask[1:], reference, rates)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
@@ -32,10 +33,11 @@ from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.trainer import batch_indices, step_seed
 
-__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "make_reference", "sparsity_loss"]
+__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "imitate", "make_reference", "sparsity_loss"]
 
 Cost = Literal["blocks", "flops", "seconds"]
 _ANSWER_BATCH = 16
+_IMITATION_BATCH = 4  # the coordinates' tokens, which no observation changes, cost the most
 
 
 class Gates(Protocol):
@@ -179,6 +181,52 @@ def _dense_answers(
         answers.append(policy.denoise(policy.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND]))
         on_progress(sum(map(len, answers)), len(reference))
     return torch.cat(answers)
+
+
+def imitate(
+    gates: Gates,
+    mask: Tensor,
+    reference: TensorDict,
+    rates: tuple[float, float] | None = None,
+    *,
+    updates: int = 600,
+    lr: float = 3e-3,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Teach untrained gates a mask, the same for all observations, for their training to begin from.
+
+    From a random mask of a long chain a training first has to find back to any that works, and each update of
+    a mask that prunes little costs most. The cross-entropy is taken against probabilities of 1/4 and 3/4,
+    since logits far from zero would get next to no gradient through the straight-through estimator.
+
+    Args:
+        gates: what will be trained, in place.
+        mask: bool [K, 3L], True = pruned.
+        reference: of :func:`make_reference`; its observations are what the mask is learned on.
+        rates: range of the target rates, where they are an input.
+        updates, lr, seed: of the imitation.
+        on_progress: called with (updates made, all).
+
+    Raises:
+        ValueError: if the mask is not of the shape of the gates.
+    """
+    torch.manual_seed(seed)
+    optimizer = torch.optim.Adam(gates.parameters(), lr)
+    for update in range(updates):
+        cond = reference[keys.COND][torch.randint(len(reference), (_IMITATION_BATCH,))]
+        rate = None if rates is None else torch.empty(len(cond), 1).uniform_(*rates)
+        logits = gates.prune_logits(cond, rate)
+        if logits.shape[1:] != mask.shape:
+            raise ValueError(
+                f"mask: expected [K, 3L] = {list(logits.shape[1:])} as the gates have, got {list(mask.shape)}"
+            )
+        target = (0.25 + 0.5 * mask.to(logits)).expand_as(logits)
+        loss = binary_cross_entropy_with_logits(logits[:, 1:], target[:, 1:])  # step 0 is never pruned
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        on_progress(update + 1, updates)
 
 
 def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool = False) -> Tensor:
