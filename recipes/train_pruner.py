@@ -3,7 +3,8 @@
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
 Stop it at any moment; the same command goes on, equal to the last bit. ``out/pruner`` is for
-`SAGPruner.from_pretrained`, ``out/l2c.json`` for `StaticSchedule`; ``out/curves.png`` shows how it went.
+`SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the ablation; ``out/l2c.json`` is for
+`StaticSchedule`; ``out/curves.png`` shows how it went.
 """
 
 from __future__ import annotations
@@ -158,11 +159,17 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         "reference": dict(config.reference),
         "updates": trainer.step,
     }
+    fixed = Schedule.from_mask(
+        trainer.fixed_mask(),
+        method="l2c" if config.method == "l2c" else "sag_fixed",
+        policy=policy.fingerprint,
+        sampler=policy.schedule.kind,
+        reuse=trainer.config.reuse,
+        settings=settings,
+    )
+    path = out / ("l2c.json" if config.method == "l2c" else "fixed.json")
+    fixed.save(path)
     if config.method == "l2c":
-        path = out / "l2c.json"
-        made_for = {"policy": policy.fingerprint, "sampler": policy.schedule.kind}
-        schedule = trainer.gates.schedule(**made_for, reuse=trainer.config.reuse, settings=settings)
-        schedule.save(path)
         return path
     info = PrunerInfo(
         policy=policy.fingerprint,

@@ -325,11 +325,8 @@ class PrunerTrainer:
     def validate(self) -> dict[str, float]:
         """Error of the actions and prune rates on held-out observations, with the masks as they will be used, and
         the variance of the masks over observations."""
-        self.gates.eval()
         cond = self.held_out[keys.COND]
-        rate = torch.full((len(cond), 1), self.config.rate)
-        masks = self._logits(cond, rate) > 0
-        masks[:, 0] = False
+        masks = self._masks(cond)
         noise = self.policy.sample_noise(self.held_out[keys.SEED].squeeze(-1))
         actions = [
             self.policy.denoise(*part, reuse=self.config.reuse)
@@ -341,6 +338,16 @@ class PrunerTrainer:
         gate = masks.float()
         variance = gate.var(dim=0, unbiased=False).mean()
         return {"error": error.item(), "variance": variance.item(), **_rates(gate, self.weight)}
+
+    @torch.no_grad()
+    def fixed_mask(self) -> Tensor:
+        """The mean of the masks of all training observations, bool [K, 3L]: what the gates prune most often, as many
+        cells as they prune on average. L2C's result, and of SAG the ablation that does not look."""
+        parts = self.train_set[keys.COND].split(_ANSWER_BATCH)
+        share = sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set)
+        mask = torch.zeros(share.numel(), dtype=torch.bool)
+        mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
+        return mask.view_as(share)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint. A kill leaves the old file or the new one, never a part of one."""
@@ -368,6 +375,13 @@ class PrunerTrainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
         self.step = state["step"]
+
+    def _masks(self, cond: Tensor) -> Tensor:
+        """The masks bool [B, K, 3L] as they will be used, at the rate that is trained for."""
+        self.gates.eval()
+        masks = self._logits(cond, torch.full((len(cond), 1), self.config.rate)) > 0
+        masks[:, 0] = False
+        return masks
 
     def _logits(self, cond: Tensor, rate: Tensor) -> Tensor:
         return self.gates.prune_logits(cond, rate if self.gates.rate_input else None)
