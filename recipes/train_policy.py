@@ -20,14 +20,13 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.trainer import TrainConfig
-from torchrl_sparse.policies.training_loop import make_logger, resume, train
+from torchrl_sparse.policies.training_loop import train
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")
@@ -35,19 +34,8 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    resume(trainer, config.out)
     settings = OmegaConf.to_container(config, resolve=True)
-    how = train(
-        trainer,
-        make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode),
-        StopSignal(),
-        save=partial(save, trainer, config),
-        evaluate=partial(evaluate, trainer, config),
-        log_every=config.log_every,
-        checkpoint_every=config.checkpoint_every,
-        eval_every=config.eval_every,
-    )
-    print(f"{Path(config.out) / 'policy'}: {how}")
+    train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
