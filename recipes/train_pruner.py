@@ -125,7 +125,6 @@ def learn_schedule(trainer: PrunerTrainer, path: Path) -> None:
             trainer.gates,
             Schedule.load(path).mask(),
             trainer.train_set,
-            trainer.config.rate_range,
             seed=trainer.config.seed,
             on_progress=show,
         )

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
+from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.pruner_training import (
     PrunerConfig,
     PrunerTrainer,
@@ -116,19 +117,19 @@ def test_training_reaches_the_rate_and_beats_a_random_mask_of_it(policy, referen
     assert learned["error"] < min(errors)
 
 
-@pytest.mark.parametrize("rates", [None, (0.5, 0.9)])
-def test_gates_learn_a_mask_to_begin_from(policy, reference, rates):
+@pytest.mark.parametrize("rate_input", [False, True])
+def test_gates_learn_a_mask_to_begin_from(policy, reference, rate_input):
     mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.5
     mask[0] = False
-    gates = sag_gates(policy, rate_input=rates is not None)
-    imitate(gates, mask, reference, rates, updates=1200)
-    cond = torch.randn(5, OBS_STEPS, COND_DIM)
-    rate = None if rates is None else torch.linspace(*rates, 5)[:, None]
+    gates = sag_gates(policy, rate_input=rate_input)
+    imitate(gates, mask, reference, updates=1200)
+    cond = reference[keys.COND][:5]
+    rate = torch.full((5, 1), prune_rate(mask).item()) if rate_input else None
     logits = gates.prune_logits(cond, rate)[:, 1:]
     assert ((logits > 0) == mask[1:]).float().mean() > 0.98
     assert logits.abs().max() < 4  # or gradients would not reach them
     with pytest.raises(ValueError, match=r"mask: expected \[K, 3L\] = \[\d+, \d+\] as the gates have, got"):
-        imitate(gates, mask[1:], reference, rates)
+        imitate(gates, mask[1:], reference)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +139,8 @@ def test_gates_learn_a_mask_to_begin_from(policy, reference, rates):
         {"estimator": "gumbel", "explore": 0.5},
         {"gradient": "step", "norm": "l2"},
         {"sparsity": "block", "checkpointed": True},
-        {"cost": "flops", "rate_range": (0.5, 0.9)},
+        {"cost": "flops"},
+        {"rate_range": (0.5, 0.7)},
         {"cost": "seconds"},
     ],
 )
@@ -189,6 +191,10 @@ def test_costs_weigh_blocks_by_their_type(policy, reference):
     [
         ({"rate": 1.0}, r"rate: expected a prune rate in \(0, 1\), got 1.0"),
         ({"rate_range": (0.7, 0.9)}, "rate_range: expected 0 < low <= rate=0.6"),
+        (
+            {"rate_range": (0.5, 0.9), "cost": "flops"},
+            "cost: expected 'blocks' with a rate_range, got 'flops'",
+        ),
         ({"estimator": "reinforce"}, "estimator: expected one of .*got 'reinforce'"),
         ({"cost": "joules"}, "cost: expected one of .*got 'joules'"),
         ({"reuse": "layer"}, "reuse: expected one of .*got 'layer'"),
@@ -202,9 +208,13 @@ def test_a_wrong_configuration_is_refused(options, message):
 
 def test_gates_and_configuration_have_to_agree(policy, reference):
     with pytest.raises(ValueError, match="rate_range: expected one if and only if the gates read the rate"):
-        trainer_of(policy, reference, sag_gates(policy), rate_range=(0.5, 0.9))
+        trainer_of(policy, reference, sag_gates(policy), rate_range=(0.5, 0.7))
     with pytest.raises(ValueError, match="expected at least 2 observations, got 1"):
         trainer_of(policy, reference[:1])
+    with pytest.raises(
+        ValueError, match=f"rate: expected at most {1 - 1 / NUM_STEPS:g}, since the first step"
+    ):
+        trainer_of(policy, reference, rate=0.99)
 
 
 def test_the_fixed_mask_of_static_gates_is_their_own(policy, reference):

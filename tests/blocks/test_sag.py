@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse.blocks.mask import NetworkSizes, query_flops
 from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
+from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner, rate_threshold
 from torchrl_sparse.keys import COND, PRUNE_MASK, PRUNE_RATE
 
 from .conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
@@ -101,6 +101,20 @@ def test_the_rate_is_an_input_that_falls_back_to_the_default():
     assert differ.any()
     pruner.rate = 0.9
     assert pruner.rate == 0.9
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.62, 0.85])
+def test_every_query_keeps_the_rate_that_it_asks_for(rate):
+    pruner = make_pruner(rate_range=(0.5, 0.97))
+    masks = plan(pruner, observations(), rate=rate)
+    assert (masks.sum(dim=(1, 2)) == round(rate * NUM_STEPS * NUM_BLOCKS)).all()
+    assert (plan(pruner, observations(), rate=0.97).sum(dim=(1, 2)) == (NUM_STEPS - 1) * NUM_BLOCKS - 1).all()
+
+
+def test_a_shift_of_all_logits_has_no_gradient():
+    logits = torch.randn(2, NUM_STEPS, NUM_BLOCKS, requires_grad=True)
+    (logits - rate_threshold(logits, torch.tensor([[0.5], [0.8]])))[:, 1:].sum().backward()
+    assert logits.grad.sum().abs() < 1e-4
 
 
 @pytest.mark.parametrize("rate", [0.4, 0.98, float("nan")])

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, prune_rate
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.blocks.sag import check_rates
 from torchrl_sparse.data.robomimic import Demonstrations
@@ -57,7 +57,8 @@ class PrunerConfig:
     Attributes:
         rate: target prune rate rho, in (0, 1), of what ``cost`` counts.
         rate_range: lowest and highest target; with it every sample of a batch gets a target of its own, uniform
-            in that range, and the gates must take it as an input.
+            in that range, and the gates must take it as an input. They then keep it exactly, and the sparsity loss
+            is 0; ``cost`` has to be ``"blocks"``.
         epochs: passes over the reference set.
         max_updates: optimiser steps, if they shall be fewer than the epochs make.
         batch_size: observations in an update.
@@ -115,6 +116,8 @@ class PrunerConfig:
         check_rates(self.rate, self.rate_range)
         if self.rate_range is not None:  # YAML brings a list
             object.__setattr__(self, "rate_range", tuple(self.rate_range))
+            if self.cost != "blocks":
+                raise ValueError(f"cost: expected 'blocks' with a rate_range, got {self.cost!r}")
         for name in ("epochs", "batch_size", "lr", "temperature"):
             if not (value := getattr(self, name)) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
@@ -187,7 +190,6 @@ def imitate(
     gates: Gates,
     mask: Tensor,
     reference: TensorDict,
-    rates: tuple[float, float] | None = None,
     *,
     updates: int = 600,
     lr: float = 3e-3,
@@ -204,7 +206,6 @@ def imitate(
         gates: what will be trained, in place.
         mask: bool [K, 3L], True = pruned.
         reference: of :func:`make_reference`; its observations are what the mask is learned on.
-        rates: range of the target rates, where they are an input.
         updates, lr, seed: of the imitation.
         on_progress: called with (updates made, all).
 
@@ -215,7 +216,7 @@ def imitate(
     optimizer = torch.optim.Adam(gates.parameters(), lr)
     for update in range(updates):
         cond = reference[keys.COND][torch.randint(len(reference), (_IMITATION_BATCH,))]
-        rate = None if rates is None else torch.empty(len(cond), 1).uniform_(*rates)
+        rate = torch.full((len(cond), 1), prune_rate(mask).item()) if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
         if logits.shape[1:] != mask.shape:
             raise ValueError(
@@ -278,6 +279,9 @@ class PrunerTrainer:
                 f"rate_range: expected one if and only if the gates read the rate, "
                 f"got {config.rate_range} and rate_input={gates.rate_input}"
             )
+        highest = 1 - 1 / policy.num_inference_steps
+        if (asked := max(config.rate_range or (config.rate,))) > highest:
+            raise ValueError(f"rate: expected at most {highest:g}, since the first step is kept, got {asked}")
         if len(reference) < 2:
             raise ValueError(f"reference set: expected at least 2 observations, got {len(reference)}")
         self.gates, self.policy, self.config = gates, policy, config

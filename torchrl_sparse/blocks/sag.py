@@ -13,7 +13,8 @@ output of their type ("one-for-all"). The paper does not publish sizes; those he
 the dense FLOPs. :mod:`torchrl_sparse.blocks.pruner_training` trains it.
 
 Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
-query through ``("diffusion", "prune_rate")``.
+query through ``("diffusion", "prune_rate")``, and keeps each of them exactly, because the logits are then compared
+with that one of them that leaves so many above it.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors,
 from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes
 from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
 
-__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner", "check_rates"]
+__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner", "check_rates", "rate_threshold"]
 
 FORMAT = "torchrl_sparse.sag/1"
 _FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
@@ -113,9 +114,11 @@ class PrunerNetwork(nn.Module):
         return self.mlp(fused).unflatten(1, (len(self.timesteps), self.num_blocks))
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """f32 [B, K, 3L]: by how much pruning is preferred to keeping."""
+        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, or, where the rate is an input, to what it takes
+        to be among the ``rate`` K x 3L blocks that are pruned."""
         keep, prune = self(cond, rate).unbind(-1)
-        return prune - keep
+        logits = prune - keep
+        return logits if rate is None else logits - rate_threshold(logits, rate)
 
     def cells(self) -> Tensor:
         """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
@@ -147,6 +150,25 @@ class PrunerNetwork(nn.Module):
         """[K * 3L, 2 * width]: step and block codes, concatenated as in the paper, not added."""
         steps = code(torch.tensor(self.timesteps)).repeat_interleave(self.num_blocks, dim=0)
         return torch.cat([steps, code(torch.arange(self.num_blocks)).repeat(len(self.timesteps), 1)], dim=-1)
+
+
+def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
+    """The value, f32 [B, 1, 1], that ``rate`` of each row's logits are above, the first step's not among them.
+
+    Gradients run through it: logits that all move together change nothing, and must not be drawn anywhere.
+
+    Args:
+        logits: f32 [B, K, 3L].
+        rate: f32 [B, 1], of all K x 3L; at least one block is kept and one pruned after the first step.
+
+    Examples:
+        >>> logits = torch.tensor([[[9.0, 9.0], [1.0, 4.0], [2.0, 3.0]]])
+        >>> rate_threshold(logits, torch.tensor([[0.5]])).item()
+        1.5
+    """
+    ordered = logits[:, 1:].flatten(1).sort(descending=True).values
+    count = (rate * logits[0].numel()).round().long().clamp(1, ordered.shape[1] - 1)
+    return ordered.gather(1, torch.cat([count - 1, count], dim=1)).mean(dim=1)[:, None, None]
 
 
 @dataclass(frozen=True)
