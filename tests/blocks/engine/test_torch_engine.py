@@ -8,7 +8,6 @@ import torch
 
 from torchrl_sparse.blocks.engine import TorchEngine, denoise
 from torchrl_sparse.blocks.engine.coefficients import step_coefficients
-from torchrl_sparse.blocks.engine.graphs import GraphCache
 from torchrl_sparse.blocks.engine.linear import make_linear
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -166,7 +165,7 @@ def test_packed_products_take_any_number_of_rows(gelu):
     packed, general = make_linear(weight, bias, gelu), make_linear(weight.double(), bias.double(), gelu)
     for rows in (1, 10, 160):
         x = torch.randn(rows, 16)
-        torch.testing.assert_close(packed(x).double(), general(x.double()), atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(packed(x, x.new_empty(rows, 24)).double(), general(x.double(), x.new_empty(rows, 24).double()), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -178,20 +177,3 @@ def test_cuda_equals_the_reference(rate):
         query = make_query(network, schedule, 3, seed)
         masks = make_masks(network, schedule, 3, rate, seed).cuda()
         assert largest_error(engine, network, schedule, query, masks) < 1e-9
-
-
-def test_only_what_comes_again_is_captured():
-    captured = []
-
-    def capture(query, noise, cond):
-        captured.append(query)
-        return query
-
-    cache = GraphCache(capture)
-    one, two = torch.ones(1), torch.full((1,), 2.0)
-    assert cache("dense", torch.add, one, two) == 3
-    assert cache("masked", torch.sub, one, two) == -1
-    assert captured == []
-    assert cache("dense", torch.add, two, two) == 4
-    assert cache("dense", torch.add, one, one) == 2
-    assert captured == [torch.add]
