@@ -85,10 +85,10 @@ class SelfAttention:
         scale[0] = (network.n_emb // network.n_head) ** -0.5
         scale = scale.expand(3, network.n_emb).flatten()
         self._project = make_linear(weight * scale[:, None], bias * scale)
-        self._output = make_linear(
-            centred(attention.out_proj.weight.T).T, centred(attention.out_proj.bias)
+        self._output = make_linear(centred(attention.out_proj.weight.T).T, centred(attention.out_proj.bias))
+        hidden = (
+            torch.full((horizon, horizon), -torch.inf).tril(-1) if network.causal_attn else torch.zeros(1)
         )
-        hidden = torch.full((horizon, horizon), -torch.inf).tril(-1) if network.causal_attn else torch.zeros(1)
         self._hidden = hidden.to(weight)  # [key, query]: a later key
 
     def __call__(self, x: Tensor, out: Tensor, bench: Workbench) -> Tensor:

@@ -106,7 +106,7 @@ class TorchEngine:
 
     def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
         tables, pool = self._current()
-        loop = build_loop(self._host_masks(mask), tables.device, pool.gathers)
+        loop = build_loop(self._host_masks(mask), tables.device, gather=pool.capture is None)
         slots = 0 if loop.dense else num_buffers(reuse, self._network.num_blocks)
         with pool.take(len(noise), slots) as workspace:
             return workspace.denoise(loop, noise, cond)
@@ -127,27 +127,28 @@ class WorkspacePool:
         capacity: how many may wait; the least recently used goes first.
 
     Attributes:
-        gathers: whether the loops are to name rows by index (:func:`~...torch_program.build_loop`).
+        capture: makes a CUDA graph of a segment; None leaves segments as they are.
     """
 
     def __init__(self, tables: Tables, capacity: int = 8) -> None:
         self._tables, self._capacity = tables, capacity
         self._free: list[tuple[tuple, Workspace]] = []
         self._lock = threading.Lock()
-        self._capture = GraphCapture(tables.device) if tables.device.type == "cuda" else None
-        self.gathers = self._capture is None
+        self.capture = GraphCapture(tables.device) if tables.device.type == "cuda" else None
 
     @contextmanager
     def take(self, batch: int, slots: int) -> Iterator[Workspace]:
         """A workspace for ``batch`` rows and ``slots`` latest outputs, for the caller alone."""
         # On a GPU the next query may be launched before the last one has run, but in the same order only in one stream.
-        stream = torch.cuda.current_stream(self._tables.device) if self._capture else None
+        stream = (
+            torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None
+        )
         key = (batch, slots, stream)
         with self._lock:
             index = next((i for i, (known, _) in enumerate(self._free) if known == key), None)
             workspace = None if index is None else self._free.pop(index)[1]
         if workspace is None:
-            workspace = Workspace(self._tables, batch, slots, self._capture)
+            workspace = Workspace(self._tables, batch, slots, self.capture)
         yield workspace
         with self._lock:
             self._free.append((key, workspace))

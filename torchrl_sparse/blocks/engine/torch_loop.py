@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.plan import COLLAPSE, COMPUTE
 from torchrl_sparse.blocks.engine.torch_blocks import Workbench
 from torchrl_sparse.blocks.engine.torch_memory import Memory
-from torchrl_sparse.blocks.engine.torch_program import Loop, build_loop
+from torchrl_sparse.blocks.engine.torch_program import Loop, Operation, build_loop
 from torchrl_sparse.blocks.engine.torch_tables import Tables
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
 
@@ -119,7 +119,7 @@ class Workspace:
                 self._walk(ops)
             self._finish()
 
-    def _walk(self, ops: list[tuple[int, int, int, Tensor | None]]) -> None:
+    def _walk(self, ops: list[Operation]) -> None:
         for op, first, last, rows in ops:
             if op != COMPUTE:
                 self._add_reused(self._x, first, last)
@@ -155,19 +155,20 @@ class Workspace:
         torch.where(self._chosen, added.view(latest.shape), latest, out=latest)
         self._x.add_(slot)
 
-    def _compute_gathered(self, block: int, rows: Tensor) -> None:
+    def _compute_gathered(self, block: int, rows: list[int]) -> None:
         """For ``rows`` alone."""
         part = self._parts.get(len(rows))
         if part is None:
             part = self._parts[len(rows)] = _Part(self._tables, self._memory, len(rows))
-        torch.index_select(self._x.view(self._batch, -1), 0, rows, out=part.x)
-        reads = self._reads[block]
-        memory = part.memory[: len(reads)]
-        for source, target in zip(reads, memory, strict=True):
-            torch.index_select(source, 0, rows, out=target)
-        added = self._tables.blocks[block](part.x_by_token, part.bench.output, part.bench, *memory)
-        slot = self._slots[block]
-        slot.view(self._batch, -1).index_copy_(0, rows, added.view(part.x.shape))
+        slot, reads = self._slots[block], self._reads[block]
+        sources = [self._x.view(self._batch, -1), *reads]
+        for source, target in zip(sources, part.inputs, strict=False):
+            for row, place in zip(rows, target, strict=True):
+                place.copy_(source[row])
+        added = self._tables.blocks[block](part.x, part.bench.output, part.bench, *part.memory[: len(reads)])
+        latest = slot.view(self._batch, -1)
+        for row, values in zip(rows, added.view(len(rows), -1), strict=True):
+            latest[row].copy_(values)
         self._x.add_(slot)
 
     def _add_reused(self, to: Tensor, first: int, last: int) -> None:
@@ -201,6 +202,7 @@ class _Part:
     def __init__(self, tables: Tables, memory: Memory, size: int) -> None:
         network = tables.network
         self.bench = Workbench(network, size)
-        self.x_by_token = tables.stem_weight.new_empty(size * network.horizon, network.n_emb)
-        self.x = self.x_by_token.view(size, -1)
+        self.x = tables.stem_weight.new_empty(size * network.horizon, network.n_emb)
         self.memory = [source.new_empty(size, *source.shape[1:]) for source in memory.by_layer[0]]
+        # By row: the residual stream, and what cross-attention reads.
+        self.inputs = [part.unbind(0) for part in (self.x.view(size, -1), *self.memory)]

@@ -12,9 +12,12 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.plan import COMPUTE, build_program
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
 
-__all__ = ["Loop", "build_loop"]
+__all__ = ["Loop", "Operation", "build_loop"]
 
 _CA = BLOCK_TYPES.index("CA")
+
+
+Operation = tuple[int, int, int, list[int] | Tensor | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,7 @@ class Loop:
         dense: nothing is ever reused.
     """
 
-    steps: list[list[tuple[int, int, int, Tensor | None]]]
+    steps: list[list[Operation]]
     attends: list[bool]
     dense: bool
 
@@ -40,13 +43,13 @@ def build_loop(masks: np.ndarray, device: torch.device, gather: bool) -> Loop:
     Args:
         masks: True = pruned.
         device: where ``rows`` are wanted.
-        gather: name rows by their indices, i64 [n], so that they can be computed alone; else by a bool [B, 1].
+        gather: name rows by a list of indices, so that they can be computed alone; else by a bool tensor [B, 1].
 
     Examples:
         >>> masks = np.zeros((2, 2, 3), bool)
         >>> masks[0, 1, :2] = masks[1, 1, 1] = True
         >>> build_loop(masks, torch.device("cpu"), gather=True).steps[1]
-        [(0, 0, 0, tensor([1])), (1, 1, 2, None), (0, 2, 0, None)]
+        [(0, 0, 0, [1]), (1, 1, 2, None), (0, 2, 0, None)]
     """
     return _build_loop(masks.shape, masks.tobytes(), device, gather)
 
@@ -70,13 +73,11 @@ def _build_loop(shape: tuple[int, ...], data: bytes, device: torch.device, gathe
 
 
 def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.device, gather: bool) -> dict:
-    """(step, block) -> rows, wherever some rows compute a block and others do not; one transfer to the device."""
+    """(step, block) -> rows, wherever some rows compute a block and others do not."""
     cells = np.argwhere(masks.any(axis=0) & ~pruned_by_all)
-    if not len(cells):
-        return {}
     computed = ~masks[:, cells[:, 0], cells[:, 1]].T
     if gather:
-        rows = torch.from_numpy(np.nonzero(computed)[1]).to(device).split(computed.sum(axis=1).tolist())
+        rows = [np.flatnonzero(cell).tolist() for cell in computed]
     else:
-        rows = torch.from_numpy(computed[..., None]).to(device).unbind(0)
+        rows = torch.from_numpy(computed[..., None]).to(device).unbind(0)  # in one transfer
     return dict(zip(map(tuple, cells.tolist()), rows, strict=True))
