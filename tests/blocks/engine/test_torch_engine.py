@@ -5,13 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from torch.profiler import ProfilerActivity, profile
 
 from torchrl_sparse.blocks.engine import TorchEngine, denoise
 from torchrl_sparse.blocks.engine.coefficients import step_coefficients
-from torchrl_sparse.blocks.engine.graphs import GraphCache
-from torchrl_sparse.blocks.engine.linear import make_linear
+from torchrl_sparse.blocks.engine.linear import can_pack, make_linear
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+
+from .recorded_graph import RecordedGraph
 
 SHAPES = {
     "small": {"horizon": 6, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32},
@@ -165,8 +167,78 @@ def test_packed_products_take_any_number_of_rows(gelu):
     weight, bias = torch.randn(24, 16), torch.randn(24)
     packed, general = make_linear(weight, bias, gelu), make_linear(weight.double(), bias.double(), gelu)
     for rows in (1, 10, 160):
-        x = torch.randn(rows, 16)
-        torch.testing.assert_close(packed(x).double(), general(x.double()), atol=1e-5, rtol=1e-5)
+        x, out = torch.randn(rows, 16), torch.empty(rows, 24)
+        expected = general(x.double(), out.double())
+        torch.testing.assert_close(packed(x, out).double(), expected, atol=1e-5, rtol=1e-5)
+
+
+def captured_engine(network, schedule, graphs):
+    """An engine on the CPU that believes to be on a GPU."""
+    engine = TorchEngine(network, schedule)
+    engine._current()[1].capture = graphs
+    return engine
+
+
+@pytest.mark.parametrize("shape", ["small", "condition layers"])
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
+def test_segments_can_be_captured_once_and_played_for_any_mask(shape, reuse):
+    network, schedule, graphs = make_network(shape), NoiseSchedule("ddpm", 8), RecordedGraph()
+    engine = captured_engine(network, schedule, graphs)
+    made = []
+    for seed, rate in enumerate([0.5, 0.9, 0.3]):
+        query, masks = make_query(network, schedule, 3, seed), make_masks(network, schedule, 3, rate, seed)
+        assert largest_error(engine, network, schedule, query, masks, reuse) < 1e-9
+        same = masks[:1].repeat(3, 1, 1)
+        assert largest_error(engine, network, schedule, query, same, reuse) < 1e-9
+        made.append(len(graphs.graphs))
+    # Each block for all rows and for some, the end of a step, and the memory if it depends on the step.
+    assert made == [2 * network.num_blocks + 1 + (shape == "condition layers")] * 3
+
+
+def test_a_captured_program_plays_its_computed_blocks_in_order():
+    network, schedule, graphs = make_network("small"), NoiseSchedule("ddim", 5), RecordedGraph()
+    engine, query = captured_engine(network, schedule, graphs), make_query(network, schedule, 1)
+    masks = torch.ones(1, 5, network.num_blocks, dtype=torch.bool)
+    masks[:, 0], masks[:, 2, 1], masks[:, 3, 4] = False, False, False
+    assert largest_error(engine, network, schedule, query, masks) < 1e-9
+    finish = network.num_blocks
+    assert graphs.replays == [0, 1, 2, 3, 4, 5, finish, finish, 1, finish, 4, finish, finish]
+
+
+@pytest.mark.parametrize("shape", ["small", "condition layers"])
+@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+def test_a_dense_loop_is_one_graph(shape, kind):
+    network, schedule, graphs = make_network(shape), NoiseSchedule(kind, 4), RecordedGraph()
+    engine = captured_engine(network, schedule, graphs)
+    for seed in range(3):
+        assert largest_error(engine, network, schedule, make_query(network, schedule, 2, seed)) < 1e-9
+    assert graphs.replays == [0, 0, 0]
+
+
+def count_allocations(steps, dtype, rate, shape="small", batch=3):
+    """In one query after the first."""
+    network, schedule = make_network(shape).to(dtype), NoiseSchedule("ddpm", steps)
+    masks = make_masks(network, NoiseSchedule("ddpm", 10), batch, rate).repeat(1, steps // 10, 1)
+    engine, query = TorchEngine(network, schedule), make_query(network, schedule, batch)
+    engine.denoise(*query, masks)
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+        engine.denoise(*query, masks)
+    events = profiler.profiler.kineto_results.events()
+    return sum(event.name() == "[memory]" and event.nbytes() > 0 for event in events)
+
+
+@pytest.mark.parametrize("shape", ["small", "condition layers"])
+@pytest.mark.parametrize("rate", [0.0, 0.5, 0.9])
+def test_a_step_allocates_nothing(rate, shape):
+    ten, twenty = (count_allocations(steps, torch.float64, rate, shape) for steps in (10, 20))
+    assert 0 < ten == twenty
+
+
+@pytest.mark.skipif(not can_pack(torch.zeros(1)), reason="needs oneDNN")
+def test_packed_products_return_memory_of_their_own_and_nothing_else_does():
+    """Four in each of two layers, each with its result and what oneDNN works in."""
+    ten, twenty = (count_allocations(steps, torch.float32, 0.0) for steps in (10, 20))
+    assert twenty - ten <= 10 * 2 * 4 * 2
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -174,24 +246,7 @@ def test_packed_products_take_any_number_of_rows(gelu):
 def test_cuda_equals_the_reference(rate):
     network, schedule = make_network("small").cuda(), NoiseSchedule("ddpm", 12)
     engine = TorchEngine(network, schedule)
-    for seed in (0, 0, 0):  # run, captured, replayed
+    for seed in (0, 0, 1):  # captured, replayed, replayed for another mask
         query = make_query(network, schedule, 3, seed)
         masks = make_masks(network, schedule, 3, rate, seed).cuda()
         assert largest_error(engine, network, schedule, query, masks) < 1e-9
-
-
-def test_only_what_comes_again_is_captured():
-    captured = []
-
-    def capture(query, noise, cond):
-        captured.append(query)
-        return query
-
-    cache = GraphCache(capture)
-    one, two = torch.ones(1), torch.full((1,), 2.0)
-    assert cache("dense", torch.add, one, two) == 3
-    assert cache("masked", torch.sub, one, two) == -1
-    assert captured == []
-    assert cache("dense", torch.add, two, two) == 4
-    assert cache("dense", torch.add, one, one) == 2
-    assert captured == [torch.add]

@@ -10,6 +10,11 @@ and the block adds ``b_o + sum_hs p_hs W_oh v_hs = b_o + sum_hs p_hs value_hs``:
 are two products with n_head * (1 + To) vectors, instead of two with d x d matrices. The time token of a
 denoising step depends on nothing else (without condition layers the condition encoder works token by token),
 so it is encoded and folded once per network.
+
+Whatever reads the residual stream begins with a layer norm, ``g (x - mean) / sqrt(var + eps) + s``. Gain and
+shift go into the weights that follow. As nothing ever sees the mean of the stream, what is added to it is
+centred beforehand, in the weights that make it; all that is left of a norm is a division by a length,
+``x / sqrt(|x|^2 + d eps)``, and a factor sqrt(d) that goes into the weights as well.
 """
 
 from __future__ import annotations
@@ -23,7 +28,44 @@ from torch import Tensor, nn
 from torchrl_sparse.blocks.engine.linear import make_linear
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["ConditionEncoder", "CrossAttentionFold", "FoldedMemory"]
+__all__ = [
+    "ConditionEncoder",
+    "CrossAttentionFold",
+    "FoldRoom",
+    "FoldedMemory",
+    "after_length",
+    "after_norm",
+    "centred",
+]
+
+
+def after_norm(norm: nn.LayerNorm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """f64 weight [out, d] and bias [out] of the layer behind ``norm``, to be used on what is normalised but not
+    yet scaled and shifted."""
+    weight, gain, shift = (part.detach().double() for part in (weight, norm.weight, norm.bias))
+    return weight * gain, bias.detach().double() + weight @ shift
+
+
+def after_length(norm: nn.LayerNorm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """The same, in the type of ``weight``, to be used on ``x / sqrt(|x|^2 + d eps)`` of a centred x.
+
+    >>> norm, x = nn.LayerNorm(4), torch.tensor([1.0, -3.0, 0.0, 2.0])
+    >>> weight, bias = after_length(norm, torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.ones(1))
+    >>> torch.allclose(weight @ (x / (x @ x + 4 * norm.eps).sqrt()) + bias, norm(x) @ torch.arange(1.0, 5) + 1)
+    True
+    """
+    folded, shifted = after_norm(norm, weight, bias)
+    return (folded * weight.shape[-1] ** 0.5).to(weight), shifted.to(weight)
+
+
+def centred(tensor: Tensor) -> Tensor:
+    """``tensor`` [..., d] without its mean over d.
+
+    >>> centred(torch.tensor([1.0, 2.0, 6.0]))
+    tensor([-2., -1.,  3.])
+    """
+    exact = tensor.detach().double()
+    return (exact - exact.mean(dim=-1, keepdim=True)).to(tensor)
 
 
 @dataclass(frozen=True)
@@ -39,8 +81,35 @@ class FoldedMemory:
     bias: Tensor
 
 
+class FoldRoom:
+    """The memory that folding N tokens takes, and its result; made by :meth:`CrossAttentionFold.room`.
+
+    Args:
+        num_tokens: N.
+        sizes: layers L, heads, head size, width d.
+        like: gives type and device.
+
+    Attributes:
+        folded: of the tokens that were folded last.
+    """
+
+    def __init__(self, num_tokens: int, sizes: tuple[int, int, int, int], like: Tensor) -> None:
+        layers, heads, size, width = sizes
+        self.projected = like.new_empty(num_tokens, layers * 2 * heads * size)
+        self.projected_by_token = (num_tokens, layers, 2, heads, size)
+        self.split = like.new_empty(2, layers, heads, num_tokens, size)
+        self.key, self.value = self.split.flatten(1, 2).unbind(0)
+        vectors = like.new_empty(2, layers, heads, num_tokens, width)
+        self.key_vectors, self.value_vectors = vectors.flatten(1, 2).unbind(0)
+        bias = like.new_empty(layers, heads, num_tokens)
+        self.bias = bias.view(layers * heads, num_tokens, 1)
+        self.folded = FoldedMemory(vectors.permute(1, 0, 3, 2, 4), bias.transpose(1, 2))
+
+
 class CrossAttentionFold:
     """Folds memory tokens into keys and values of width d; a snapshot of the network's weights.
+
+    The keys are for activations divided by their length, the values are centred.
 
     Args:
         network: the denoiser.
@@ -49,31 +118,41 @@ class CrossAttentionFold:
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=3, n_head=2, n_emb=16
         ... )
-        >>> CrossAttentionFold(network)(torch.zeros(6, 16)).vectors.shape
+        >>> fold = CrossAttentionFold(network)
+        >>> fold(torch.zeros(6, 16), fold.room(6)).vectors.shape
         torch.Size([3, 2, 6, 2, 16])
     """
 
     def __init__(self, network: TransformerForDiffusion) -> None:
         heads, width = network.n_head, network.n_emb
-        size = width // heads
-        attention = [layer.multihead_attn for layer in network.decoder.layers]
+        layers, size = network.decoder.layers, width // heads
+        attention = [layer.multihead_attn for layer in layers]
         weight = torch.stack([a.in_proj_weight for a in attention]).detach()
         bias = torch.stack([a.in_proj_bias for a in attention]).detach()
-        output = torch.stack([a.out_proj.weight for a in attention]).detach()
-        by_head = (len(attention), heads, size, width)
+        output = torch.stack([a.out_proj.weight.T for a in attention])
         # Scores are scaled by 1 / sqrt(d_h); scaling the query side scales keys and biases alike.
-        self._query = (weight[:, :width] * size**-0.5).reshape(by_head)
-        self._query_bias = (bias[:, :width] * size**-0.5).reshape(*by_head[:3], 1)
+        queries = [
+            after_length(layer.norm2, weight[i, :width] * size**-0.5, bias[i, :width] * size**-0.5)
+            for i, layer in enumerate(layers)
+        ]
+        self._sizes = (len(layers), heads, size, width)
+        self._query = torch.stack([query for query, _ in queries]).view(-1, size, width)
+        self._query_bias = torch.stack([shift for _, shift in queries]).view(-1, size, 1)
         self._project = make_linear(weight[:, width:].flatten(0, 1), bias[:, width:].flatten())
-        self._output = output.reshape(len(attention), width, heads, size).permute(0, 2, 3, 1).contiguous()
+        self._output = centred(output).view(-1, size, width)
 
-    def __call__(self, tokens: Tensor) -> FoldedMemory:
-        """Fold encoded memory ``tokens`` [N, d]."""
-        layers, heads, size, _ = self._query.shape
-        projected = self._project(tokens).view(-1, layers, 2, heads, size)
-        key, value = projected.permute(2, 1, 3, 0, 4)  # [L, n_head, N, d_h] each
-        vectors = torch.stack([key @ self._query, value @ self._output], dim=1)
-        return FoldedMemory(vectors.transpose(2, 3), (key @ self._query_bias).squeeze(-1).transpose(1, 2))
+    def room(self, num_tokens: int) -> FoldRoom:
+        """Memory to fold ``num_tokens`` tokens in."""
+        return FoldRoom(num_tokens, self._sizes, self._query)
+
+    def __call__(self, tokens: Tensor, room: FoldRoom) -> FoldedMemory:
+        """Fold encoded memory ``tokens`` [N, d]; the result is that of ``room``, until it is used again."""
+        projected = self._project(tokens, room.projected).view(room.projected_by_token)
+        room.split.copy_(projected.permute(2, 1, 3, 0, 4))
+        torch.bmm(room.key, self._query, out=room.key_vectors)
+        torch.bmm(room.value, self._output, out=room.value_vectors)
+        torch.bmm(room.key, self._query_bias, out=room.bias)
+        return room.folded
 
 
 class ConditionEncoder:

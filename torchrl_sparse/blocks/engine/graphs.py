@@ -1,82 +1,47 @@
-"""CUDA graphs: a whole query as one launch."""
+"""CUDA graphs of what the PyTorch engine plays."""
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 import torch
-from torch import Tensor
 
-__all__ = ["GraphCache", "capture_query"]
+__all__ = ["GraphCapture"]
 
 _WARM_UP = 3
-_CAPACITY = 16
-_REMEMBERED = 256
-
-Query = Callable[[Tensor, Tensor], Tensor]
-
-
-def capture_query(query: Query, noise: Tensor, cond: Tensor) -> Query:
-    """``query`` as one CUDA graph for inputs of these shapes; its launches may depend on nothing else."""
-    fixed_noise, fixed_cond = noise.clone(), cond.clone()
-    # Libraries initialise themselves in their first calls, which a capture does not allow.
-    stream = torch.cuda.Stream(noise.device)
-    stream.wait_stream(torch.cuda.current_stream(noise.device))
-    with torch.cuda.stream(stream):
-        for _ in range(_WARM_UP):
-            query(fixed_noise, fixed_cond)
-    torch.cuda.current_stream(noise.device).wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        result = query(fixed_noise, fixed_cond)
-
-    def replay(noise: Tensor, cond: Tensor) -> Tensor:
-        fixed_noise.copy_(noise)
-        fixed_cond.copy_(cond)
-        graph.replay()
-        return result.clone()
-
-    return replay
+_CAPTURES = (
+    threading.Lock()
+)  # a thread that begins to capture waits for the device, which ends the capture of another
 
 
-class GraphCache:
-    """Runs queries, and from the second time on as graphs: what comes once, as most learned masks do, is not captured.
+class GraphCapture:
+    """Captures functions without arguments as CUDA graphs. Written for a GPU, never run on one.
 
-    A graph has fixed inputs, so calls are serialised by a lock.
+    They may launch what they like but read and write only memory that outlives the graph, and may not wait for the device.
+    All graphs take their scratch memory from one pool: none leaves anything there for another, so they may be played in
+    any order, one at a time.
 
     Args:
-        capture: makes a graph, :func:`capture_query`.
-
-    Examples:
-        >>> cache = GraphCache(capture=lambda query, noise, cond: lambda noise, cond: noise + cond)
-        >>> ones = torch.ones(1)
-        >>> [cache("a mask", torch.sub, ones, ones).item() for _ in range(3)]
-        [0.0, 2.0, 2.0]
+        device: a CUDA device.
     """
 
-    def __init__(self, capture: Callable[[Query, Tensor, Tensor], Query] = capture_query) -> None:
-        self._capture = capture
-        self._seen: OrderedDict[Hashable, None] = OrderedDict()
-        self._graphs: OrderedDict[Hashable, Query] = OrderedDict()
-        self._lock = threading.Lock()
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+        self._pool = torch.cuda.graph_pool_handle()
 
-    def __call__(self, key: Hashable, query: Query, noise: Tensor, cond: Tensor) -> Tensor:
-        """``query(noise, cond)``; ``key`` names everything that it depends on but the values of its arguments."""
-        with self._lock:
-            if key in self._graphs:
-                self._graphs.move_to_end(key)
-                return self._graphs[key](noise, cond)
-            if key not in self._seen:
-                self._seen[key] = None
-                _trim(self._seen, _REMEMBERED)
-                return query(noise, cond)
-            self._graphs[key] = self._capture(query, noise, cond)
-            _trim(self._graphs, _CAPACITY)
-            return self._graphs[key](noise, cond)
-
-
-def _trim(entries: OrderedDict, size: int) -> None:
-    while len(entries) > size:
-        entries.popitem(last=False)
+    def __call__(self, segment: Callable[[], object]) -> Callable[[], object]:
+        """``segment`` as a graph, to be called like it; the segment runs a few times."""
+        with _CAPTURES:
+            present = torch.cuda.current_stream(self._device)
+            self._stream.wait_stream(present)
+            # Libraries initialise themselves in their first calls, which a capture does not allow.
+            with torch.cuda.stream(self._stream):
+                for _ in range(_WARM_UP):
+                    segment()
+            present.wait_stream(self._stream)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+                segment()
+        return graph.replay

@@ -28,6 +28,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.coefficients import step_coefficients
+from torchrl_sparse.blocks.engine.folding import after_norm
 
 if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -182,7 +183,7 @@ class PackedNetwork:
             clip=coefficients.clip,
             layer=layer_array,
             embed=self._matrix(network.input_emb.weight, network.input_emb.bias + positions, torch.float32),
-            head=self._matrix(*_after_norm(norm, head.weight, head.bias), torch.float32),
+            head=self._matrix(*after_norm(norm, head.weight, head.bias), torch.float32),
             cond=self._matrix(
                 network.cond_obs_emb.weight, network.cond_obs_emb.bias + cond_positions, torch.float32
             ),
@@ -196,7 +197,7 @@ class PackedNetwork:
     def _pack_loop(self, layer) -> dict[str, _Matrix]:
         """The matrices of self-attention and of the feed-forward network."""
         attention = layer.self_attn
-        qkv, bias = _after_norm(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
+        qkv, bias = after_norm(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
         scale = torch.ones(3, 1).double()
         scale[0] = self._head_size**-0.5
         qkv, bias = qkv.unflatten(0, (3, -1)) * scale[..., None], bias.unflatten(0, (3, -1)) * scale
@@ -204,7 +205,7 @@ class PackedNetwork:
         return {
             "qkv": self._matrix(self._padded_heads(qkv), self._padded_heads(bias)),
             "out": self._matrix(out, attention.out_proj.bias),
-            "up": self._matrix(*_after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
+            "up": self._matrix(*after_norm(layer.norm3, layer.linear1.weight, layer.linear1.bias)),
             "down": self._matrix(layer.linear2.weight, layer.linear2.bias),
         }
 
@@ -281,12 +282,6 @@ class PackedNetwork:
         return self._arena.keep(tensor.float())
 
 
-def _after_norm(norm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """``weight`` and ``bias`` of the layer behind ``norm``, to be used on what is normalised but not yet scaled."""
-    weight = weight.double()
-    return weight * norm.weight.double(), bias.double() + weight @ norm.bias.double()
-
-
 def _in_proj(attention) -> tuple[Tensor, Tensor]:
     return attention.in_proj_weight.double(), attention.in_proj_bias.double()
 
@@ -294,6 +289,6 @@ def _in_proj(attention) -> tuple[Tensor, Tensor]:
 def _cross_matrices(layer) -> tuple[Tensor, Tensor, Tensor]:
     """Scaled query weight [d, d] and bias [d] on normalised activations, and the output weight [d, d]."""
     weight, bias = (tensor.unflatten(0, (3, -1))[0] for tensor in _in_proj(layer.multihead_attn))
-    weight, bias = _after_norm(layer.norm2, weight, bias)
+    weight, bias = after_norm(layer.norm2, weight, bias)
     scale = (len(weight) // layer.multihead_attn.num_heads) ** -0.5
     return weight * scale, bias * scale, layer.multihead_attn.out_proj.weight.double()

@@ -8,7 +8,9 @@ network, observations once per query, cross-attention reads folded memory
 
 from __future__ import annotations
 
-from functools import partial
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +18,14 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.costs import time_blocks
-from torchrl_sparse.blocks.engine.graphs import GraphCache
+from torchrl_sparse.blocks.engine.graphs import GraphCapture
 from torchrl_sparse.blocks.engine.linear import can_pack
 from torchrl_sparse.blocks.engine.reference import check_query
-from torchrl_sparse.blocks.engine.torch_blocks import Tables
-from torchrl_sparse.blocks.engine.torch_loop import build_loop, make_walk, run_loop
+from torchrl_sparse.blocks.engine.torch_loop import Workspace
+from torchrl_sparse.blocks.engine.torch_program import build_loop
+from torchrl_sparse.blocks.engine.torch_tables import Tables
 from torchrl_sparse.blocks.engine.weights import WeightWatch
-from torchrl_sparse.blocks.mask import Reuse
+from torchrl_sparse.blocks.mask import Reuse, num_buffers
 
 if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
@@ -86,27 +89,27 @@ class TorchEngine:
     @torch.inference_mode()
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
         """See :meth:`torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
-        tables = self._current()[0]
-        return time_blocks(make_walk(tables), tables.num_layers, repeats, tables.device)
+        tables, pool = self._current()
+        with pool.take(1, self._network.num_blocks) as workspace:
+            return time_blocks(workspace.walk, self._network.n_layer, repeats, tables.device)
 
-    def _current(self) -> tuple[Tables, GraphCache | None]:
-        """Tables of the present weights, and the CUDA graphs made with them."""
+    def _current(self) -> tuple[Tables, WorkspacePool]:
+        """Tables of the present weights, and the workspaces made with them."""
         state = self._watch.state()
-        known, tables, graphs = self._known  # read and replaced in one go: other threads may do the same
+        known, tables, pool = self._known  # read and replaced in one go: other threads may do the same
         if known != state:
             with torch.inference_mode():
                 tables = Tables(self._network, self._schedule)
-            graphs = GraphCache() if tables.device.type == "cuda" else None
-            self._known = state, tables, graphs
-        return tables, graphs
+            pool = WorkspacePool(tables)
+            self._known = state, tables, pool
+        return tables, pool
 
     def _denoise(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
-        tables, graphs = self._current()
-        loop = build_loop(self._host_masks(mask), tables.device)
-        if graphs is None:
-            return run_loop(tables, loop, noise, cond, reuse)
-        query = partial(run_loop, tables, loop, reuse=reuse)
-        return graphs((loop, reuse, noise.shape), query, noise, cond)
+        tables, pool = self._current()
+        loop = build_loop(self._host_masks(mask), tables.device, gather=pool.capture is None)
+        slots = 0 if loop.dense else num_buffers(reuse, self._network.num_blocks)
+        with pool.take(len(noise), slots) as workspace:
+            return workspace.denoise(loop, noise, cond)
 
     def _host_masks(self, mask: Tensor | None) -> np.ndarray:
         """The masks on the host, a single one if that is that of all rows."""
@@ -114,3 +117,39 @@ class TorchEngine:
             return np.zeros((1, self._schedule.num_inference_steps, self._network.num_blocks), bool)
         host = mask.cpu().numpy()
         return host[:1] if (host == host[0]).all() else host
+
+
+class WorkspacePool:
+    """Workspaces that wait for their next query; a query that finds none gets a new one.
+
+    Args:
+        tables: of the network.
+        capacity: how many may wait; the least recently used goes first.
+
+    Attributes:
+        capture: makes a CUDA graph of a segment; None leaves segments as they are.
+    """
+
+    def __init__(self, tables: Tables, capacity: int = 8) -> None:
+        self._tables, self._capacity = tables, capacity
+        self._free: list[tuple[tuple, Workspace]] = []
+        self._lock = threading.Lock()
+        self.capture = GraphCapture(tables.device) if tables.device.type == "cuda" else None
+
+    @contextmanager
+    def take(self, batch: int, slots: int) -> Iterator[Workspace]:
+        """A workspace for ``batch`` rows and ``slots`` latest outputs, for the caller alone."""
+        # On a GPU the next query may be launched before the last one has run, but in the same order only in one stream.
+        stream = (
+            torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None
+        )
+        key = (batch, slots, stream)
+        with self._lock:
+            index = next((i for i, (known, _) in enumerate(self._free) if known == key), None)
+            workspace = None if index is None else self._free.pop(index)[1]
+        if workspace is None:
+            workspace = Workspace(self._tables, batch, slots, self.capture)
+        yield workspace
+        with self._lock:
+            self._free.append((key, workspace))
+            del self._free[: -self._capacity]

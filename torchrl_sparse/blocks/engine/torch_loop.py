@@ -1,228 +1,208 @@
-"""The denoising loop of the PyTorch engine: programs, their rows, and the state of one query."""
+"""The denoising loop of the PyTorch engine, and the memory in which it runs.
+
+A loop is a sequence of *segments*, and a program says which come in which order: the block of a column, for all rows of
+a batch or for some, the predicted noise with the scheduler's step, and a few single operations such as adding a run of
+reused outputs. A segment reads and writes memory that is always the same; what differs between denoising steps is
+copied there beforehand. So each can be captured once, as a CUDA graph, and a mask that was never seen is only another
+order of what is there already.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.folding import FoldedMemory
-from torchrl_sparse.blocks.engine.plan import COLLAPSE, COMPUTE, build_program
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
+from torchrl_sparse.blocks.engine.plan import COLLAPSE, COMPUTE
+from torchrl_sparse.blocks.engine.torch_blocks import Workbench
+from torchrl_sparse.blocks.engine.torch_memory import Memory
+from torchrl_sparse.blocks.engine.torch_program import Loop, Operation, build_loop
+from torchrl_sparse.blocks.engine.torch_tables import Tables
+from torchrl_sparse.blocks.mask import BLOCK_TYPES
 
-if TYPE_CHECKING:
-    from torchrl_sparse.blocks.engine.torch_blocks import Tables
-
-__all__ = ["Loop", "build_loop", "make_walk", "run_loop"]
+__all__ = ["Segment", "Workspace"]
 
 _CA = BLOCK_TYPES.index("CA")
 
+Segment = Callable[[], object]
 
-@dataclass(frozen=True, eq=False)
-class Loop:
-    """The program of a batch; compares by identity.
 
-    Attributes:
-        steps: for each denoising step its operations (operation, first, last, rows), see
-            :mod:`torchrl_sparse.blocks.engine.plan`; ``rows`` i64 names the rows of the batch that compute a
-            block, None means all.
-        attends: for each denoising step, whether it computes cross-attention anywhere.
-        dense: nothing is ever reused.
+class Workspace:
+    """Everything that the queries of one batch size write to, allocated once; for one query at a time.
+
+    Args:
+        tables: of the network.
+        batch: rows B.
+        slots: latest outputs to keep (:func:`~torchrl_sparse.blocks.mask.num_buffers`); 0 for dense loops, which
+            reuse none.
+        capture: turns a segment into one that does the same faster; None leaves them as they are. With it, the whole
+            dense loop is one segment, and a block that only some rows need computes all of them and keeps those: the
+            number of rows is part of a captured segment, and one for each number would be a great many.
     """
 
-    steps: list[list[tuple[int, int, int, Tensor | None]]]
-    attends: list[bool]
-    dense: bool
-
-
-def build_loop(masks: np.ndarray, device: torch.device) -> Loop:
-    """The loop of the masks bool [B, K, 3L] of a batch, kept for the next batch with the same masks."""
-    return _build_loop(masks.shape, masks.tobytes(), device)
-
-
-@lru_cache(maxsize=64)
-def _build_loop(shape: tuple[int, ...], data: bytes, device: torch.device) -> Loop:
-    masks = np.frombuffer(data, bool).reshape(shape)
-    pruned_by_all = masks.all(axis=0)
-    # Where some row computes, the operation is a COMPUTE of those rows.
-    program = build_program(pruned_by_all)
-    rows = _partial_rows(masks, pruned_by_all, device)
-    steps = [
-        [
-            (op, first, last, rows.get((k, first)) if op == COMPUTE else None)
-            for op, first, last in program.step(k)
-        ]
-        for k in range(shape[1])
-    ]
-    attends = (~pruned_by_all[:, _CA :: len(BLOCK_TYPES)]).any(axis=1).tolist()
-    return Loop(steps, attends, dense=not masks.any())
-
-
-def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.device) -> dict:
-    """(step, block) -> i64 rows, wherever some rows compute a block and others do not."""
-    cells = np.argwhere(masks.any(axis=0) & ~pruned_by_all)
-    if not len(cells):
-        return {}
-    computed = ~masks[:, cells[:, 0], cells[:, 1]].T
-    rows = torch.from_numpy(np.nonzero(computed)[1]).to(device)
-    parts = rows.split(computed.sum(axis=1).tolist())
-    return dict(zip(map(tuple, cells.tolist()), parts, strict=True))
-
-
-def run_loop(tables: Tables, loop: Loop, noise: Tensor, cond: Tensor, reuse: Reuse) -> Tensor:
-    """Actions [B, H, A] of one query.
-
-    Buffers are allocated once per query; in its steps only PyTorch's operators allocate, what they return.
-    """
-    return _Query(tables, loop, noise, cond, reuse).run()
-
-
-def make_walk(tables: Tables) -> Callable[[int], None]:
-    """A function to be timed, which runs the SA (0), CA (1) or FFN (2) blocks of all layers, batch 1."""
-    memory = _Memory(tables, tables.stem_weight.new_zeros(1, *tables.cond_shape))
-    memory.set_step(0)
-    x = tables.stem_bias
-
-    def walk(kind: int) -> None:
-        for layer, block in enumerate(tables.blocks[kind :: len(BLOCK_TYPES)]):
-            block(x, *(memory.by_layer[layer] if kind == _CA else ()))
-
-    return walk
-
-
-class _Memory:
-    """Folded memory of the denoising step at hand, for every row of the batch."""
-
-    def __init__(self, tables: Tables, cond: Tensor) -> None:
-        batch, tokens, heads = len(cond), 1 + cond.shape[1], tables.num_heads
-        self._fold, self._time = tables.fold, tables.time
-        self._vectors = cond.new_empty(tables.num_layers, 2, batch, tokens, heads, tables.width)
-        self._bias = cond.new_zeros(tables.num_layers, batch, tables.horizon, tokens, heads)
-        if tables.memory_mask is not None:
-            self._bias += tables.memory_mask[..., None]
-        self._hidden = self._bias[:1].clone()
-        if self._time is None:
-            self._memory = tables.encoder.memory(cond)
-        else:
-            observations = self._fold(tables.encoder.observation_tokens(cond).flatten(0, 1))
-            self._put(slice(1, None), observations, batch)
-        self.by_layer = [
-            (vectors[0].flatten(1, 2), vectors[1].flatten(1, 2), bias.flatten(2))
-            for vectors, bias in zip(self._vectors, self._bias, strict=True)
-        ]
-
-    def set_step(self, step: int) -> None:
-        """Make it the memory of denoising step ``step``."""
-        if self._time is None:
-            self._put(slice(None), self._fold(self._memory[step].flatten(0, 1)), len(self._memory[step]))
-        else:
-            # Every row sees the time token, so its bias has no -inf to keep.
-            self._vectors[:, :, :, 0] = self._time.vectors[:, :, step, None]
-            self._bias[:, :, :, 0] = self._time.bias[:, step, None, None]
-
-    def _put(self, tokens: slice, folded: FoldedMemory, batch: int) -> None:
-        self._vectors[:, :, :, tokens] = folded.vectors.unflatten(2, (batch, -1))
-        bias = folded.bias.unflatten(1, (batch, 1, -1))
-        torch.add(self._hidden[:, :, :, tokens], bias, out=self._bias[:, :, :, tokens])
-
-
-class _Query:
-    """The state of one query."""
-
-    def __init__(self, tables: Tables, loop: Loop, noise: Tensor, cond: Tensor, reuse: Reuse) -> None:
-        self._tables, self._loop = tables, loop
-        self._batch = batch = len(noise)
-        rows, size = batch * tables.horizon, batch * tables.horizon * tables.width
-        self._sample = noise[:, 0].reshape(rows, -1).clone()
-        self._clean = torch.empty_like(self._sample)
-        self._gaussians = _scaled_gaussians(noise, tables.spread)
-        self._memory = _Memory(tables, cond)
+    def __init__(
+        self, tables: Tables, batch: int, slots: int, capture: Callable[[Segment], Segment] | None = None
+    ) -> None:
+        network, new = tables.network, tables.stem_weight.new_zeros
+        rows, width = batch * network.horizon, network.n_emb
+        self._tables, self._batch = tables, batch
+        self._memory, self._bench = Memory(tables, batch), Workbench(network, batch)
+        self._parts: dict[int, _Part] = {}
+        self._sample, self._clean, self._eps = new(3, rows, network.input_dim).unbind(0)
+        self._step_table = new(tables.num_steps, tables.coefficients.shape[1] + self._sample.numel())
+        self._step_table[:, : tables.coefficients.shape[1]] = tables.coefficients
+        self._step_row = torch.empty_like(self._step_table[0])
+        coefficients, gaussian = self._step_row.tensor_split([tables.coefficients.shape[1]])
+        self._coefficients, self._gaussian = coefficients.unbind(0), gaussian.view_as(self._sample)
         self._stem = tables.stem_bias.repeat(batch, 1)
-        self._x = noise.new_empty(rows, tables.width)
-        self._sum = torch.empty_like(self._x)
-        slots = num_buffers(reuse, tables.num_blocks)
-        self._counts = tables.counts.get(slots)  # None where every block has a buffer of its own
-        self._latest = None if loop.dense else noise.new_empty(slots, size)
-        self._slots = None if loop.dense else [slot.view(rows, -1) for slot in self._latest]
-        self._ones = noise.new_ones(tables.num_blocks)
+        self._x, self._sum = new(2, rows, width).unbind(0)
+        self._chosen = torch.zeros(batch, 1, dtype=torch.bool, device=tables.device)
+        self._keeps = slots > 0
+        self._latest = new(slots, rows, width)
+        blocks = range(network.num_blocks)
+        self._slots = [self._latest[b % slots] if slots else self._bench.output for b in blocks]
+        self._reads = [self._memory.by_layer[b // 3] if b % 3 == _CA else () for b in blocks]
+        self._ones = new(network.num_blocks) + 1
+        self._runs: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+        self._set_segments(capture)
 
-    def run(self) -> Tensor:
-        """Actions [B, H, A]."""
-        for step, ops in enumerate(self._loop.steps):
-            if self._loop.attends[step]:
-                self._memory.set_step(step)
-            self._update(step, self._predict(ops))
-        return self._sample.view(self._batch, self._tables.horizon, -1)
-
-    def _predict(self, ops: list[tuple[int, int, int, Tensor | None]]) -> Tensor:
-        """The noise [B * H, A] that the network predicts."""
-        tables, x = self._tables, self._x
-        if ops[0][0] == COLLAPSE:
-            if ops[0][1]:
-                self._sum.copy_(self._stem)
-                self._add_reused(self._sum, 0, tables.num_blocks)
-            torch.addmm(self._sum, self._sample, tables.stem_weight, out=x)
-        else:
-            torch.addmm(self._stem, self._sample, tables.stem_weight, out=x)
-            for op, first, last, rows in ops:
-                if op == COMPUTE:
-                    self._compute(first, rows)
-                else:
-                    self._add_reused(x, first, last)
-        return torch.addmm(tables.head_bias, tables.norm(x), tables.head_weight)
-
-    def _compute(self, block: int, rows: Tensor | None) -> None:
-        x = self._x
-        if rows is not None:
-            self._compute_rows(block, rows)
+    def _set_segments(self, capture: Callable[[Segment], Segment] | None) -> None:
+        blocks = range(len(self._tables.blocks))
+        self._compute = [partial(self._compute_all, block) for block in blocks]
+        self._choose = [partial(self._compute_chosen, block) for block in blocks]
+        self._finish, self._fold, self._play = self._finish_step, self._memory.fold, self._run
+        self._gathers = capture is None
+        if capture is None:
             return
-        output = self._tables.blocks[block](x, *self._block_memory(block))
-        x.add_(output)
-        if self._slots is not None:
-            self._slot(block).copy_(output)
+        if not self._keeps:
+            dense = np.zeros((1, self._tables.num_steps, len(blocks)), bool)
+            whole = capture(partial(self._run, build_loop(dense, self._tables.device, gather=False)))
+            self._play = lambda loop: whole()
+            return
+        self._compute = [capture(segment) for segment in self._compute]
+        if self._batch > 1:
+            self._choose = [capture(segment) for segment in self._choose]
+        self._finish = capture(self._finish)
+        if self._tables.time is None:
+            self._fold = capture(self._fold)
 
-    def _compute_rows(self, block: int, rows: Tensor) -> None:
-        shape = (self._batch, -1)
-        memory = [part.index_select(0, rows) for part in self._block_memory(block)]
-        x = self._x.view(shape).index_select(0, rows).view(-1, self._tables.width)
-        output = self._tables.blocks[block](x, *memory)
-        latest = self._slot(block)
-        latest.view(shape).index_copy_(0, rows, output.view(len(rows), -1))
-        self._x.add_(latest)
+    def denoise(self, loop: Loop, noise: Tensor, cond: Tensor) -> Tensor:
+        """Actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
+        self._sample.copy_(noise[:, 0].flatten(0, 1))
+        # What step k adds is the gaussian of the transition to step k + 1; the last step adds none.
+        gaussians = noise[:, 1:].transpose(0, 1)
+        target = self._step_table[:-1, len(self._coefficients) :].view(gaussians.shape)
+        torch.mul(gaussians, self._tables.spread[:-1, None, None, None], out=target)
+        self._memory.begin(cond)
+        self._play(loop)
+        return self._sample.view(noise[:, 0].shape).clone()
 
-    def _block_memory(self, block: int) -> tuple[Tensor, ...]:
-        layer, kind = divmod(block, len(BLOCK_TYPES))
-        return self._memory.by_layer[layer] if kind == _CA else ()
+    def walk(self, kind: int) -> None:
+        """To be timed: the blocks of type ``kind`` (0 SA, 1 CA, 2 FFN) of all layers."""
+        for segment in self._compute[kind :: len(BLOCK_TYPES)]:
+            segment()
 
-    def _slot(self, block: int) -> Tensor:
-        return self._slots[block % len(self._slots)]
+    def _run(self, loop: Loop) -> None:
+        for step, ops in enumerate(loop.steps):
+            self._step_row.copy_(self._step_table[step])
+            if loop.attends[step]:
+                self._memory.load(step)
+                if self._tables.time is None:
+                    self._fold()
+            if ops[0][0] == COLLAPSE:
+                self._embed_collapsed(fresh=ops[0][1])
+            else:
+                self._embed(self._stem)
+                self._walk(ops)
+            self._finish()
 
-    def _add_reused(self, x: Tensor, first: int, last: int) -> None:
-        """Add to ``x`` what the pruned blocks ``first .. last-1`` add: one matrix times one vector."""
-        if self._counts is not None:
-            x.view(-1).addmv_(self._latest.mT, self._counts[first][last])
-        else:
-            x.view(-1).addmv_(self._latest[first:last].mT, self._ones[: last - first])
+    def _walk(self, ops: list[Operation]) -> None:
+        for op, first, last, rows in ops:
+            if op != COMPUTE:
+                self._add_reused(self._x, first, last)
+            elif rows is None:
+                self._compute[first]()
+            elif self._gathers:
+                self._compute_gathered(first, rows)
+            else:
+                self._chosen.copy_(rows)
+                self._choose[first]()
 
-    def _update(self, step: int, eps: Tensor) -> None:
-        """Take the scheduler's step, in place (:meth:`StepCoefficients.update` says what it computes)."""
-        noise_scale, signal_scale, clean_weight, sample_weight, eps_weight = self._tables.updates[step]
-        sample, clip = self._sample, self._tables.clip
-        clean = torch.sub(sample, eps, alpha=noise_scale, out=self._clean)
-        clean.div_(signal_scale).clamp_(-clip, clip)
-        torch.add(self._gaussians[step], sample, alpha=sample_weight, out=sample)
-        sample.add_(clean, alpha=clean_weight)
-        if eps_weight:
-            sample.add_(eps, alpha=eps_weight)
+    def _embed(self, bias: Tensor) -> None:
+        torch.addmm(bias, self._sample, self._tables.stem_weight, out=self._x)
+
+    def _embed_collapsed(self, fresh: int) -> None:
+        if fresh:
+            self._sum.copy_(self._stem)
+            self._add_reused(self._sum, 0, len(self._tables.blocks))
+        self._embed(self._sum)
+
+    def _compute_all(self, block: int) -> None:
+        slot = self._slots[block]
+        added = self._tables.blocks[block](self._x, slot, self._bench, *self._reads[block])
+        self._x.add_(added)
+        if self._keeps and added is not slot:
+            slot.copy_(added)
+
+    def _compute_chosen(self, block: int) -> None:
+        """For the rows that ``_chosen`` names."""
+        bench, slot = self._bench, self._slots[block]
+        added = self._tables.blocks[block](self._x, bench.output, bench, *self._reads[block])
+        latest = slot.view(self._batch, -1)
+        torch.where(self._chosen, added.view(latest.shape), latest, out=latest)
+        self._x.add_(slot)
+
+    def _compute_gathered(self, block: int, rows: list[int]) -> None:
+        """For ``rows`` alone."""
+        part = self._parts.get(len(rows))
+        if part is None:
+            part = self._parts[len(rows)] = _Part(self._tables, self._memory, len(rows))
+        slot, reads = self._slots[block], self._reads[block]
+        sources = [self._x.view(self._batch, -1), *reads]
+        for source, target in zip(sources, part.inputs, strict=False):
+            for row, place in zip(rows, target, strict=True):
+                place.copy_(source[row])
+        added = self._tables.blocks[block](part.x, part.bench.output, part.bench, *part.memory[: len(reads)])
+        latest = slot.view(self._batch, -1)
+        for row, values in zip(rows, added.view(len(rows), -1), strict=True):
+            latest[row].copy_(values)
+        self._x.add_(slot)
+
+    def _add_reused(self, to: Tensor, first: int, last: int) -> None:
+        """Add to ``to`` what the pruned blocks ``first .. last-1`` add: one matrix times one vector."""
+        run = self._runs.get((first, last))
+        if run is None:
+            latest = self._latest.flatten(1)
+            counts = self._tables.counts.get(len(latest))  # None where every block has a slot of its own
+            run = latest[first:last].mT, self._ones[: last - first]
+            if counts is not None:
+                run = latest.mT, counts[first][last]
+            self._runs[first, last] = run
+        to.view(-1).addmv_(*run)
+
+    def _finish_step(self) -> None:
+        """Predict the noise and take the scheduler's step (``StepCoefficients.update`` says what it computes)."""
+        tables, sample, clean = self._tables, self._sample, self._clean
+        noise_scale, signal_scale, clean_weight, sample_weight, eps_weight = self._coefficients
+        eps = torch.addmm(tables.head_bias, self._bench.normalise(self._x), tables.head_weight, out=self._eps)
+        torch.addcmul(sample, eps, noise_scale, out=clean)
+        clean.div_(signal_scale).clamp_(-tables.clip, tables.clip)
+        torch.addcmul(self._gaussian, sample, sample_weight, out=sample)
+        sample.addcmul_(clean, clean_weight)
+        if tables.weighs_eps:
+            sample.addcmul_(eps, eps_weight)
 
 
-def _scaled_gaussians(noise: Tensor, spread: Tensor) -> tuple[Tensor, ...]:
-    """What each of the K steps adds, [B * H, A]."""
-    # The last step's spread is 0, and there is no gaussian for it: any will do.
-    scaled = noise.roll(-1, dims=1) * spread[:, None, None]
-    return scaled.transpose(0, 1).flatten(1, 2).unbind(0)
+class _Part:
+    """Memory for a block that ``size`` rows of a batch compute alone."""
+
+    def __init__(self, tables: Tables, memory: Memory, size: int) -> None:
+        network = tables.network
+        self.bench = Workbench(network, size)
+        self.x = tables.stem_weight.new_empty(size * network.horizon, network.n_emb)
+        self.memory = [source.new_empty(size, *source.shape[1:]) for source in memory.by_layer[0]]
+        # By row: the residual stream, and what cross-attention reads.
+        self.inputs = [part.unbind(0) for part in (self.x.view(size, -1), *self.memory)]
