@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.tasks import get_task
@@ -72,12 +73,13 @@ def main(config: DictConfig) -> None:
     own = {name: delay(latency[name].p50, config) for name in methods}
     common = {delay(seconds, config) for seconds in config.latencies}
     runs = {}
-    for name, method in methods.items():
-        episodes = {
-            steps: evaluate(name, method, steps, environment, seeds, config)
-            for steps in sorted({*common, own[name]})
-        }
-        runs[name] = RealtimeRun(latency[name].p50, episodes)
+    with backend_runtime(config.backend, config.workers):  # one Ray for all runs
+        for name, method in methods.items():
+            episodes = {
+                steps: evaluate(name, method, steps, environment, seeds, config)
+                for steps in sorted({*common, own[name]})
+            }
+            runs[name] = RealtimeRun(latency[name].p50, episodes)
     results = build_realtime(
         runs,
         task=task.name,
@@ -121,6 +123,7 @@ def evaluate(
             seeds,
             num_envs=config.num_envs,
             workers=config.workers,
+            backend=config.backend,
             results_file=Path(config.out) / "episodes" / f"{name}_delay{steps}.jsonl",
             identity=identity,
             on_episode=lambda _, done, total: bar.update(done - bar.n),

@@ -247,9 +247,10 @@ def test_out_of_range_options_are_named(tmp_path, field, value):
         collect(tmp_path / "a.h5", Collection(**{"task": "Lift", "episodes": 1, field: value}))
 
 
-def test_two_workers_make_the_same_file(collected, tmp_path):
+def test_two_workers_make_the_same_file(collected, tmp_path, backend, monkeypatch):
     path, summary = collected
-    assert collect(tmp_path / "two.h5", THREE, workers=2) == summary
+    monkeypatch.chdir(tmp_path)
+    assert collect("two.h5", THREE, workers=2, backend=backend) == summary
     assert (tmp_path / "two.h5").read_bytes() == path.read_bytes()
 
 
