@@ -32,6 +32,7 @@ from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.plots import method_colors
 from torchrl_sparse.evaluation.schema import REFERENCE
 from torchrl_sparse.evaluation.stats import paired_difference, wilson_interval
+from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.files import atomic_path
 
 __all__ = [
@@ -168,12 +169,8 @@ def realtime_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def format_realtime(results: Mapping[str, Any]) -> str:
     """The table as markdown that also lines up in a terminal, and what it says."""
-    rows = realtime_rows(results)
-    widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in rows[0]}
-    lines = ["| " + " | ".join(column.ljust(width) for column, width in widths.items()) + " |"]
-    lines.append("|" + "|".join("-" * (width + 2) for width in widths.values()) + "|")
-    lines += [f"| {' | '.join(row[c].ljust(width) for c, width in widths.items())} |" for row in rows]
-    return "\n".join([*lines, "", realtime_note(results)])
+    table = markdown_table(realtime_rows(results), left=("method", "latency"))
+    return f"{table}\n\n{realtime_note(results)}"
 
 
 def realtime_note(results: Mapping[str, Any]) -> str:
