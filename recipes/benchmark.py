@@ -29,6 +29,8 @@ from torchrl_sparse.evaluation.fidelity import action_error, block_errors
 from torchrl_sparse.evaluation.latency import describe_machine
 from torchrl_sparse.evaluation.mask_figures import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.methods import (
+    CALIBRATION_SEED,
+    EVALUATION_SEED,
     MethodName,
     answer,
     calibrate_policy,
@@ -46,8 +48,6 @@ from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-EVALUATION_SEED = 100_000  # Diffusion Policy's test_start_seed: apart from the seeds of demonstrations
-CALIBRATION_SEED = 1_000_000
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 
 

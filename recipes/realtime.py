@@ -23,6 +23,8 @@ from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.episodes import EpisodeResult
 from torchrl_sparse.evaluation.latency import describe_machine
 from torchrl_sparse.evaluation.methods import (
+    CALIBRATION_SEED,
+    EVALUATION_SEED,
     calibrate_policy,
     check_method,
     make_method,
@@ -39,9 +41,6 @@ from torchrl_sparse.evaluation.realtime import (
     save_realtime,
 )
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-
-EVALUATION_SEED = 100_000  # as in benchmark.py
-CALIBRATION_SEED = 1_000_000
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")
