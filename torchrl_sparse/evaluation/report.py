@@ -9,13 +9,12 @@ from typing import Any
 
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.latency import Latency
-from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, validate_results
+from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, outcome_entry, validate_results
 from torchrl_sparse.evaluation.stats import (
     DEFAULT_MARGIN,
     PairedDifference,
     episodes_needed,
     paired_difference,
-    wilson_interval,
 )
 from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.files import atomic_path
@@ -89,18 +88,7 @@ def _method_entry(name: str, run: MethodRun, dense: MethodRun, margin: float) ->
         paired = paired_difference(outcomes, [reference[seed].success for seed in ours], margin)
     cost, dense_cost = totals(run.episodes), totals(dense.episodes)
     return {
-        "success": {
-            "k": sum(outcomes),
-            "n": len(outcomes),
-            "rate": sum(outcomes) / len(outcomes),
-            "ci95": list(wilson_interval(sum(outcomes), len(outcomes))),
-        },
-        "paired_vs_dense": {
-            "diff": paired.diff,
-            "ci95": list(paired.ci),
-            "margin": paired.margin,
-            "verdict": paired.verdict,
-        },
+        **outcome_entry(outcomes, paired),
         "prune_rate": cost.prune_rate,
         "flops": {
             "per_query": cost.flops_per_query,
