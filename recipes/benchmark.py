@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.tasks import get_task
@@ -28,6 +29,8 @@ from torchrl_sparse.evaluation.fidelity import action_error, block_errors
 from torchrl_sparse.evaluation.latency import describe_machine
 from torchrl_sparse.evaluation.mask_figures import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.methods import (
+    CALIBRATION_SEED,
+    EVALUATION_SEED,
     MethodName,
     answer,
     calibrate_policy,
@@ -45,8 +48,6 @@ from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-EVALUATION_SEED = 100_000  # Diffusion Policy's test_start_seed: apart from the seeds of demonstrations
-CALIBRATION_SEED = 1_000_000
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 
 
@@ -77,7 +78,10 @@ def main(config: DictConfig) -> None:
     first = EVALUATION_SEED + config.seed
     seeds = range(first, first + config.episodes)
 
-    episodes = {name: evaluate(name, method, environment, seeds, config) for name, method in methods.items()}
+    with backend_runtime(config.backend, config.workers):  # one Ray for all methods
+        episodes = {
+            name: evaluate(name, method, environment, seeds, config) for name, method in methods.items()
+        }
     settle_rates(methods, episodes)
     queries = record_queries(executor("dense", policy, config), environment, seeds[: config.probe_episodes])
     with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
@@ -134,6 +138,7 @@ def evaluate(
             seeds,
             num_envs=config.num_envs,
             workers=config.workers,
+            backend=config.backend,
             results_file=log,
             identity=identity,
             on_episode=show,

@@ -33,7 +33,9 @@ def main(config: DictConfig) -> None:
             bar.set_postfix_str(f"{tally.successes}/{tally.attempts} succeeded", refresh=False)
             bar.update(tally.kept - bar.n)
 
-        summary = collect(config.out, collection, workers=config.workers, on_episode=show)
+        summary = collect(
+            config.out, collection, workers=config.workers, backend=config.backend, on_episode=show
+        )
     print(f"{config.out}: {config.task} {config.quality}, {summary}")
 
 

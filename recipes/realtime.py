@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.tasks import get_task
@@ -22,6 +23,8 @@ from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.episodes import EpisodeResult
 from torchrl_sparse.evaluation.latency import describe_machine
 from torchrl_sparse.evaluation.methods import (
+    CALIBRATION_SEED,
+    EVALUATION_SEED,
     calibrate_policy,
     check_method,
     make_method,
@@ -38,9 +41,6 @@ from torchrl_sparse.evaluation.realtime import (
     save_realtime,
 )
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-
-EVALUATION_SEED = 100_000  # as in benchmark.py
-CALIBRATION_SEED = 1_000_000
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")
@@ -72,12 +72,13 @@ def main(config: DictConfig) -> None:
     own = {name: delay(latency[name].p50, config) for name in methods}
     common = {delay(seconds, config) for seconds in config.latencies}
     runs = {}
-    for name, method in methods.items():
-        episodes = {
-            steps: evaluate(name, method, steps, environment, seeds, config)
-            for steps in sorted({*common, own[name]})
-        }
-        runs[name] = RealtimeRun(latency[name].p50, episodes)
+    with backend_runtime(config.backend, config.workers):  # one Ray for all runs
+        for name, method in methods.items():
+            episodes = {
+                steps: evaluate(name, method, steps, environment, seeds, config)
+                for steps in sorted({*common, own[name]})
+            }
+            runs[name] = RealtimeRun(latency[name].p50, episodes)
     results = build_realtime(
         runs,
         task=task.name,
@@ -121,6 +122,7 @@ def evaluate(
             seeds,
             num_envs=config.num_envs,
             workers=config.workers,
+            backend=config.backend,
             results_file=Path(config.out) / "episodes" / f"{name}_delay{steps}.jsonl",
             identity=identity,
             on_episode=lambda _, done, total: bar.update(done - bar.n),

@@ -10,9 +10,12 @@ The same file works with `wandb sweep recipes/sweeps/rho_lift.yaml` and `wandb a
 from __future__ import annotations
 
 import csv
+import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
@@ -40,11 +43,25 @@ def main(config: DictConfig) -> None:
     if config.mode == "online":
         run_online(read_sweep(path), out, config)
         return
-    sweep = LocalSweep(read_sweep(path), out, config.count)
-    while trial := sweep.next_trial():
-        print(f"trial {sweep.trials.index(trial) + 1}: {trial.label}", flush=True)
-        run_trial(sweep, trial)
-    summarise(sweep)
+    with lock_folder(out) as lock:
+        sweep = LocalSweep(read_sweep(path), out, config.count)
+        while trial := sweep.next_trial():
+            print(f"trial {sweep.trials.index(trial) + 1}: {trial.label}", flush=True)
+            run_trial(sweep, trial, lock)
+        summarise(sweep)
+
+
+@contextmanager
+def lock_folder(out: Path) -> Iterator[int]:
+    """Waits until nothing else works in the folder; the trial inherits the lock, since it outlives a sweep that is killed."""
+    out.mkdir(parents=True, exist_ok=True)
+    with open(out / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"waiting for a trial that still runs in {out}", flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield file.fileno()
 
 
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
@@ -58,14 +75,14 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     wandb.agent(note.read_text(), project=config.project, count=config.count)
 
 
-def run_trial(sweep: LocalSweep, trial: Trial) -> None:
+def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     environment = os.environ | {
         "WANDB_MODE": "offline",
         "WANDB_RUN_ID": trial.id,
         "WANDB_RUN_GROUP": sweep.out.name,
     }
     command = trial_command(sweep.config, trial)
-    code = subprocess.run(command, env=environment).returncode
+    code = subprocess.run(command, env=environment, pass_fds=[lock]).returncode
     if code:
         raise RuntimeError(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
     sweep.finish(trial)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -107,7 +108,8 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     )
 
     media = next(out.glob("wandb/offline-run-*/files/media"))
-    assert {path.suffix for path in media.rglob("*.*")} >= {".png", ".json"}
+    logged = {path.suffix for path in media.rglob("*.*")}
+    assert logged == {".png", ".json", *(Path(video).suffix for video in videos)}
 
     logs = {file.name: file.read_bytes() for file in (out / "episodes").iterdir()}
     run("benchmark", *options)  # a second run reads the episodes instead of running them
@@ -131,43 +133,66 @@ def test_realtime_leaves_a_curve_per_method(work, policy):
 
 
 FAKE_TRIAL = """
-import os, shutil, sys
+import os, shutil, signal, sys, time
 from pathlib import Path
 
-arguments = dict(word.split("=", 1) for word in sys.argv[1:])
-out = Path(os.environ["SWEEP_OUT"]) / os.environ["WANDB_RUN_ID"]
+number = dict(word.split("=", 1) for word in sys.argv[1:])["num_updates"]
+sweep = Path(os.environ["SWEEP_OUT"])
+out = sweep / os.environ["WANDB_RUN_ID"]
 out.mkdir(exist_ok=True)
-if arguments["num_updates"] == "10" and not (out / "tried").exists():
-    (out / "tried").touch()
-    os.kill(os.getppid(), 9)
-    sys.exit("killed")
+first = not (out / "tried").exists()
+(out / "tried").touch()
+if number == "3" and first:  # kills the sweep and lives on
+    os.kill(os.getppid(), signal.SIGKILL)
+    os.close(1), os.close(2)
+    deadline = time.monotonic() + 600
+    while not (sweep / "go").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    (out / "ended").touch()
+    sys.exit()
+if number == "3" and not (out / "ended").exists():
+    sys.exit("the same trial runs twice at a time")
+if number == "6" and first:
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(100)
 shutil.copy(Path(__file__).with_name("template.json"), out / "results.json")
 """
 
 
-def test_a_killed_sweep_goes_on_and_ends_with_every_trial(work):
+def test_a_sweep_of_eight_survives_a_kill_and_an_interrupt(work):
     (work / "trial.py").write_text(FAKE_TRIAL)
     save_results(make_results(20, names=("dense", "bac")), work / "template.json")
     sweep = {
         "program": str(work / "trial.py"),
         "method": "grid",
         "metric": {"name": "tested/success", "goal": "maximize"},
-        "parameters": {"num_updates": {"values": [20, 10, 5]}},
+        "parameters": {"num_updates": {"values": list(range(1, 9))}},
         "command": ["${env}", "python", "${program}", "${args_no_hyphens}"],
     }
     (work / "toy.yaml").write_text(json.dumps(sweep))
     options = ("sweep", f"sweep={work}/toy.yaml", f"out={work}/sweep")
-    run(*options, expect=-9)
-    before = json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
-    assert [trial["finished"] for trial in before] == [True, False]
-    assert "3 trials" in run(*options)
-    after = json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
-    assert [trial["id"] for trial in after][:2] == [trial["id"] for trial in before]
-    assert [trial["parameters"]["num_updates"] for trial in after] == [20, 10, 5]
-    assert list(load_results(work / "sweep" / "results.json")["methods"]) == [
-        "dense", "num_updates=20", "num_updates=10", "num_updates=5",
-    ]  # fmt: skip
-    assert len((work / "sweep" / "trials.csv").read_text().splitlines()) == 4
+
+    def trials():
+        return json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
+
+    run(*options, expect=-signal.SIGKILL)
+    assert [trial["finished"] for trial in trials()] == [True, True, False]
+
+    command = [sys.executable, str(RECIPES / "sweep.py"), *options[1:]]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT) as again:
+        assert again.stdout.readline().startswith("waiting for a trial that still runs")
+        (work / "sweep" / "go").touch()
+        again.stdout.read()
+    assert again.returncode != 0
+    interrupted = trials()
+    assert [trial["finished"] for trial in interrupted] == [True] * 5 + [False]
+
+    assert "8 trials" in run(*options)
+    assert [trial["id"] for trial in trials()][:6] == [trial["id"] for trial in interrupted]
+    assert [trial["parameters"]["num_updates"] for trial in trials()] == list(range(1, 9))
+    labels = [f"num_updates={number}" for number in range(1, 9)]
+    assert list(load_results(work / "sweep" / "results.json")["methods"]) == ["dense", *labels]
+    assert len((work / "sweep" / "trials.csv").read_text().splitlines()) == 1 + 8
     assert iio.imread(work / "sweep" / "pareto.png").std() > 5
 
 

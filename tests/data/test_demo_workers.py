@@ -1,4 +1,4 @@
-"""Work in several processes comes out in order, and a death on the way loses nothing."""
+"""Work of several workers comes out in order, and a death on the way loses nothing."""
 
 import os
 import signal
@@ -25,22 +25,22 @@ def take(numbers, n):
     return taken
 
 
-def test_comes_in_order(tmp_path):
-    assert take(in_order(partial(note, tmp_path, 10**9), 5, workers=2), 4) == [5, 6, 7, 8]
+def test_comes_in_order(tmp_path, backend):
+    assert take(in_order(partial(note, tmp_path, 10**9), 5, workers=2, backend=backend), 4) == [5, 6, 7, 8]
     assert all((tmp_path / str(number)).exists() for number in range(5, 9))
 
 
-def test_a_dead_worker_is_reported_and_its_work_redone(tmp_path):
-    with pytest.warns(RuntimeWarning, match=r"a worker died: going on from number \d"):
-        assert take(in_order(partial(note, tmp_path, 2), 0, workers=2), 4) == [0, 1, 2, 3]
+def test_a_dead_worker_is_reported_and_its_work_redone(tmp_path, backend):
+    with pytest.warns(RuntimeWarning, match=r"worker died.*; going on from number \d"):
+        assert take(in_order(partial(note, tmp_path, 2), 0, workers=2, backend=backend), 4) == [0, 1, 2, 3]
     assert all((tmp_path / str(number)).exists() for number in range(4))
 
 
-def test_workers_that_keep_dying_end_it(tmp_path):
+def test_workers_that_keep_dying_end_it(tmp_path, backend):
     with pytest.warns(RuntimeWarning), pytest.raises(RuntimeError, match="died 3 times in a row at number 0"):
-        take(in_order(partial(note, tmp_path, -1), 0, workers=1), 1)
+        take(in_order(partial(note, tmp_path, -1), 0, workers=1, backend=backend), 1)
 
 
-def test_what_the_work_raises_is_raised():
+def test_what_the_work_raises_is_raised(backend):
     with pytest.raises(TypeError, match="str"):
-        take(in_order(os.getenv, 0, workers=1), 1)
+        take(in_order(os.getenv, 0, workers=1, backend=backend), 1)

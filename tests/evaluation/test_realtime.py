@@ -59,3 +59,7 @@ def test_file_table_and_figure(tmp_path):
     (tmp_path / "realtime.json").write_text('{"schema": 1}')
     with pytest.raises(ValueError, match=r"realtime.json: expected realtime results of schema 1, got None"):
         load_realtime(tmp_path / "realtime.json")
+    del results["methods"]["bac"]["points"][1]["success"]["k"]
+    save_realtime(results, tmp_path / "realtime.json")
+    with pytest.raises(ValueError, match=r"realtime.json: methods.bac.points.1.success.k: expected this key"):
+        load_realtime(tmp_path / "realtime.json")

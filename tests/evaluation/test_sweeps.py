@@ -7,7 +7,7 @@ import yaml
 
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.evaluation.report import save_results
-from torchrl_sparse.evaluation.sweeps import LocalSweep, merge_trials, read_sweep, trial_command
+from torchrl_sparse.evaluation.sweeps import LocalSweep, Trial, merge_trials, read_sweep, trial_command
 from torchrl_sparse.evaluation.tracking import trial_metrics
 
 SWEEPS = sorted((Path(__file__).parents[2] / "recipes" / "sweeps").glob("*.yaml"))
@@ -76,6 +76,19 @@ def test_metrics_have_names_that_do_not_depend_on_the_method():
         == results["methods"]["ddim10"]["success"]["rate"]
     )
     assert metrics["dense/speedup"] == 1
+
+
+def test_trials_go_by_what_they_tested_or_else_by_their_parameters():
+    def merged(*tested):
+        pairs = [
+            (Trial(str(i), {"seed": i}), make_results(20, names=("dense", name)))
+            for i, name in enumerate(tested)
+        ]
+        return list(merge_trials(pairs)["methods"])
+
+    assert merged("ddim10", "bac") == ["dense", "ddim10", "bac"]
+    assert merged("bac", "bac") == ["dense", "seed=0", "seed=1"]
+    assert merged("dense", "bac") == ["dense", "seed=0", "seed=1"]
 
 
 def test_nothing_finished_cannot_be_merged():

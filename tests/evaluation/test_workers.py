@@ -1,7 +1,8 @@
-"""Episodes do not depend on how many processes ran them, nor on a process that died on the way."""
+"""Episodes do not depend on how many workers ran them, nor where, nor on a worker that died on the way."""
 
 import os
 import signal
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,15 +35,17 @@ def run(make_env, **kwargs):
     return rollout_episodes(FakeActor(), make_env, SEEDS, **kwargs)
 
 
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_two_workers_find_what_one_finds():
-    assert run(FakeEnv, workers=2, num_envs=2) == run(FakeEnv, workers=1)
+@pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")
+@pytest.mark.parametrize(("workers", "num_envs"), [(1, 3), (2, 2)])
+def test_workers_find_what_this_process_finds(backend, workers, num_envs):
+    assert run(FakeEnv, workers=workers, num_envs=num_envs, backend=backend) == run(FakeEnv)
 
 
-def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path):
-    log = tmp_path / "episodes.jsonl"
-    with pytest.warns(RuntimeWarning, match=r"exit code -9.*episodes are run anew"):
-        episodes = run(partial(MortalEnv, folder=tmp_path), workers=2, num_envs=1, results_file=log)
+def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, backend):
+    log, make_env = tmp_path / "episodes.jsonl", partial(MortalEnv, folder=tmp_path)
+    said = {"process": r"exit code -9.*episodes are run anew", "ray": r"a Ray worker died: .*are run anew"}
+    with pytest.warns(RuntimeWarning, match=said[backend]):
+        episodes = run(make_env, workers=2, num_envs=1, results_file=log, backend=backend)
     assert episodes == run(FakeEnv)
     assert (tmp_path / "died").exists()
     assert len(log.read_text().splitlines()) == 1 + len(SEEDS)
@@ -89,21 +92,47 @@ def test_an_error_without_a_death_is_not_tried_again():
     assert len(started) == 1
 
 
-def test_robosuite_gives_the_same_in_two_workers():
+def test_robosuite_gives_the_same_in_two_workers(backend):
     from torchrl_sparse import ChunkExecutor, DiffusionPolicy, NoiseSchedule, make_env
 
     policy = DiffusionPolicy.from_pretrained("assets/lift")
     policy.schedule = NoiseSchedule("ddim", 3)
     make = partial(make_env, "Lift", horizon=10)
     runs = [
-        rollout_episodes(ChunkExecutor(policy), make, [100_000, 100_001], num_envs=1, workers=workers)
-        for workers in (1, 2)  # the second with an engine that has already run here
+        rollout_episodes(ChunkExecutor(policy), make, [100_000, 100_001], num_envs=1, **where)
+        # the second with an engine that has already run here
+        for where in ({}, {"workers": 2, "backend": backend})
     ]
     one, two = ([replace(episode, latency=()) for episode in episodes] for episodes in runs)
     assert one == two
     assert all(episode.queries == 2 for episode in one)
 
 
-def test_counts_are_checked():
-    with pytest.raises(ValueError, match="workers >= 1"):
-        run(FakeEnv, workers=0)
+class BrokenEnv(FakeEnv):
+    """Cannot be stepped."""
+
+    def _step(self, tensordict):
+        raise ArithmeticError("no step")
+
+
+def test_what_a_ray_worker_raises_is_raised_and_not_tried_again(ray_cluster):
+    with pytest.raises(ArithmeticError, match="no step"):
+        run(BrokenEnv, backend="ray")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"workers": 0}, "workers: expected at least 1, got 0"),
+        ({"backend": "smoke"}, "backend: expected one of process, ray, got 'smoke'"),
+    ],
+)
+def test_options_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        run(FakeEnv, **options)
+
+
+def test_ray_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ImportError, match=r"pip install 'torchrl-sparse\[ray\]'"):
+        run(FakeEnv, backend="ray")

@@ -1,6 +1,7 @@
-"""Demonstrations made by several processes, handed on in the order of their seeds.
+"""Demonstrations made by several workers, handed on in the order of their seeds.
 
-An expert reads the simulator and not the TensorDict, so these are plain processes rather than a TorchRL collector.
+An expert reads the simulator and not the TensorDict, so these are plain processes, or plain Ray tasks, rather than a TorchRL
+collector.
 """
 
 from __future__ import annotations
@@ -8,10 +9,13 @@ from __future__ import annotations
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import count
 from multiprocessing import get_context
+from typing import Any
+
+from torchrl_sparse.backends import backend_runtime, ray_death
 
 __all__ = ["in_order"]
 
@@ -19,17 +23,22 @@ _AHEAD = 2  # tasks per worker that are handed out beyond the one waited for
 _FAILURES = 3
 
 
-def in_order(task: Callable[[int], None], first: int, workers: int) -> Iterator[int]:
-    """Calls ``task(first)``, ``task(first + 1)``, ... in worker processes and yields each number once it is done, in order.
+def in_order(
+    task: Callable[[int], None], first: int, workers: int, *, backend: str = "process"
+) -> Iterator[int]:
+    """Calls ``task(first)``, ``task(first + 1)``, ... in workers and yields each number once it is done, in order.
 
     A worker that dies is reported as a warning; what it and the others had under way is done again.
 
     Args:
         task: picklable; calling it again for the same number must do no harm.
         first: the first number.
-        workers: processes.
+        workers: processes, or CPUs of Ray's.
+        backend: "process" or "ray", see `backend_runtime`.
 
     Raises:
+        ValueError: for an unknown backend.
+        ImportError: if Ray is asked for and not installed.
         RuntimeError: if workers die three times in a row without anything done between.
         Exception: whatever ``task`` raises.
 
@@ -39,22 +48,73 @@ def in_order(task: Callable[[int], None], first: int, workers: int) -> Iterator[
     >>> numbers.close()
     """
     failures = 0
-    while True:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            ahead: deque[Future] = deque()
-            try:
-                numbers = count(first)
-                while True:
-                    while len(ahead) < _AHEAD * workers:
-                        ahead.append(pool.submit(task, next(numbers)))
-                    ahead.popleft().result()
-                    failures, first = 0, first + 1
-                    yield first - 1
-            except BrokenProcessPool as error:
-                failures += 1
-                if failures == _FAILURES:
-                    raise RuntimeError(f"workers died {failures} times in a row at number {first}") from error
-                warnings.warn(f"a worker died: going on from number {first}", RuntimeWarning, stacklevel=2)
-            finally:
-                for future in ahead:
-                    future.cancel()
+    with backend_runtime(backend, workers):
+        while True:
+            with _pool(backend, workers) as pool:
+                ahead: deque[Future] = deque()
+                try:
+                    numbers = count(first)
+                    while True:
+                        while len(ahead) < _AHEAD * workers:
+                            ahead.append(pool.submit(task, next(numbers)))
+                        ahead.popleft().result()
+                        failures, first = 0, first + 1
+                        yield first - 1
+                except Exception as error:
+                    death = _death(backend, error)
+                    if not death:
+                        raise
+                    failures += 1
+                    if failures == _FAILURES:
+                        raise RuntimeError(
+                            f"workers died {failures} times in a row at number {first}: {death}"
+                        ) from error
+                    warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)
+                finally:
+                    for future in ahead:
+                        future.cancel()
+
+
+def _pool(backend: str, workers: int) -> Executor:
+    if backend == "ray":
+        return _RayPool()
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
+def _death(backend: str, error: Exception) -> str:
+    """What died, in words; empty if it is the task that raised ``error``."""
+    if backend == "ray":
+        return ray_death(error)
+    return "a worker died" if isinstance(error, BrokenProcessPool) else ""
+
+
+class _RayPool(Executor):
+    """Ray tasks of one CPU each as futures. Ray's own silent retries are off: a death has to be reported."""
+
+    def __init__(self) -> None:
+        import ray
+
+        self._call = ray.remote(num_cpus=1, max_retries=0)(_call)
+        self._open: set[Any] = set()
+
+    def submit(self, task: Callable[[int], None], number: int) -> Future:
+        """Hands a task out."""
+        reference = self._call.remote(task, number)
+        self._open.add(reference)
+        future = reference.future()
+        future.add_done_callback(lambda _: self._open.discard(reference))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Interrupts what is under way and waits until it has ended."""
+        import ray
+
+        running = list(self._open)
+        for reference in running:
+            ray.cancel(reference)
+        if running:
+            ray.wait(running, num_returns=len(running))
+
+
+def _call(task: Callable[[int], None], number: int) -> None:
+    task(number)

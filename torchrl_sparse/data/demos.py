@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from torchrl_sparse import keys
+from torchrl_sparse.backends import check_backend
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
@@ -127,6 +128,7 @@ def collect(
     *,
     env: RobosuiteEnv | None = None,
     workers: int = 1,
+    backend: str = "process",
     on_episode: Callable[[Summary], None] | None = None,
 ) -> Summary:
     """Collects demonstrations into ``path``, going on where a killed run stopped.
@@ -138,8 +140,9 @@ def collect(
         path: the HDF5 file to make; layout in `torchrl_sparse.data.hdf5_writer`.
         collection: what to collect.
         env: an environment of that task to use; made when it is needed by default. Workers make their own.
-        workers: processes; the file is the same whatever their number. One that dies is reported as a warning and its
-            episode made again.
+        workers: how many make episodes at a time; the file is the same whatever their number. One that dies is reported as
+            a warning and its episode made again.
+        backend: "process" or "ray", see `backend_runtime`. Machines of a Ray cluster must share the folder of ``path``.
         on_episode: called with the tally so far, after episodes found on disk and after each new one.
 
     Raises:
@@ -147,9 +150,8 @@ def collect(
     """
     path = Path(path)
     _check(collection)
-    if workers < 1:
-        raise ValueError(f"workers: expected at least 1, got {workers}")
-    parts = path.with_name(path.name + ".parts")
+    check_backend(backend, workers)
+    parts = path.with_name(path.name + ".parts").absolute()  # workers may run in another folder
     settings = asdict(collection)
     if path.exists():
         shutil.rmtree(parts, ignore_errors=True)  # a kill between the two last steps leaves them
@@ -157,12 +159,7 @@ def collect(
     _claim(parts, settings)
     kept: list[Path] = []
     tally = Summary(0, 0, 0, 0.0)
-    own = cache(lambda: RobosuiteEnv(collection.task) if env is None else env)
-    environment = own if workers == 1 else partial(_worker_env, collection.task)
-    make = partial(_make_part, parts, collection.quality, environment)
-    first = collection.seed
-    seeds = in_order(make, first, workers) if workers > 1 else (make(seed) for seed in itertools.count(first))
-    with closing(seeds):
+    with closing(_seeds_made(parts, collection, env, workers, backend)) as seeds:
         while tally.kept < collection.episodes:
             tally = _add(tally, _part(parts, next(seeds)), kept, collection.keep_failures)
             if on_episode is not None:
@@ -173,6 +170,17 @@ def collect(
     merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
     shutil.rmtree(parts)
     return tally
+
+
+def _seeds_made(
+    parts: Path, collection: Collection, env: RobosuiteEnv | None, workers: int, backend: str
+) -> Iterator[int]:
+    """Makes one episode after the other, and yields its seed."""
+    if workers == 1 and backend == "process":
+        own = cache(lambda: RobosuiteEnv(collection.task) if env is None else env)
+        return (_make_part(parts, collection.quality, own, seed) for seed in itertools.count(collection.seed))
+    make = partial(_make_part, parts, collection.quality, partial(_worker_env, collection.task))
+    return in_order(make, collection.seed, workers, backend=backend)
 
 
 def _part(parts: Path, seed: int) -> Path:

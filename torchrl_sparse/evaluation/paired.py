@@ -5,27 +5,26 @@ paired by running each on the same seeds, in whatever order, number of environme
 """
 
 import os
-import signal
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import EnvBase, SerialEnv, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType
+from torchrl.collectors import BaseCollector
+from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.backends import backend_runtime
+from torchrl_sparse.evaluation.collectors import lost_workers, start_collector
 from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.evaluation.latency import num_threads
 
 __all__ = ["rollout_episodes"]
 
-_STEPS_PER_BATCH = 16  # that worker processes make between two reports
 _FAILURES = 3  # crashes of workers in a row, without an episode finished between them, that end an evaluation
 _REQUIRED = (keys.EPISODE_SEED, keys.QUERIED, keys.FLOPS, ("next", keys.SUCCESS), ("next", "done"))
 
@@ -37,6 +36,7 @@ def rollout_episodes(
     *,
     num_envs: int = 10,
     workers: int = 1,
+    backend: str = "process",
     max_steps: int | None = None,
     results_file: str | os.PathLike | None = None,
     identity: Mapping[str, Any] | None = None,
@@ -47,8 +47,10 @@ def rollout_episodes(
 
     Seeds are dealt to the environments in turn. An environment that has done its own keeps stepping until the last
     one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiSyncCollector`` runs as many
-    processes, each with a copy of the actor. A worker that dies is reported as a warning, and the episodes that were
-    under way run again: they come out the same, since nothing but its seed fixes an episode.
+    processes, and with ``backend="ray"`` a ``RayCollector`` as many Ray actors of one CPU, each with a copy of the actor.
+    A worker that dies is reported as a warning, and the episodes that were under way run again: they come out the same,
+    since nothing but its seed fixes an episode. Nothing but rounding, that is: PyTorch sums in another order on several
+    threads. The native engine does not, so with it one process equals many whatever its number of threads.
 
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
@@ -57,7 +59,9 @@ def rollout_episodes(
             turn and report them under ``("episode", "seed")``, with ``("next", "success")``.
         seeds: one episode each, all different.
         num_envs: environments stepped as one batch, in each worker.
-        workers: processes; 1 runs in this one. With more, ``actor`` and ``make_env`` must be picklable.
+        workers: how many run episodes at a time, each on one thread. One process is this one, with its own number of
+            threads; more, and any on Ray, need an ``actor`` and a ``make_env`` that can be pickled.
+        backend: "process" or "ray"; see `backend_runtime` for which Ray that is.
         max_steps: truncates an episode, environment steps; None leaves it to the environment's own horizon.
         results_file: JSON-lines file that every finished episode is appended to at once. If it exists, the
             episodes in it are taken over and only the missing seeds run.
@@ -69,7 +73,8 @@ def rollout_episodes(
         The episodes in the order of ``seeds``.
 
     Raises:
-        ValueError: if seeds repeat, a count is out of range or the file belongs to something else.
+        ValueError: if seeds repeat, an option is out of range or the file belongs to something else.
+        ImportError: if Ray is asked for and not installed.
         KeyError: if the actor or the environment leaves out a key that is needed.
         RuntimeError: if workers keep dying without finishing an episode.
 
@@ -82,17 +87,29 @@ def rollout_episodes(
         raise ValueError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
     if num_envs < 1 or (max_steps is not None and max_steps < 1):
         raise ValueError(f"expected num_envs >= 1 and max_steps >= 1 or None, got {num_envs}, {max_steps}")
-    if workers < 1:
-        raise ValueError(f"expected workers >= 1, got {workers}")
+    runtime = backend_runtime(backend, workers)
     log = None
     finished: dict[int, EpisodeResult] = {}
     if results_file is not None:
         log = EpisodeLog(results_file, {**(identity or {}), "max_steps": max_steps})
         finished.update(log.episodes)
     pending = [seed for seed in seeds if seed not in finished]
-    start = partial(_start, actor, make_env, num_envs, workers, max_steps, policy_device)
+    start = partial(
+        start_collector,
+        actor,
+        make_env,
+        num_envs=num_envs,
+        workers=workers,
+        backend=backend,
+        max_steps=max_steps,
+        policy_device=policy_device,
+    )
     # TorchRL's collectors and batched environments change PyTorch's thread count when they close.
-    with num_threads(None), closing(_episodes(start, pending)) as episodes:
+    with (
+        runtime if pending else nullcontext(),
+        num_threads(None),
+        closing(_episodes(start, pending)) as episodes,
+    ):
         for episode in episodes:
             finished[episode.seed] = episode
             if log is not None:
@@ -103,7 +120,7 @@ def rollout_episodes(
 
 
 def _episodes(
-    start: Callable[[Sequence[int]], Collector | MultiSyncCollector], seeds: Sequence[int]
+    start: Callable[[Sequence[int]], BaseCollector], seeds: Sequence[int]
 ) -> Iterator[EpisodeResult]:
     """The episode of each seed, as it ends; a collector whose worker dies is replaced by a new one for what is left."""
     pending, failures = list(seeds), 0
@@ -115,8 +132,7 @@ def _episodes(
                 failures = 0
                 yield episode
         except Exception as error:
-            # What TorchRL raises when a worker dies depends on when it notices; that one did is what counts.
-            lost, failures = _lost(collector), failures + 1
+            lost, failures = lost_workers(collector, error), failures + 1
             if not lost:
                 raise
             if failures == _FAILURES:
@@ -126,64 +142,7 @@ def _episodes(
             collector.shutdown()
 
 
-def _lost(collector: Collector | MultiSyncCollector) -> str:
-    """Which worker died of itself, in words; empty if none did."""
-    dead = [
-        f"worker {index} ended with exit code {process.exitcode}"
-        for index, process in enumerate(getattr(collector, "procs", ()))
-        # TorchRL terminates and closes those that are alive when it finds a dead one.
-        if not process._closed and process.exitcode not in (None, -signal.SIGTERM)
-    ]
-    return ", ".join(dead)
-
-
-def _start(
-    actor: TensorDictModuleBase,
-    make_env: Callable[..., EnvBase],
-    num_envs: int,
-    workers: int,
-    max_steps: int | None,
-    policy_device: torch.device | str | None,
-    seeds: Sequence[int],
-) -> Collector | MultiSyncCollector:
-    workers = min(workers, len(seeds))
-    count = min(num_envs, len(seeds) // workers)  # as many in each worker, and none without a seed
-    shares = [seeds[index :: workers * count] for index in range(workers * count)]
-    make = [
-        partial(_batched, make_env, shares[worker * count : (worker + 1) * count], max_steps)
-        for worker in range(workers)
-    ]
-    options = {
-        "total_frames": -1,
-        "policy_device": policy_device,
-        "storing_device": torch.device("cpu"),
-        # The policy's noise is a key, not a distribution; RANDOM keeps any other actor as it was trained.
-        "exploration_type": ExplorationType.RANDOM,
-        "auto_register_policy_transforms": True,
-    }
-    if workers == 1:
-        return Collector(make[0](), actor, frames_per_batch=count, **options)
-    return MultiSyncCollector(
-        make,
-        actor,
-        frames_per_batch=workers * count * _STEPS_PER_BATCH,
-        cat_results=0,
-        num_threads=1,
-        **options,
-    )
-
-
-def _batched(
-    make_env: Callable[..., EnvBase], shares: Sequence[Sequence[int]], max_steps: int | None
-) -> EnvBase:
-    """One environment per share of the seeds, stepped as one batch."""
-    # One function with differing arguments, rather than differing functions, lets SerialEnv take its
-    # specs from a single throw-away environment instead of one per worker.
-    env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
-    return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps))
-
-
-def _finished(collector: Collector | MultiSyncCollector, pending: set[int]) -> Iterator[EpisodeResult]:
+def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeResult]:
     """Each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
     running: dict[int, _OpenEpisode] = {}
     for batch in collector:

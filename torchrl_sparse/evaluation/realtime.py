@@ -30,8 +30,9 @@ from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.evaluation.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.plots import method_colors
-from torchrl_sparse.evaluation.schema import REFERENCE
-from torchrl_sparse.evaluation.stats import paired_difference, wilson_interval
+from torchrl_sparse.evaluation.schema import MACHINE, OUTCOME, REFERENCE, check_types, outcome_entry
+from torchrl_sparse.evaluation.stats import paired_difference
+from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.files import atomic_path
 
 __all__ = [
@@ -44,6 +45,16 @@ __all__ = [
 ]
 
 SCHEMA = 1
+_RESULTS = {
+    "realtime": int,
+    "task": str,
+    "seed": int,
+    "control_freq": float,
+    "n_action_steps": int,
+    "machine": MACHINE,
+    "methods": dict,
+}
+_POINT = {"delay_steps": int, "own": bool, **OUTCOME, "episode_length": float}
 
 
 @dataclass(frozen=True)
@@ -106,17 +117,7 @@ def _point(
         raise ValueError(f"{name}: expected the seeds of {REFERENCE!r}, in their order, got others")
     outcomes = [episode.success for episode in episodes]
     paired = paired_difference(outcomes, [episode.success for episode in reference], margin)
-    k, n = sum(outcomes), len(outcomes)
-    return {
-        "success": {"k": k, "n": n, "rate": k / n, "ci95": list(wilson_interval(k, n))},
-        "paired_vs_dense": {
-            "diff": paired.diff,
-            "ci95": list(paired.ci),
-            "margin": paired.margin,
-            "verdict": paired.verdict,
-        },
-        "episode_length": totals(episodes).episode_length,
-    }
+    return {**outcome_entry(outcomes, paired), "episode_length": totals(episodes).episode_length}
 
 
 def save_realtime(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
@@ -135,12 +136,21 @@ def load_realtime(path: str | os.PathLike) -> dict[str, Any]:
     """
     try:
         results = json.loads(Path(path).read_text(encoding="utf-8"))
+        _check_realtime(results)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    return results
+
+
+def _check_realtime(results: Any) -> None:
     found = results.get("realtime") if isinstance(results, dict) else None
     if found != SCHEMA:
-        raise ValueError(f"{path}: expected realtime results of schema {SCHEMA}, got {found!r}")
-    return results
+        raise ValueError(f"expected realtime results of schema {SCHEMA}, got {found!r}")
+    check_types(results, _RESULTS, "")
+    for name, method in results["methods"].items():
+        check_types(method, {"own_latency_s": float, "points": list}, f"methods.{name}")
+        for index, point in enumerate(method["points"]):
+            check_types(point, _POINT, f"methods.{name}.points.{index}")
 
 
 def realtime_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -168,12 +178,8 @@ def realtime_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def format_realtime(results: Mapping[str, Any]) -> str:
     """The table as markdown that also lines up in a terminal, and what it says."""
-    rows = realtime_rows(results)
-    widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in rows[0]}
-    lines = ["| " + " | ".join(column.ljust(width) for column, width in widths.items()) + " |"]
-    lines.append("|" + "|".join("-" * (width + 2) for width in widths.values()) + "|")
-    lines += [f"| {' | '.join(row[c].ljust(width) for c, width in widths.items())} |" for row in rows]
-    return "\n".join([*lines, "", realtime_note(results)])
+    table = markdown_table(realtime_rows(results), left=("method", "latency"))
+    return f"{table}\n\n{realtime_note(results)}"
 
 
 def realtime_note(results: Mapping[str, Any]) -> str:

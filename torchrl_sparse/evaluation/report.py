@@ -9,14 +9,14 @@ from typing import Any
 
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.latency import Latency
-from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, validate_results
+from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, outcome_entry, validate_results
 from torchrl_sparse.evaluation.stats import (
     DEFAULT_MARGIN,
     PairedDifference,
     episodes_needed,
     paired_difference,
-    wilson_interval,
 )
+from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.files import atomic_path
 
 __all__ = ["MethodRun", "build_results", "format_table", "load_results", "save_results"]
@@ -88,18 +88,7 @@ def _method_entry(name: str, run: MethodRun, dense: MethodRun, margin: float) ->
         paired = paired_difference(outcomes, [reference[seed].success for seed in ours], margin)
     cost, dense_cost = totals(run.episodes), totals(dense.episodes)
     return {
-        "success": {
-            "k": sum(outcomes),
-            "n": len(outcomes),
-            "rate": sum(outcomes) / len(outcomes),
-            "ci95": list(wilson_interval(sum(outcomes), len(outcomes))),
-        },
-        "paired_vs_dense": {
-            "diff": paired.diff,
-            "ci95": list(paired.ci),
-            "margin": paired.margin,
-            "verdict": paired.verdict,
-        },
+        **outcome_entry(outcomes, paired),
         "prune_rate": cost.prune_rate,
         "flops": {
             "per_query": cost.flops_per_query,
@@ -154,30 +143,13 @@ def format_table(results: Mapping[str, Any]) -> str:
         ValueError: if ``results`` is not of the schema.
     """
     validate_results(results)
-    rows = results_rows(results)
-    columns = list(rows[0])
-    widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in columns}
-
-    def line(row: Mapping[str, str]) -> str:
-        cells = [
-            row[column].ljust(widths[column]) if column in _LEFT else row[column].rjust(widths[column])
-            for column in columns
-        ]
-        return f"| {' | '.join(cells)} |"
-
-    rule = "|".join(
-        ":" + "-" * (widths[c] + 1) if c in _LEFT else "-" * (widths[c] + 1) + ":" for c in columns
-    )
-    header = line({column: column for column in columns})
-    return "\n".join([header, f"|{rule}|", *map(line, rows), "", results_note(results)])
+    table = markdown_table(results_rows(results), left=("method", "verdict"))
+    return f"{table}\n\n{results_note(results)}"
 
 
 def results_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
     """The rows of the table, one per method: column -> text."""
     return [_table_row(name, method) for name, method in results["methods"].items()]
-
-
-_LEFT = ("method", "verdict")
 
 
 def _table_row(name: str, method: Mapping[str, Any]) -> dict[str, str]:

@@ -31,16 +31,20 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from torchrl_sparse.evaluation.stats import Verdict
+from torchrl_sparse.evaluation.stats import PairedDifference, Verdict, wilson_interval
 
-__all__ = ["REFERENCE", "SCHEMA", "validate_results"]
+__all__ = ["MACHINE", "OUTCOME", "REFERENCE", "SCHEMA", "check_types", "outcome_entry", "validate_results"]
 
 SCHEMA = 1
 REFERENCE = "dense"
 
-_METHOD = {
+MACHINE = {"cpu": str, "threads": int, "device": str, "torch": str, "date": str}
+OUTCOME = {
     "success": {"k": int, "n": int, "rate": float, "ci95": "interval"},
     "paired_vs_dense": {"diff": float, "ci95": "interval", "margin": float, "verdict": str},
+}
+_METHOD = {
+    **OUTCOME,
     "prune_rate": float,
     "flops": {"per_query": float, "ratio_to_dense": float},
     "latency_s": {"p50": float, "p95": float, "n": int},
@@ -52,7 +56,7 @@ _RESULTS = {
     "schema": int,
     "task": str,
     "seed": int,
-    "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
+    "machine": MACHINE,
     "policy": {
         "params": int,
         "num_inference_steps": int,
@@ -62,6 +66,25 @@ _RESULTS = {
     },
     "methods": dict,
 }
+
+
+def outcome_entry(outcomes: Sequence[bool], paired: PairedDifference) -> dict[str, Any]:
+    """What `OUTCOME` describes: success of the episodes, and their difference to dense.
+
+    >>> from torchrl_sparse.evaluation.stats import paired_difference
+    >>> outcome_entry([True, False], paired_difference([True, False], [True, True], 0.05))["success"]["rate"]
+    0.5
+    """
+    k, n = sum(outcomes), len(outcomes)
+    return {
+        "success": {"k": k, "n": n, "rate": k / n, "ci95": list(wilson_interval(k, n))},
+        "paired_vs_dense": {
+            "diff": paired.diff,
+            "ci95": list(paired.ci),
+            "margin": paired.margin,
+            "verdict": paired.verdict,
+        },
+    }
 
 
 def validate_results(results: Any) -> None:
@@ -77,13 +100,13 @@ def validate_results(results: Any) -> None:
     """
     if isinstance(results, Mapping) and results.get("schema", SCHEMA) != SCHEMA:
         raise _fault("schema", SCHEMA, results["schema"])
-    _check(results, _RESULTS, "")
+    check_types(results, _RESULTS, "")
     if REFERENCE not in results["methods"]:
         raise _fault("methods", f"the key {REFERENCE!r}", sorted(results["methods"]))
     n = None
     for name, method in results["methods"].items():
         path = f"methods.{name}"
-        _check(method, _METHOD, path)
+        check_types(method, _METHOD, path)
         _check_method_values(method, path)
         n = method["success"]["n"] if n is None else n
         _require(
@@ -119,8 +142,17 @@ def _check_method_values(method: Mapping[str, Any], path: str) -> None:
         _require(min(method[key].values()) >= 0, f"{path}.{key}", "values >= 0", method[key])
 
 
-def _check(value: Any, spec: Any, path: str) -> None:
-    """Check a value against a nested specification of types."""
+def check_types(value: Any, spec: Any, path: str) -> None:
+    """Check a value against a nested specification: a type, ``"interval"``, or a mapping of the only keys to theirs.
+
+    Raises:
+        ValueError: naming the path, which is ``path`` and the keys below it.
+
+    >>> check_types({"k": 1.5}, {"k": int}, "success")
+    Traceback (most recent call last):
+    ...
+    ValueError: success.k: expected an integer, got 1.5
+    """
     if isinstance(spec, Mapping):
         _require(isinstance(value, Mapping), path or "results", "an object", value)
         for key in spec:
@@ -128,7 +160,7 @@ def _check(value: Any, spec: Any, path: str) -> None:
         unknown = sorted(str(key) for key in value if key not in spec)
         _require(not unknown, path or "results", f"only the keys {sorted(spec)}", f"also {unknown}")
         for key, inner in spec.items():
-            _check(value[key], inner, f"{path}.{key}".lstrip("."))
+            check_types(value[key], inner, f"{path}.{key}".lstrip("."))
     elif spec == "interval":
         pair = isinstance(value, Sequence) and len(value) == 2 and all(_is_number(limit) for limit in value)
         _require(pair and value[0] <= value[1], path, "[low, high] with low <= high", value)
@@ -137,7 +169,8 @@ def _check(value: Any, spec: Any, path: str) -> None:
     elif spec is int:
         _require(isinstance(value, int) and not isinstance(value, bool), path, "an integer", value)
     else:
-        _require(isinstance(value, spec), path, {str: "a string", dict: "an object"}[spec], value)
+        names = {str: "a string", dict: "an object", list: "an array", bool: "true or false"}
+        _require(isinstance(value, spec), path, names[spec], value)
 
 
 def _is_number(value: Any) -> bool:

@@ -144,7 +144,7 @@ def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
 
 
 def merge_trials(trials: Sequence[tuple[Trial, Mapping[str, Any]]]) -> dict[str, Any]:
-    """One ``results.json`` of a sweep: dense, and each trial's tested method under the trial's label.
+    """One ``results.json`` of a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
 
     Latencies come from the trials' own processes, each with its own dense for ``speedup_vs_dense``; the dense entry
     is the first trial's.
@@ -155,7 +155,13 @@ def merge_trials(trials: Sequence[tuple[Trial, Mapping[str, Any]]]) -> dict[str,
     if not trials:
         raise ValueError("trials: expected at least one finished, got none")
     first = trials[0][1]
-    tested = {trial.label: results["methods"][tested_method(results)] for trial, results in trials}
+    names = [tested_method(results) for _, results in trials]
+    if len({REFERENCE, *names}) <= len(names):
+        names = [trial.label for trial, _ in trials]
+    tested = {
+        name: results["methods"][tested_method(results)]
+        for name, (_, results) in zip(names, trials, strict=True)
+    }
     merged = {**first, "methods": {REFERENCE: first["methods"][REFERENCE], **tested}}
     validate_results(merged)
     return merged

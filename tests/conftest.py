@@ -1,0 +1,21 @@
+"""Where workers run, as a parameter of tests."""
+
+import pytest
+
+from torchrl_sparse.backends import backend_runtime
+
+
+@pytest.fixture(scope="session")
+def ray_cluster():
+    """A Ray of two CPUs, one for all tests of a process; skips where Ray is not installed."""
+    pytest.importorskip("ray")
+    with backend_runtime("ray", workers=2):
+        yield
+
+
+@pytest.fixture(params=["process", "ray"])
+def backend(request):
+    """Both backends, the second where Ray is installed."""
+    if request.param == "ray":
+        request.getfixturevalue("ray_cluster")
+    return request.param
