@@ -80,4 +80,6 @@ def _arm_settings(config: Mapping[str, Any] | list) -> tuple[Mapping[str, Any], 
         arm = parts.get("arms", parts)["right"]
     if arm["type"] != "OSC_POSE" or arm.get("impedance_mode", "fixed") != "fixed":
         raise ValueError(f"a controller {arm['type']}, impedance {arm.get('impedance_mode', 'fixed')}")
+    if arm.get("input_type") == "absolute" and arm.get("input_ref_frame") != "world":
+        raise ValueError("absolute poses in the frame of the robot's base")
     return arm, is_old
