@@ -31,9 +31,8 @@ from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task, get_task
 
-_EXPERT_STREAM = (
-    1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
-)
+# Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
+_EXPERT_STREAM = 1
 
 
 @dataclass(frozen=True)
