@@ -5,7 +5,8 @@ becomes the pose that robosuite's OSC controller makes its goal when the recorde
 delta given to it; the gripper's command stays.
 
 Observations are made anew from the recorded states, since those of robosuite up to 1.4 mean something else (Lift's vector
-between hand and cube has the other sign, Transport's parts another order) and no published file has the grip site's quaternion.
+between hand and cube has the other sign, Transport's parts another order) and published files lack the grip site's quaternion
+(robosuite issue 672). They are those of the state itself; in a running simulator they are one physics step, 2 ms, older.
 """
 
 from __future__ import annotations
@@ -56,6 +57,10 @@ def convert_demos(path: str | Path, out: str | Path) -> int:
         FileNotFoundError: if there is no file.
         ValueError: naming file and demonstration, if the file is damaged or not of a known task with Pandas under
             OSC_POSE, or its recorded hand is not where its states put it; or if ``out`` was made of another file.
+
+    Examples:
+        >>> convert_demos("low_dim_v15.hdf5", "data/lift_human.h5")  # doctest: +SKIP
+        200
     """
     path, out = Path(path), Path(out)
     with open_demos(path) as source:
@@ -85,6 +90,14 @@ class AbsoluteActions:
 
     Raises:
         ValueError: if the task is unknown or its robots are not Pandas.
+
+    Examples:
+        >>> settings = {"type": "OSC_POSE", "input_type": "delta", "input_ref_frame": "world"}
+        >>> absolute = AbsoluteActions(RecordedControl("Lift", ("Panda",), settings, keeps_orientation=False))
+        >>> state = absolute.env.sim_env.sim.get_state().flatten()
+        >>> made = absolute.convert(state[None], np.array([[0, 0, 1.0, 0, 0, 0, -1]]))
+        >>> (made["actions"][0, :3] - made["obs/robot0_eef_pos"][0]).round(6).tolist()
+        [0.0, 0.0, 0.05]
     """
 
     def __init__(self, control: RecordedControl):

@@ -56,6 +56,12 @@ def demo_names(path: str | Path, file: h5py.File, filter_key: str | None = None)
 
     Raises:
         ValueError: if there are none, or no such filter key, or it lists a demonstration that is not there.
+
+    Examples:
+        >>> with h5py.File("in memory", "w", driver="core", backing_store=False) as file:
+        ...     _ = file.create_group("data/demo_10"), file.create_group("data/demo_9")
+        ...     demo_names("in memory", file)
+        ['demo_9', 'demo_10']
     """
     if "data" not in file or not isinstance(file["data"], h5py.Group):
         raise ValueError(f"{path}: expected a group 'data', got {sorted(file)}")
@@ -122,8 +128,8 @@ def _first_loss(path: Path) -> str:
 
 def _read_through(name: str, item: h5py.Group | h5py.Dataset) -> None:
     if isinstance(item, h5py.Dataset):
-        for row in range(len(item)):
-            item[row]
+        for part in item.iter_chunks() if item.chunks else [()]:
+            item[part]
 
 
 class _Endless(io.RawIOBase):

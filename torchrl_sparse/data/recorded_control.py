@@ -25,7 +25,12 @@ class RecordedControl:
         robots: names of the robots.
         arm: settings of each arm's controller, in the terms of robosuite 1.5.
         keeps_orientation: a rotation of exactly zero leaves the goal's orientation as it was, as in robosuite up to 1.4;
-            later it makes the hand's present orientation the goal.
+            later versions make the hand's present orientation the goal.
+
+    Examples:
+        >>> control = RecordedControl("Lift", ("Panda",), {"input_type": "delta"}, keeps_orientation=False)
+        >>> control.are_deltas(np.zeros((1, 7))), control.are_deltas(np.full((1, 7), 2.2))
+        (True, False)
     """
 
     env_name: str
