@@ -72,9 +72,7 @@ def test_deltas_are_not_read_as_poses(published):
 def test_absolute_actions_lead_through_the_recorded_states(lifts, converted):
     states, success = replay(converted, LIFT)
     assert success
-    np.testing.assert_allclose(states, lifts[0]["states"], atol=1e-3)
-    joints = slice(1, 8)
-    np.testing.assert_allclose(states[:, joints], np.stack(lifts[0]["states"])[:, joints], atol=1e-5)
+    np.testing.assert_allclose(states, lifts[0]["states"], atol=1e-4)  # rad, m, and the same a second
 
 
 def test_two_arms_whose_bases_are_turned(tmp_path):

@@ -10,6 +10,7 @@ demonstration at a time is in memory.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,7 +129,10 @@ def read_demos(
     if not state_keys:
         raise ValueError("state_keys: expected at least one observation key, got none")
     with open_demos(path) as file:
-        names, control = demo_names(path, file, filter_key), read_control(path, file)
+        names, control = demo_names(path, file, filter_key), None
+        # Of files of other simulators only their maker knows whether actions are poses.
+        with suppress(ValueError):
+            control = read_control(path, file)
         episodes = [
             _read_episode(f"{path}, {name}", file["data"], name, state_keys, control) for name in names
         ]
