@@ -20,14 +20,13 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.trainer import TrainConfig
-from torchrl_sparse.policies.training_loop import make_logger, resume, train
+from torchrl_sparse.policies.training_loop import train
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")
@@ -35,23 +34,12 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    resume(trainer, config.out)
     settings = OmegaConf.to_container(config, resolve=True)
-    how = train(
-        trainer,
-        make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode),
-        StopSignal(),
-        save=partial(save, trainer, config),
-        evaluate=partial(evaluate, trainer, config),
-        log_every=config.log_every,
-        checkpoint_every=config.checkpoint_every,
-        eval_every=config.eval_every,
-    )
-    print(f"{Path(config.out) / 'policy'}: {how}")
+    train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
-    """Reads the demonstrations and builds an untrained network that fits them."""
+    """Reads the demonstrations and builds what is trained on them."""
     task, cameras = get_task(config.task), chosen_cameras(config)
     demos = read_demos(
         config.demos,
@@ -60,8 +48,26 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         cameras=cameras,
         image_folder=Path(config.out) / "images",
     )
+    if config.init is None:
+        policy = untrained_policy(demos, cameras, config)
+    else:
+        policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
+    policy.to(config.device)
+    trainer = PolicyTrainer(
+        policy.network, policy.normalizer, demos, TrainConfig(**config.train), policy.vision
+    )
+    print(
+        f"{config.demos}: {len(demos)} demonstrations, {len(demos.data)} steps, "
+        f"{len(trainer.train_rows)} training windows; "
+        f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
+    )
+    return trainer
+
+
+def untrained_policy(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> DiffusionPolicy:
+    """A network that fits the demonstrations."""
     state, action = demos.data[keys.STATE], demos.data[keys.ACTION]
-    normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization).to(config.device)
+    normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization)
     torch.manual_seed(config.seed)
     vision = make_vision(demos, cameras, config) if cameras else None
     features = 0 if vision is None else vision.feature_dim
@@ -70,14 +76,8 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         output_dim=action.shape[-1],
         cond_dim=features + state.shape[-1],
         **config.network,
-    ).to(config.device)
-    trainer = PolicyTrainer(network, normalizer, demos, TrainConfig(**config.train), vision)
-    print(
-        f"{config.demos}: {len(demos)} demonstrations, {len(state)} steps, "
-        f"{len(trainer.train_rows)} training windows; "
-        f"{sum(p.numel() for p in network.parameters()):,} parameters"
     )
-    return trainer
+    return DiffusionPolicy(network, normalizer, vision=vision, engine="reference")
 
 
 def chosen_cameras(config: DictConfig) -> dict[str, str]:
@@ -88,8 +88,7 @@ def chosen_cameras(config: DictConfig) -> dict[str, str]:
 def make_vision(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> VisionEncoder:
     image_size = demos.data["observation", next(iter(cameras))].shape[-2:]
     crop_size = [round(config.vision.crop * size) for size in image_size]
-    vision = VisionEncoder([*cameras], image_size=image_size, crop_size=crop_size, width=config.vision.width)
-    return vision.to(config.device)
+    return VisionEncoder([*cameras], image_size=image_size, crop_size=crop_size, width=config.vision.width)
 
 
 def save(trainer: PolicyTrainer, config: DictConfig) -> None:

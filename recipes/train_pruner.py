@@ -3,12 +3,15 @@
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
 Stop it at any moment; the same command goes on, equal to the last bit. ``out/pruner`` is for
-`SAGPruner.from_pretrained`, ``out/l2c.json`` for `StaticSchedule`; ``out/curves.png`` shows how it went.
+`SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the ablation; ``out/l2c.json`` is for
+`StaticSchedule`; ``out/curves.png`` shows how it went.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,8 +24,9 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
-from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, make_reference
+from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate, make_reference
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
+from torchrl_sparse.blocks.static import Schedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
@@ -45,6 +49,8 @@ def main(config: DictConfig) -> None:
     if (out / "checkpoint.pt").exists():
         trainer.load(out / "checkpoint.pt")
         print(f"{out / 'checkpoint.pt'}: going on from update {trainer.step}")
+    elif config.init is not None:
+        learn_schedule(trainer, Path(config.init))
     stop = StopSignal()
     train(trainer, config, stop)
     if config.logger == "csv" and trainer.step >= config.log_every:
@@ -65,16 +71,23 @@ def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     if path.exists():
         return read_reference(path, made_for)
     demos = read_demos(config.demos, get_task(config.task).state_keys)
-    with tqdm(unit="window", desc="dense answers") as bar:
+    with progress("window", "dense answers") as show:
+        reference = make_reference(policy, demos, **config.reference, on_progress=show)
+    with atomic_path(path) as temporary:
+        save_file(dict(reference.flatten_keys("/").items()), temporary, {"made_for": json.dumps(made_for)})
+    return reference
+
+
+@contextmanager
+def progress(unit: str, desc: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar that is told (done, total)."""
+    with tqdm(unit=unit, desc=desc, mininterval=2) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        reference = make_reference(policy, demos, **config.reference, on_progress=show)
-    with atomic_path(path) as temporary:
-        save_file(dict(reference.flatten_keys("/").items()), temporary, {"made_for": json.dumps(made_for)})
-    return reference
+        yield show
 
 
 def read_reference(path: Path, made_for: dict) -> TensorDict:
@@ -106,6 +119,19 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
     return PrunerTrainer(gates, policy, reference, options)
 
 
+def learn_schedule(trainer: PrunerTrainer, path: Path) -> None:
+    with progress("update", f"learning {path.name}") as show:
+        imitate(
+            trainer.gates,
+            Schedule.load(path).mask(),
+            trainer.train_set,
+            trainer.config.rate_range,
+            seed=trainer.config.seed,
+            on_progress=show,
+        )
+    print(f"{path}: learned, {trainer.validate()}")
+
+
 def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
     """Updates until the end or a signal, logging and saving on the way."""
     settings = OmegaConf.to_container(config, resolve=True)
@@ -127,12 +153,23 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     """Writes the checkpoint and the pruner or schedule as it is now; returns where that is."""
     out, policy = Path(config.out), trainer.policy
     trainer.save(out / "checkpoint.pt")
-    settings = {**asdict(trainer.config), "reference": dict(config.reference), "updates": trainer.step}
+    settings = {
+        **asdict(trainer.config),
+        "init": config.init,
+        "reference": dict(config.reference),
+        "updates": trainer.step,
+    }
+    fixed = Schedule.from_mask(
+        trainer.fixed_mask(),
+        method="l2c" if config.method == "l2c" else "sag_fixed",
+        policy=policy.fingerprint,
+        sampler=policy.schedule.kind,
+        reuse=trainer.config.reuse,
+        settings=settings,
+    )
+    path = out / ("l2c.json" if config.method == "l2c" else "fixed.json")
+    fixed.save(path)
     if config.method == "l2c":
-        path = out / "l2c.json"
-        made_for = {"policy": policy.fingerprint, "sampler": policy.schedule.kind}
-        schedule = trainer.gates.schedule(**made_for, reuse=trainer.config.reuse, settings=settings)
-        schedule.save(path)
         return path
     info = PrunerInfo(
         policy=policy.fingerprint,

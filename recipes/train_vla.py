@@ -23,9 +23,8 @@ from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.rotations import ABSOLUTE_DIM
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.trainer import TrainConfig
-from torchrl_sparse.policies.training_loop import make_logger, resume, train
+from torchrl_sparse.policies.training_loop import train
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
@@ -41,19 +40,8 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    resume(trainer, config.out)
     settings = OmegaConf.to_container(config, resolve=True)
-    how = train(
-        trainer,
-        make_logger(config.logger, config.out, settings=settings, wandb_mode=config.wandb_mode),
-        StopSignal(),
-        save=partial(save, trainer, config),
-        evaluate=partial(evaluate, trainer, config),
-        log_every=config.log_every,
-        checkpoint_every=config.checkpoint_every,
-        eval_every=config.eval_every,
-    )
-    print(f"{Path(config.out) / 'policy'}: {how}")
+    train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
 
 
 def make_trainer(config: DictConfig) -> VLATrainer:

@@ -195,18 +195,27 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
     )
     assert iio.imread(work / "sag" / "curves.png").std() > 5
-    run("train_pruner", "method=l2c", "reuse=block", *training, f"out={work}/l2c")
+    output = run(
+        "train_pruner",
+        "method=l2c",
+        "reuse=block",
+        *training,
+        f"out={work}/l2c",
+        f"init={work}/sag/fixed.json",
+    )
+    assert "fixed.json: learned" in output
     plans = shutil.copytree(schedules, work / "plans")
     shutil.copytree(work / "sag" / "pruner", plans / "sag")
-    shutil.copy(work / "l2c" / "l2c.json", plans)
+    for path in (work / "l2c" / "l2c.json", work / "sag" / "fixed.json"):
+        shutil.copy(path, plans)
 
-    methods = ("dense", "l2c", "sag@0.5", "sag@0.6-0.4")
+    methods = ("dense", "l2c", "fixed", "sag@0.5", "sag@0.6-0.4")
     output = run(
         "benchmark", f"policy={policy}", f"schedules={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
         "episodes=1", "horizon=16", "latency_repeats=2", "probe_episodes=1", "videos=[sag@0.5]", f"out={work}/sparse",
     )  # fmt: skip
     assert tuple(load_results(work / "sparse" / "results.json")["methods"]) == methods
-    for name in methods[2:]:
+    for name in methods[3:]:
         assert iio.imread(work / "sparse" / f"strip_{name}.png").std() > 5
         assert iio.imread(work / "sparse" / f"masks_{name}.png").std() > 5
     assert (work / "sparse" / "rollout_sag@0.5.mp4").exists() or "rendering needs a GL library" in output

@@ -8,11 +8,14 @@ from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
-from torchrl_sparse.blocks.mask import prune_rate
-from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, make_reference, sparsity_loss
+from torchrl_sparse.blocks.pruner_training import (
+    PrunerConfig,
+    PrunerTrainer,
+    imitate,
+    make_reference,
+    sparsity_loss,
+)
 from torchrl_sparse.blocks.sag import PrunerNetwork
-from torchrl_sparse.blocks.static import StaticSchedule
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -113,6 +116,21 @@ def test_training_reaches_the_rate_and_beats_a_random_mask_of_it(policy, referen
     assert learned["error"] < min(errors)
 
 
+@pytest.mark.parametrize("rates", [None, (0.5, 0.9)])
+def test_gates_learn_a_mask_to_begin_from(policy, reference, rates):
+    mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.5
+    mask[0] = False
+    gates = sag_gates(policy, rate_input=rates is not None)
+    imitate(gates, mask, reference, rates, updates=1200)
+    cond = torch.randn(5, OBS_STEPS, COND_DIM)
+    rate = None if rates is None else torch.linspace(*rates, 5)[:, None]
+    logits = gates.prune_logits(cond, rate)[:, 1:]
+    assert ((logits > 0) == mask[1:]).float().mean() > 0.98
+    assert logits.abs().max() < 4  # or gradients would not reach them
+    with pytest.raises(ValueError, match=r"mask: expected \[K, 3L\] = \[\d+, \d+\] as the gates have, got"):
+        imitate(gates, mask[1:], reference, rates)
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -189,16 +207,24 @@ def test_gates_and_configuration_have_to_agree(policy, reference):
         trainer_of(policy, reference[:1])
 
 
-def test_learned_gates_become_a_schedule_of_the_policy(policy):
+def test_the_fixed_mask_of_static_gates_is_their_own(policy, reference):
     gates = StaticGates(NUM_STEPS, NUM_BLOCKS)
     torch.nn.init.normal_(gates.logits)
-    schedule = gates.schedule(
-        policy=policy.fingerprint, sampler="ddim", reuse="type", settings={"updates": 1}
-    )
-    planner = StaticSchedule(schedule)
-    assert (schedule.method, planner.reuse) == ("l2c", "type")
-    mask = planner.mask(PlanSpec(NUM_STEPS, NUM_LAYERS, policy.fingerprint, "ddim"))
     expected = gates.logits.detach() > 0
     expected[0] = False
-    assert torch.equal(mask, expected)
-    assert 0.2 < prune_rate(mask) < 0.8
+    assert torch.equal(trainer_of(policy, reference, gates).fixed_mask(), expected)
+
+
+def test_no_static_mask_of_its_rate_is_nearer_to_the_pruned_ones(policy, reference):
+    gates = sag_gates(policy)
+    torch.nn.init.normal_(gates.fuse_obs.weight)  # so that masks differ
+    trainer = trainer_of(policy, reference, gates)
+    fixed = trainer.fixed_mask()
+    masks = gates.prune_logits(trainer.train_set[keys.COND]) > 0
+    masks[:, 0] = False
+    assert masks.float().var(dim=0).mean() > 0
+    assert fixed.sum().item() == round(masks.sum().item() / len(masks))
+    differing = (masks != fixed).sum()
+    for seed in range(20):
+        other = fixed.flatten()[torch.randperm(fixed.numel(), generator=torch.Generator().manual_seed(seed))]
+        assert (masks != other.view_as(fixed)).sum() >= differing

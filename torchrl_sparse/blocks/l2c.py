@@ -5,19 +5,14 @@ baseline that tells what a learned mask is worth without the observation. As rel
 other step and weighs sparsity with an L1 term; here every step but the first may be pruned and the sparsity term
 is SAG's, so that both methods can be compared at the same cost. Pruned blocks reuse their own latest output.
 
-:mod:`torchrl_sparse.blocks.pruner_training` trains it; the result is a
+:mod:`torchrl_sparse.blocks.pruner_training` trains it; its mask is kept as a
 :class:`~torchrl_sparse.blocks.static.Schedule`.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
-
-from torchrl_sparse.blocks.mask import Reuse
-from torchrl_sparse.blocks.static import Schedule
 
 __all__ = ["StaticGates"]
 
@@ -44,11 +39,3 @@ class StaticGates(nn.Module):
     def prune_logits(self, cond: Tensor, rate: None = None) -> Tensor:
         """f32 [B, K, 3L], the same for every observation of ``cond`` [B, To, D]."""
         return self.logits.expand(len(cond), -1, -1)
-
-    def schedule(self, *, policy: str, sampler: str, reuse: Reuse, settings: dict[str, Any]) -> Schedule:
-        """The learned schedule; the arguments are those of :class:`~torchrl_sparse.blocks.static.Schedule`."""
-        mask = self.logits.detach() > 0
-        mask[0] = False
-        return Schedule.from_mask(
-            mask, method="l2c", policy=policy, sampler=sampler, reuse=reuse, settings=settings
-        )

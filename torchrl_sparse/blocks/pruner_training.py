@@ -21,6 +21,7 @@ import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
@@ -32,10 +33,11 @@ from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.trainer import batch_indices, step_seed
 
-__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "make_reference", "sparsity_loss"]
+__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "imitate", "make_reference", "sparsity_loss"]
 
 Cost = Literal["blocks", "flops", "seconds"]
 _ANSWER_BATCH = 16
+_IMITATION_BATCH = 4  # the coordinates' tokens, which no observation changes, cost the most
 
 
 class Gates(Protocol):
@@ -181,6 +183,52 @@ def _dense_answers(
     return torch.cat(answers)
 
 
+def imitate(
+    gates: Gates,
+    mask: Tensor,
+    reference: TensorDict,
+    rates: tuple[float, float] | None = None,
+    *,
+    updates: int = 600,
+    lr: float = 3e-3,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Teach untrained gates a mask, the same for all observations, for their training to begin from.
+
+    From a random mask of a long chain a training first has to find back to any that works, and each update of
+    a mask that prunes little costs most. The cross-entropy is taken against probabilities of 1/4 and 3/4,
+    since logits far from zero would get next to no gradient through the straight-through estimator.
+
+    Args:
+        gates: what will be trained, in place.
+        mask: bool [K, 3L], True = pruned.
+        reference: of :func:`make_reference`; its observations are what the mask is learned on.
+        rates: range of the target rates, where they are an input.
+        updates, lr, seed: of the imitation.
+        on_progress: called with (updates made, all).
+
+    Raises:
+        ValueError: if the mask is not of the shape of the gates.
+    """
+    torch.manual_seed(seed)
+    optimizer = torch.optim.Adam(gates.parameters(), lr)
+    for update in range(updates):
+        cond = reference[keys.COND][torch.randint(len(reference), (_IMITATION_BATCH,))]
+        rate = None if rates is None else torch.empty(len(cond), 1).uniform_(*rates)
+        logits = gates.prune_logits(cond, rate)
+        if logits.shape[1:] != mask.shape:
+            raise ValueError(
+                f"mask: expected [K, 3L] = {list(logits.shape[1:])} as the gates have, got {list(mask.shape)}"
+            )
+        target = (0.25 + 0.5 * mask.to(logits)).expand_as(logits)
+        loss = binary_cross_entropy_with_logits(logits[:, 1:], target[:, 1:])  # step 0 is never pruned
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        on_progress(update + 1, updates)
+
+
 def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool = False) -> Tensor:
     """``mean |sum w M / sum w - rho|`` over the batch, a scalar (SAG's global sparsity loss for equal weights).
 
@@ -277,11 +325,8 @@ class PrunerTrainer:
     def validate(self) -> dict[str, float]:
         """Error of the actions and prune rates on held-out observations, with the masks as they will be used, and
         the variance of the masks over observations."""
-        self.gates.eval()
         cond = self.held_out[keys.COND]
-        rate = torch.full((len(cond), 1), self.config.rate)
-        masks = self._logits(cond, rate) > 0
-        masks[:, 0] = False
+        masks = self._masks(cond)
         noise = self.policy.sample_noise(self.held_out[keys.SEED].squeeze(-1))
         actions = [
             self.policy.denoise(*part, reuse=self.config.reuse)
@@ -293,6 +338,16 @@ class PrunerTrainer:
         gate = masks.float()
         variance = gate.var(dim=0, unbiased=False).mean()
         return {"error": error.item(), "variance": variance.item(), **_rates(gate, self.weight)}
+
+    @torch.no_grad()
+    def fixed_mask(self) -> Tensor:
+        """The mean of the masks of all training observations, bool [K, 3L]: what the gates prune most often, as many
+        cells as they prune on average. L2C's result, and of SAG the ablation that does not look."""
+        parts = self.train_set[keys.COND].split(_ANSWER_BATCH)
+        share = sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set)
+        mask = torch.zeros(share.numel(), dtype=torch.bool)
+        mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
+        return mask.view_as(share)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint. A kill leaves the old file or the new one, never a part of one."""
@@ -320,6 +375,13 @@ class PrunerTrainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
         self.step = state["step"]
+
+    def _masks(self, cond: Tensor) -> Tensor:
+        """The masks bool [B, K, 3L] as they will be used, at the rate that is trained for."""
+        self.gates.eval()
+        masks = self._logits(cond, torch.full((len(cond), 1), self.config.rate)) > 0
+        masks[:, 0] = False
+        return masks
 
     def _logits(self, cond: Tensor, rate: Tensor) -> Tensor:
         return self.gates.prune_logits(cond, rate if self.gates.rate_input else None)

@@ -13,46 +13,38 @@ from tqdm import tqdm
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.trainer import Trainer
 
-__all__ = ["make_logger", "resume", "train"]
-
-
-def resume(trainer: Trainer, folder: str | Path) -> Path:
-    """Goes on from ``folder/checkpoint.pt`` if it is there; returns its path, which `Trainer.save` can write.
-
-    Raises:
-        ValueError: if it belongs to another training, see `Trainer.load`.
-    """
-    path = Path(folder) / "checkpoint.pt"
-    if path.exists():
-        trainer.load(path)
-        print(f"{path}: going on from step {trainer.step}")
-    return path
+__all__ = ["make_logger", "train"]
 
 
 def train(
     trainer: Trainer,
-    logger: Logger,
-    stop: StopSignal,
+    settings: Mapping[str, Any],
     *,
     save: Callable[[], None],
     evaluate: Callable[[], float | None],
-    log_every: int,
-    checkpoint_every: int,
-    eval_every: int,
-) -> str:
-    """Steps until ``max_steps`` or until ``stop`` has noted a signal, and saves at the end.
+) -> None:
+    """Goes on from ``out/checkpoint.pt`` if it is there, and steps until ``max_steps`` or a signal to stop; saves at the end.
 
     Args:
-        trainer: what to train; it may be in mid-training.
-        logger: gets ``train/loss``, ``train/lr``, ``train/seconds_per_step``, ``val/loss`` and ``eval/success``.
-        stop: asked before every step.
-        save: writes checkpoint and policy.
+        trainer: what to train.
+        settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger`` and ``wandb_mode``, see
+            `make_logger`, which gets ``train/loss``, ``train/lr``, ``train/seconds_per_step``, ``val/loss`` and
+            ``eval/success``; ``log_every``, ``checkpoint_every`` and ``eval_every``, steps between two of each (0: none).
+        save: writes ``out/checkpoint.pt`` and ``out/policy``.
         evaluate: the success rate of the policy so far, in [0, 1]; None where it cannot be measured.
-        log_every, checkpoint_every, eval_every: steps between two of each; ``eval_every`` 0 for none.
 
-    Returns:
-        How it ended, in words.
+    Raises:
+        ValueError: if the checkpoint belongs to another training, see `Trainer.load`.
     """
+    out = Path(settings["out"])
+    if (out / "checkpoint.pt").exists():
+        trainer.load(out / "checkpoint.pt")
+        print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
+    logger = make_logger(settings["logger"], out, settings=settings, wandb_mode=settings["wandb_mode"])
+    stop = StopSignal()
+    log_every, checkpoint_every, eval_every = (
+        settings[f"{name}_every"] for name in ("log", "checkpoint", "eval")
+    )
     total, losses, last = trainer.config.max_steps, [], time.perf_counter()
     with tqdm(total=total, initial=trainer.step, unit="step", mininterval=2) as bar:
         while trainer.step < total and stop.name is None:
@@ -73,7 +65,7 @@ def train(
                 logger.log_metrics({"eval/success": rate}, step=trainer.step)
     save()
     how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
-    return f"step {trainer.step} of {total}, {how}"
+    print(f"{out / 'policy'}: step {trainer.step} of {total}, {how}")
 
 
 def make_logger(kind: str, folder: str | Path, *, settings: Mapping[str, Any], wandb_mode: str) -> Logger:

@@ -222,3 +222,16 @@ def write_checkpoint(path, policy, *, change=None, make_config=low_dim_config):
         change(payload)
     torch.save(payload, path, pickle_module=dill)
     return path
+
+
+def put_config(path, value):
+    """A change of a checkpoint's payload: the entry ``path`` of its configuration becomes ``value``."""
+
+    def change(payload):
+        node = payload["cfg"]
+        *parents, last = path.split(".")
+        for key in parents:
+            node = node[key]
+        node[last] = value
+
+    return change

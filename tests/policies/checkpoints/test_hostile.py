@@ -14,7 +14,7 @@ from torchrl_sparse.policies.checkpoints.diffusion_policy import CheckpointError
 from torchrl_sparse.policies.checkpoints.inert_pickle import read_pickle
 from torchrl_sparse.policies.checkpoints.published_config import KNOWN_NAMES
 
-from .published import low_dim_config, write_checkpoint
+from .published import low_dim_config, put_config, write_checkpoint
 
 
 class Attack:
@@ -47,17 +47,6 @@ def put(*path, value):
         for key in path[:-1]:
             node = node[key]
         node[path[-1]] = value
-
-    return change
-
-
-def put_config(path, value):
-    def change(payload):
-        node = payload["cfg"]
-        *parents, last = path.split(".")
-        for key in parents:
-            node = node[key]
-        node[last] = value
 
     return change
 

@@ -8,7 +8,7 @@ from torchrl_sparse import DiffusionPolicy, Uniform, keys
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.policies.checkpoints.diffusion_policy import CheckpointError
 
-from .published import write_checkpoint
+from .published import put_config, write_checkpoint
 from .published_images import TRANSPORT, ImagePolicy, image_config
 
 ENGINES = ["reference", "torch"] + ["native"] * native_available()[0]
@@ -109,36 +109,28 @@ def test_round_trip_through_our_own_files(published, checkpoint, tmp_path):
     assert again.fingerprint != policy.fingerprint
 
 
-def edit(path, value):
-    def change(payload):
-        node = payload["cfg"]
-        *parents, last = path.split(".")
-        for key in parents:
-            node = node[key]
-        node[last] = value
-
-    return change
-
-
 def weight(name, value):
     return lambda payload: payload["state_dicts"]["ema_model"].update({name: value})
 
 
 CAMERA = "obs_encoder.obs_nets.agentview_image."
 FAULTS = {
-    "random crops in use": (edit("policy.eval_fixed_crop", False), "eval_fixed_crop: expected true"),
-    "crop beyond the image": (edit("policy.crop_shape", [90, 90]), "crop_size: expected .* got \\[90, 90\\]"),
-    "crop of words": (edit("policy.crop_shape", ["a", "b"]), "crop_shape: expected whole numbers"),
+    "random crops in use": (put_config("policy.eval_fixed_crop", False), "eval_fixed_crop: expected true"),
+    "crop beyond the image": (
+        put_config("policy.crop_shape", [90, 90]),
+        "crop_size: expected .* got \\[90, 90\\]",
+    ),
+    "crop of words": (put_config("policy.crop_shape", ["a", "b"]), "crop_shape: expected whole numbers"),
     "state of two axes": (
-        edit("task.shape_meta.obs.robot0_eef_pos.shape", [3, 3]),
+        put_config("task.shape_meta.obs.robot0_eef_pos.shape", [3, 3]),
         r"robot0_eef_pos: expected an image or one axis, got shape \(3, 3\)",
     ),
     "images of several sizes": (
-        edit("task.shape_meta.obs.agentview_image.shape", [3, 64, 64]),
+        put_config("task.shape_meta.obs.agentview_image.shape", [3, 64, 64]),
         "RGB images of one size",
     ),
     "a camera without weights": (
-        edit("task.shape_meta.obs.extra_image", {"shape": [3, 84, 84], "type": "rgb"}),
+        put_config("task.shape_meta.obs.extra_image", {"shape": [3, 84, 84], "type": "rgb"}),
         "obs_encoder: extra_image: expected a spatial softmax, got none",
     ),
     "batch norm": (weight(f"{CAMERA}nets.0.nets.1.running_mean", torch.zeros(16)), "trunk.1.running_mean"),

@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from tests.policies.training_runs import stop_and_go_on, train_unbroken
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -41,3 +42,11 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     assert models[0] == models[1]
     policy = DiffusionPolicy.from_pretrained(broken / "policy")
     assert (policy.horizon, policy.network.cond_dim, policy.num_inference_steps) == (10, 19, 100)
+
+    # Started from that policy, a training that learns nothing gives it back.
+    tuned = tmp_path / "tuned"
+    train_unbroken(
+        "train_policy", tuned, [f"demos={demos}", f"init={broken}/policy", "max_steps=1", "lr=0.0"]
+    )
+    again = DiffusionPolicy.from_pretrained(tuned / "policy").state_dict()
+    assert all(torch.equal(again[name], value) for name, value in policy.state_dict().items())
