@@ -44,6 +44,7 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     demos = read_demos(
         config.demos,
         task.proprioception_keys if cameras else task.state_keys,
+        filter_key=config.filter_key,
         cameras=cameras,
         image_folder=Path(config.out) / "images",
     )

@@ -13,6 +13,8 @@ import pytest
 
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse import DiffusionPolicy
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.evaluation import load_results, save_results
 from torchrl_sparse.evaluation.realtime import load_realtime
 
@@ -64,6 +66,12 @@ def test_calibration_writes_a_schedule_per_method(schedules):
         "bac_blockwise.json",
         "bac_unified.json",
     ]
+
+
+def test_conversion_makes_what_training_reads(work, demos):
+    out = work / "converted.h5"
+    assert f"{out}: 2 demonstrations" in run("convert_robomimic", f"demos={demos}", f"out={out}")
+    assert len(read_demos(out, get_task("lift").state_keys)) == 2
 
 
 def test_image_policies_go_the_same_way(work, demos):

@@ -1,10 +1,16 @@
 """Images of demonstration files: values, order, memory-mapped files, and files that are wrong."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
 import torch
 
+from tests.data.big_files import write_big
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import read_demos
 
@@ -69,3 +75,43 @@ def test_a_wrong_file_names_the_demonstration(path, value, message):
         replaced(value)(file)
     with pytest.raises(ValueError, match=rf"demos\.h5, demo_1, obs/agentview_image: {message}"):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS)
+    with pytest.raises(ValueError, match="demo_1"):
+        read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=path.parent / "images")
+    assert not list((path.parent / "images").glob("*agentview*"))
+
+
+def test_images_that_are_read_again_replace_the_old_ones_at_once(path, tmp_path):
+    read = {"cameras": CAMERAS, "image_folder": tmp_path / "images"}
+    in_use = read_demos(path, ["robot0_eef_pos"], **read).data["observation", "image"]
+    before = in_use.clone()
+    with h5py.File(path, "r+") as file:
+        file["data/demo_0/obs/agentview_image"][...] = 7
+    again = read_demos(path, ["robot0_eef_pos"], **read).data["observation", "image"]
+    assert (again[: LENGTHS[0]] == 7).all()
+    assert torch.equal(in_use, before)
+
+
+def read_in_a_process(path, folder):
+    """Peak memory before and after reading, and the size of the images, MB."""
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, root / "tests/data/big_files.py", path, folder]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return [int(number) / 1e6 for number in done.stdout.split()]
+
+
+def test_reading_takes_the_memory_of_one_demonstration(tmp_path):
+    path = write_big(tmp_path / "images.hdf5", demos=60, length=200)
+    before, after, size = read_in_a_process(path, tmp_path)
+    assert size > 250
+    assert after - before < 100
+
+
+@pytest.mark.slow
+def test_five_gigabytes_are_read_with_less_than_one(tmp_path):
+    path = write_big(tmp_path / "images.hdf5", demos=240, length=1000)
+    _, peak, size = read_in_a_process(path, tmp_path)
+    for file in tmp_path.iterdir():
+        file.unlink()
+    assert size > 5000
+    assert peak < 1000

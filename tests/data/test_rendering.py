@@ -19,6 +19,8 @@ CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demos")
     collect(folder / "lift.h5", Collection("Lift", episodes=1, seed=50))
+    with h5py.File(folder / "lift.h5", "r+") as file:
+        file["mask/train"] = np.array(["demo_0"], dtype="S8")
     try:
         render_demos(
             folder / "lift.h5", folder / "images.h5", ["agentview", "robot0_eye_in_hand"], image_size=32
@@ -65,6 +67,7 @@ def test_everything_else_is_copied_and_the_file_is_never_its_own_source(files):
     plain, rendered = files
     with h5py.File(plain) as one, h5py.File(rendered) as other:
         assert dict(one["data"].attrs) == dict(other["data"].attrs)
+        assert other["mask/train"][()].tolist() == [b"demo_0"]
         np.testing.assert_array_equal(one["data/demo_0/states"], other["data/demo_0/states"])
         assert other["data/demo_0/obs/agentview_image"].shape[1:] == (32, 32, 3)
     with pytest.raises(ValueError, match="out: expected another file"):

@@ -48,6 +48,16 @@ def test_values_of_every_demonstration(path):
     assert demos.data[keys.STATE].dtype == demos.data[keys.ACTION].dtype == torch.float32
 
 
+@pytest.mark.parametrize(
+    "env_args", ['{"env_name": "Stack", "type": 4}', '{"type": 1, "env_kwargs": {}}', "none"]
+)
+def test_files_of_other_simulators_are_read_as_they_are(path, env_args):
+    expected = read_demos(path, STATE_KEYS)
+    with h5py.File(path, "r+") as file:
+        file["data"].attrs["env_args"] = env_args
+    assert (read_demos(path, STATE_KEYS).data == expected.data).all()
+
+
 def test_state_follows_the_order_of_its_keys(path):
     one, other = read_demos(path, STATE_KEYS), read_demos(path, STATE_KEYS[::-1])
     assert torch.equal(one.data[keys.STATE].roll(3, -1), other.data[keys.STATE])

@@ -25,16 +25,15 @@ from torchrl_sparse.backends import check_backend
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
+from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task, get_task
-from torchrl_sparse.files import atomic_path
 
-_EXPERT_STREAM = (
-    1  # keeps the operator's random numbers apart from those of the initial state, which has the same seed
-)
+# Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
+_EXPERT_STREAM = 1
 
 
 @dataclass(frozen=True)
@@ -151,12 +150,11 @@ def collect(
     path = Path(path)
     _check(collection)
     check_backend(backend, workers)
-    parts = path.with_name(path.name + ".parts").absolute()  # workers may run in another folder
     settings = asdict(collection)
     if path.exists():
-        shutil.rmtree(parts, ignore_errors=True)  # a kill between the two last steps leaves them
+        shutil.rmtree(parts_of(path), ignore_errors=True)  # a kill between the two last steps leaves them
         return _finished(path, settings)
-    _claim(parts, settings)
+    parts = claim_parts(path, settings).absolute()  # workers may run in another folder
     kept: list[Path] = []
     tally = Summary(0, 0, 0, 0.0)
     with closing(_seeds_made(parts, collection, env, workers, backend)) as seeds:
@@ -203,6 +201,8 @@ def _worker_env(task: str) -> RobosuiteEnv:
 def read_initial_state(path: str | Path, index: int) -> InitialState:
     """How one demonstration started: ``env.reset(initial_state=...)`` begins there again.
 
+    Its seed is -1 where the file names none, as those of people do not.
+
     Raises:
         FileNotFoundError: if there is no file.
         KeyError: if the file has no demonstration of that number.
@@ -212,7 +212,7 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
         return InitialState(
             model_xml=str(demo.attrs["model_file"]),
             sim_state=np.asarray(demo["states"][0]),
-            seed=int(demo.attrs["seed"]),
+            seed=int(demo.attrs.get("seed", -1)),
             instruction=read_instruction(demo),
         )
 
@@ -247,33 +247,12 @@ def _check_yield(tally: Summary) -> None:
         raise RuntimeError(f"the expert fails: {tally}; keep_failures=true collects its episodes for a look")
 
 
-def _claim(parts: Path, settings: Mapping[str, Any]) -> None:
-    """Starts or goes on with a folder of finished episodes, made with the same settings."""
-    parts.mkdir(parents=True, exist_ok=True)
-    note = parts / "settings.json"
-    if not note.exists():
-        with atomic_path(note) as temporary:
-            temporary.write_text(json.dumps(settings, indent=1))
-    _same(note, json.loads(note.read_text()), settings)
-
-
 def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:
     with h5py.File(path, "r") as file:
         made = json.loads(file["data"].attrs.get("collection", "{}"))
     summary = made.pop("summary", None)
-    _same(path, made, settings)
+    check_same(path, made, settings)
     return Summary(**summary)
-
-
-def _same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    different = [
-        f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]
-    ]
-    if different:
-        raise ValueError(
-            f"{where} was collected with other settings ({'; '.join(different)}): "
-            "move it or choose another file"
-        )
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:

@@ -71,16 +71,36 @@ def merge_episodes(
 
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
+    parts = {f"demo_{index}": part for index, part in enumerate(parts)}
+    total = sum(episode_length(part)[0] for part in parts.values())
+    attributes = {"total": total, "env_args": env_args, "collection": collection}
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        data = file.create_group("data")
-        total = 0
-        for index, part in enumerate(parts):
+        data = lay_out(file, parts, attributes)
+        for name, part in parts.items():
             with h5py.File(part, "r") as source:
-                source.copy("demo", data, name=f"demo_{index}")
-            total += int(data[f"demo_{index}"].attrs["num_samples"])
-        data.attrs["total"] = total
-        data.attrs["env_args"] = json.dumps(env_args, sort_keys=True)
-        data.attrs["collection"] = json.dumps(collection, sort_keys=True)
+                copy_attributes(source["demo"], data[name])
+                for child in source["demo"]:
+                    source.copy(f"demo/{child}", data[name])
+
+
+def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:
+    """The group ``data`` with its attributes, mappings as json, and an empty group for each demonstration.
+
+    Made before anything is filled in, the index of demonstrations lies at the front of the file, so that one which is cut
+    off later still tells which demonstration broke.
+    """
+    data = file.create_group("data")
+    for name, value in attributes.items():
+        data.attrs[name] = json.dumps(value, sort_keys=True) if isinstance(value, Mapping) else value
+    for name in names:
+        data.create_group(name)
+    return data
+
+
+def copy_attributes(source: h5py.Group, target: h5py.Group) -> None:
+    """All attributes of one demonstration to another."""
+    for name, value in source.attrs.items():
+        target.attrs[name] = value
 
 
 def _fill(group: h5py.Group, episode: Episode) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import h5py
@@ -11,11 +11,14 @@ import torch
 from tensordict import MemoryMappedTensor
 from torch import Tensor
 
+from torchrl_sparse.data.hdf5_reader import naming
+from torchrl_sparse.files import atomic_path
+
 __all__ = ["read_images"]
 
 
 def read_images(
-    path: Path, data: h5py.Group, lengths: Mapping[str, int], key: str, folder: str | Path | None
+    path: str | Path, data: h5py.Group, lengths: Mapping[str, int], key: str, folder: str | Path | None
 ) -> Tensor:
     """Images u8 [N, 3, h, w] of all demonstrations, one demonstration in memory at a time.
 
@@ -24,44 +27,47 @@ def read_images(
         data: its group of demonstrations, which hold images as u8 [T, h, w, 3].
         lengths: demonstration -> its number of steps, in order.
         key: the observation to read.
-        folder: where to put a memory-mapped file; None keeps the images in memory.
+        folder: where to put a memory-mapped file, which appears when it is complete; None keeps the images in memory.
 
     Raises:
         ValueError: naming file, demonstration and observation, if images are missing, damaged or of another
             size than those before.
     """
-    images, first = None, 0
+    episodes = _episodes(path, data, lengths, key)
+    if folder is None:
+        return torch.cat([torch.from_numpy(episode) for episode in episodes])
+    filename = Path(folder) / f"{key}.memmap"
+    # Written as a file, not through the map: the pages of a map that were touched count as this process's memory.
+    with atomic_path(filename) as temporary, open(temporary, "wb") as file:
+        for episode in episodes:
+            file.write(episode)
+            frame = episode.shape[1:]
+    shape = (sum(lengths.values()), *frame)
+    return MemoryMappedTensor.from_filename(filename, dtype=torch.uint8, shape=shape)
+
+
+def _episodes(
+    path: str | Path, data: h5py.Group, lengths: Mapping[str, int], key: str
+) -> Iterator[np.ndarray]:
+    """u8 [T, 3, h, w] of each demonstration, all of one height and width."""
+    frame: tuple[int, ...] | None = None
     for name, length in lengths.items():
-        episode = _read_episode(f"{path}, {name}, obs/{key}", data[name], key, length)
-        if images is None:
-            images = _allocate((sum(lengths.values()), *episode.shape[1:]), folder, key)
-        if episode.shape[1:] != images.shape[1:]:
+        where = f"{path}, {name}, obs/{key}"
+        episode = _read_episode(where, data[name], key, length)
+        frame = frame or episode.shape[1:]
+        if episode.shape[1:] != frame:
             raise ValueError(
-                f"{path}, {name}, obs/{key}: expected images {list(images.shape[1:])} as before, "
-                f"got {list(episode.shape[1:])}"
+                f"{where}: expected images {list(frame)} as before, got {list(episode.shape[1:])}"
             )
-        images[first : first + length] = torch.from_numpy(episode)
-        first += length
-    return images
+        yield episode
 
 
 def _read_episode(where: str, demo: h5py.Group, key: str, length: int) -> np.ndarray:
     """u8 [T, 3, h, w]."""
-    try:
+    with naming(where):
         images = np.asarray(demo[f"obs/{key}"])
-    except (OSError, KeyError, RuntimeError) as error:  # h5py reports damaged files through all three
-        raise ValueError(f"{where}: cannot be read: {error}") from error
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[-1] != 3 or len(images) != length:
         raise ValueError(
             f"{where}: expected uint8 [{length}, h, w, 3], got {images.dtype} {list(images.shape)}"
         )
     return np.ascontiguousarray(images.transpose(0, 3, 1, 2))
-
-
-def _allocate(shape: tuple[int, ...], folder: str | Path | None, key: str) -> Tensor:
-    if folder is None:
-        return torch.empty(shape, dtype=torch.uint8)
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    # What an earlier run left is written anew: it may be of other demonstrations, or half of them.
-    filename = str(Path(folder) / f"{key}.memmap")
-    return MemoryMappedTensor.empty(shape, dtype=torch.uint8, filename=filename, existsok=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import h5py
 
-from torchrl_sparse.data.robomimic import demo_names
+from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 
 __all__ = ["read_instruction", "read_instructions"]
 
@@ -39,14 +39,11 @@ def read_instructions(path: str | Path) -> list[str]:
         >>> read_instructions("data/lift_named_proficient.h5")[0]  # doctest: +SKIP
         'lift the green cube'
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"demonstrations: no file {path}")
-    with h5py.File(path, "r") as file:
+    with open_demos(path) as file:
         return [_required(path, file["data"][name]) for name in demo_names(path, file)]
 
 
-def _required(path: Path, demo: h5py.Group) -> str:
+def _required(path: str | Path, demo: h5py.Group) -> str:
     try:
         words = read_instruction(demo)
     except ValueError as error:

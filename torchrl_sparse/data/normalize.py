@@ -12,9 +12,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.envs.rotations import ABSOLUTE_DIM
+
 __all__ = ["Normalizer"]
 
-_ARM_DIM = 10
 _POSITION = slice(0, 3)
 _MIN_RANGE = 1e-4
 """Dimensions that vary less are centred and not stretched: dividing by their range would amplify noise."""
@@ -94,7 +95,7 @@ class Normalizer(nn.Module):
 
 def _pose_map(action: Tensor) -> tuple[Tensor, Tensor]:
     """Scale and offset [10 * arms]: range for positions, identity for rotation and gripper."""
-    arms = action.reshape(action.shape[0], -1, _ARM_DIM)
+    arms = action.reshape(action.shape[0], -1, ABSOLUTE_DIM)
     scale, offset = torch.ones(arms.shape[1:]), torch.zeros(arms.shape[1:])
     for arm in range(arms.shape[1]):
         scale[arm, _POSITION], offset[arm, _POSITION] = _range_map(arms[:, arm, _POSITION])
@@ -114,8 +115,10 @@ def _check_data(state: Tensor, action: Tensor) -> None:
         raise ValueError(
             f"expected state [N, Ds] and action [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}"
         )
-    if action.shape[1] % _ARM_DIM:
-        raise ValueError(f"action: expected {_ARM_DIM} numbers per arm, got a last axis of {action.shape[1]}")
+    if action.shape[1] % ABSOLUTE_DIM:
+        raise ValueError(
+            f"action: expected {ABSOLUTE_DIM} numbers per arm, got a last axis of {action.shape[1]}"
+        )
     for name, value in (("state", state), ("action", action)):
         if not value.isfinite().all():
             raise ValueError(f"{name}: expected finite numbers, got {value[~value.isfinite()][0].item()}")

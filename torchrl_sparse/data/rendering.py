@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrl_sparse.data.demos import read_initial_state
+from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.files import atomic_path
 
@@ -25,23 +26,26 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     ``out`` appears when it is complete.
 
     Args:
-        path: a file of `torchrl_sparse.data.demos.collect`.
+        path: a file of `torchrl_sparse.data.demos.collect`, or of `torchrl_sparse.data.absolute.convert_demos` if the models
+            that it recorded are of robosuite 1.5.
         out: the file to write.
         cameras: robosuite's names, e.g. "agentview" and "robot0_eye_in_hand".
         image_size: height and width, pixels.
 
     Raises:
+        FileNotFoundError: if there is no file.
         RuntimeError: if no GL library is installed.
-        ValueError: if there is no such camera, or ``out`` is ``path``.
+        ValueError: if the file is truncated, there is no such camera, or ``out`` is ``path``.
     """
     if Path(path).resolve() == Path(out).resolve():
         raise ValueError(f"out: expected another file than the demonstrations, got {out}")
-    with atomic_path(Path(out)) as temporary, h5py.File(path) as source, h5py.File(temporary, "w") as file:
-        source.copy("data", file)
+    with open_demos(path) as source, atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+        for group in source:  # the demonstrations and their filter keys
+            source.copy(group, file)
         env = RobosuiteEnv(json.loads(file["data"].attrs["env_args"])["env_name"])
-        for index in tqdm(range(len(file["data"])), unit="demo"):
-            env.reset(initial_state=read_initial_state(path, index))
-            demo = file[f"data/demo_{index}"]
+        for name in tqdm(demo_names(path, source), unit="demo"):
+            env.reset(initial_state=read_initial_state(path, int(name[5:])))
+            demo = file["data"][name]
             for camera, images in _render(env, demo["states"][:], cameras, image_size).items():
                 demo.create_dataset(f"obs/{camera}_image", data=images, compression="lzf")
         env.close()

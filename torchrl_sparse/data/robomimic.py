@@ -2,13 +2,15 @@
 
 Layout: ``data/demo_<i>/actions`` [T, 7 * arms] absolute poses (position, rotation vector, gripper),
 ``data/demo_<i>/obs/<key>`` [T, n], images u8 [T, h, w, 3] among them, and the attribute ``num_samples`` = T on every
-demonstration. Writing is in `torchrl_sparse.data.hdf5_writer`. Images are streamed: one demonstration at a time is in
-memory.
+demonstration; whatever else a file holds is ignored. Published files record deltas and need
+`torchrl_sparse.data.absolute.convert_demos` first. Writing is in `torchrl_sparse.data.hdf5_writer`. Images are streamed: one
+demonstration at a time is in memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +21,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.hdf5_reader import demo_names, naming, open_demos, read_array
 from torchrl_sparse.data.images import read_images
+from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.envs.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "read_demos"]
@@ -95,6 +99,7 @@ def read_demos(
     path: str | Path,
     state_keys: Sequence[str],
     *,
+    filter_key: str | None = None,
     cameras: Mapping[str, str] | None = None,
     image_folder: str | Path | None = None,
 ) -> Demonstrations:
@@ -103,6 +108,7 @@ def read_demos(
     Args:
         path: HDF5 file.
         state_keys: observations that make up the state, concatenated in this order.
+        filter_key: only those that the file lists as ``mask/<filter_key>``, e.g. "train" or "better".
         cameras: images to read: the name here -> the observation there, e.g. ``{"image": "agentview_image"}``.
         image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
             memory by default.
@@ -112,85 +118,54 @@ def read_demos(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if the file is truncated or malformed; the message names file, demonstration and dataset.
+        ValueError: if the file is truncated or malformed, its actions are deltas, or there is no such filter key; the
+            message names file, demonstration and dataset.
 
     Examples:
         >>> demos = read_demos("data/lift.h5", get_task("Lift").state_keys)  # doctest: +SKIP
         >>> demos.data["action"].shape[1], len(demos)  # doctest: +SKIP
         (10, 200)
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"demonstrations: no file {path}")
     if not state_keys:
         raise ValueError("state_keys: expected at least one observation key, got none")
-    try:
-        with h5py.File(path, "r") as file:
-            names = demo_names(path, file)
-            episodes = [_read_episode(path, file["data"], name, state_keys) for name in names]
-            lengths = [len(action) for _, action in episodes]
-            steps = dict(zip(names, lengths, strict=True))
-            images = {
-                ("observation", name): read_images(path, file["data"], steps, key, image_folder)
-                for name, key in (cameras or {}).items()
-            }
-    except OSError as error:
-        raise ValueError(
-            f"{path}: expected a complete HDF5 file, got one that h5py cannot open ({error})"
-        ) from error
+    with open_demos(path) as file:
+        names, control = demo_names(path, file, filter_key), None
+        # Of files of other simulators only their maker knows whether actions are poses.
+        with suppress(ValueError):
+            control = read_control(path, file)
+        episodes = [
+            _read_episode(f"{path}, {name}", file["data"], name, state_keys, control) for name in names
+        ]
+        lengths = [len(action) for _, action in episodes]
+        steps = dict(zip(names, lengths, strict=True))
+        images = {
+            ("observation", name): read_images(path, file["data"], steps, key, image_folder)
+            for name, key in (cameras or {}).items()
+        }
     widths = sorted({(state.shape[1], action.shape[1]) for state, action in episodes})
     if len(widths) > 1:
         raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
-    state, action = (torch.from_numpy(np.concatenate(part)).float() for part in zip(*episodes, strict=True))
+    state, action = (torch.from_numpy(np.concatenate(part)) for part in zip(*episodes, strict=True))
     data = TensorDict({keys.STATE: state, keys.ACTION: action, **images}, batch_size=[len(state)])
     return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0))
 
 
-def demo_names(path: Path, file: h5py.File) -> list[str]:
-    """Names of the demonstrations of an open file, in the order of their numbers; ValueError if there are none."""
-    if "data" not in file or not isinstance(file["data"], h5py.Group):
-        raise ValueError(f"{path}: expected a group 'data', got {sorted(file)}")
-    names = [name for name in file["data"] if name.startswith("demo_") and name[5:].isdigit()]
-    if not names:
-        raise ValueError(f"{path}: expected groups data/demo_<number>, got {sorted(file['data'])}")
-    return sorted(names, key=lambda name: int(name[5:]))
-
-
 def _read_episode(
-    path: Path, data: h5py.Group, name: str, state_keys: Sequence[str]
+    where: str, data: h5py.Group, name: str, state_keys: Sequence[str], control: RecordedControl | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """State [T, Ds] and absolute action [T, 10 * arms] of one demonstration, float64."""
-    where = f"{path}, {name}"
-    try:
+    """State [T, Ds] and absolute action [T, 10 * arms] of one demonstration, f32."""
+    with naming(where):
         demo = data[name]
         length = int(demo.attrs["num_samples"])
-        pose = _read_dataset(where, demo, "actions", length)
-        state = [_read_dataset(where, demo, f"obs/{key}", length) for key in state_keys]
-    except (OSError, KeyError, RuntimeError) as error:
-        # h5py reports damaged files through all three.
-        raise ValueError(f"{where}: cannot be read: {error}") from error
+    pose = read_array(where, demo, "actions", length)
     if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
         raise ValueError(f"{where}, actions: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
-    return np.concatenate(state, axis=1), pose_to_absolute(pose)
-
-
-def _read_dataset(where: str, demo: h5py.Group, name: str, length: int) -> np.ndarray:
-    if name not in demo:
-        raise ValueError(f"{where}: expected a dataset {name!r}, got {_dataset_names(demo)}")
-    value = np.asarray(demo[name], dtype=np.float64)
-    if value.ndim != 2 or len(value) != length or not length:
+    if control is not None and control.are_deltas(pose):
         raise ValueError(
-            f"{where}, {name}: expected shape [{length} = num_samples > 0, n], got {list(value.shape)}"
+            f"{where}, actions: expected absolute poses, got deltas; recipes/convert_robomimic.py converts them"
         )
-    if not np.isfinite(value).all():
-        raise ValueError(f"{where}, {name}: expected finite numbers, got {value[~np.isfinite(value)][0]}")
-    return value
-
-
-def _dataset_names(demo: h5py.Group) -> list[str]:
-    names: list[str] = []
-    demo.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return sorted(names)
+    state = [read_array(where, demo, f"obs/{key}", length) for key in state_keys]
+    return np.concatenate(state, axis=1).astype(np.float32), pose_to_absolute(pose).astype(np.float32)
 
 
 def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:
