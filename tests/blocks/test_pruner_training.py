@@ -122,7 +122,7 @@ def test_gates_learn_a_mask_to_begin_from(policy, reference, rate_input):
     mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.5
     mask[0] = False
     gates = sag_gates(policy, rate_input=rate_input)
-    imitate(gates, mask, reference, updates=2000)
+    imitate(gates, mask, reference, updates=1200)
     cond = reference[keys.COND][:5]
     rate = torch.full((5, 1), prune_rate(mask).item()) if rate_input else None
     logits = gates.prune_logits(cond, rate)[:, 1:]

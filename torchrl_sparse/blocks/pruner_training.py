@@ -26,7 +26,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, prune_rate
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
-from torchrl_sparse.blocks.sag import check_rates
+from torchrl_sparse.blocks.sag import check_rates, rate_threshold
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.training import read_checkpoint
@@ -388,7 +388,10 @@ class PrunerTrainer:
         return masks
 
     def _logits(self, cond: Tensor, rate: Tensor) -> Tensor:
-        return self.gates.prune_logits(cond, rate if self.gates.rate_input else None)
+        if not self.gates.rate_input:
+            return self.gates.prune_logits(cond)
+        logits = self.gates.prune_logits(cond, rate)
+        return logits - rate_threshold(logits, rate)
 
     def _gate(self, cond: Tensor, rate: Tensor) -> Tensor:
         logits = self._logits(cond, rate)

@@ -114,11 +114,9 @@ class PrunerNetwork(nn.Module):
         return self.mlp(fused).unflatten(1, (len(self.timesteps), self.num_blocks))
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, or, where the rate is an input, to what it takes
-        to be among the ``rate`` K x 3L blocks that are pruned."""
+        """f32 [B, K, 3L]: by how much pruning is preferred to keeping."""
         keep, prune = self(cond, rate).unbind(-1)
-        logits = prune - keep
-        return logits if rate is None else logits - rate_threshold(logits, rate)
+        return prune - keep
 
     def cells(self) -> Tensor:
         """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
@@ -305,7 +303,8 @@ class SAGPruner(Planner):
                 f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
                 f"got {list(cond.shape)}"
             )
-        masks = self.network.prune_logits(cond, rate) > 0
+        logits = self.network.prune_logits(cond, rate)
+        masks = logits > (0 if rate is None else rate_threshold(logits, rate))
         masks[:, 0] = False
         return masks
 
