@@ -16,7 +16,7 @@ from torchrl_sparse.policies.vla.decoder import BidirectionalLlama, Decoded
 from torchrl_sparse.policies.vla.heads import L1ActionHead, ProprioProjector
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner
 from torchrl_sparse.policies.vla.text import BOS_ID, STOP_ID, Prompts
-from torchrl_sparse.policies.vla.vision import FusedProjector, VisionTowers, center_crop
+from torchrl_sparse.policies.vla.vision import FusedProjector, VisionTowers
 
 __all__ = ["VLANetwork"]
 
@@ -59,7 +59,7 @@ class VLANetwork(nn.Module):
         """Actions [B, H, A], f32, and what the decoder did.
 
         Args:
-            images: u8 [B, cameras, 3, h, w].
+            images: u8 [B, cameras, 3, h, w], cropped where the model was trained so.
             state: f32 [B, state_dim], normalised.
             prompts: tokenised prompts of the B samples.
             keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
@@ -73,8 +73,7 @@ class VLANetwork(nn.Module):
 
     def visual_tokens(self, images: Tensor) -> Tensor:
         """[B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
-        pixels = center_crop(images.flatten(0, 1), self.config.crop_area)
-        return self.projector(self.vision(pixels)).unflatten(0, images.shape[:2]).flatten(1, 2)
+        return self.projector(self.vision(images.flatten(0, 1))).unflatten(0, images.shape[:2]).flatten(1, 2)
 
     def _sequence(
         self, visual: Tensor, state: Tensor, prompts: Prompts, keep_mask: Tensor | None, td: TensorDictBase
