@@ -22,7 +22,7 @@ from torchrl_sparse.policies.vla.backbones import (
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner
 
-__all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention"]
+__all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
 
 _ROPE_BASE = 10000.0
 
@@ -85,7 +85,7 @@ class BidirectionalLlama(nn.Module):
             rows = pruner.score_rows(state) if index in scored_layers else None
             state.hidden, query, key = _run_layer(layer, state.hidden, rotary, mask, self._head_dim)
             if rows is not None:
-                state.attention, state.scores = _visual_scores(state, query, key, rows)
+                state.attention, state.scores = visual_scores(state, query, key, rows)
                 scored = scored + rows.sum(1) * lengths
             keep = pruner.after_layer(index, state)
             if keep is not None:
@@ -156,7 +156,7 @@ def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Te
 
 
 @torch.no_grad()
-def _visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+def visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """``attention`` [B, R, N] and ``scores`` [B, N] of `LayerState`."""
     rows = rows & state.alive
     weights = row_attention(query, key, rows, state.alive)

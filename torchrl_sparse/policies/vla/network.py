@@ -7,6 +7,9 @@ last prompt token and all slots but the last.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -18,7 +21,7 @@ from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPrun
 from torchrl_sparse.policies.vla.text import BOS_ID, STOP_ID, Prompts
 from torchrl_sparse.policies.vla.vision import FusedProjector, VisionTowers
 
-__all__ = ["VLANetwork"]
+__all__ = ["VLANetwork", "make_network"]
 
 
 class VLANetwork(nn.Module):
@@ -115,3 +118,25 @@ class VLANetwork(nn.Module):
         first = decoded.lengths[:, None] - slots - 2
         index = first + torch.arange(slots, device=first.device)
         return decoded.hidden.gather(1, index[..., None].expand(-1, -1, decoded.hidden.shape[-1]))
+
+
+def make_network(
+    config: VLAConfig, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> VLANetwork:
+    """An untrained network whose weights are made as ``dtype`` on ``device``: the published size takes no room elsewhere.
+
+    >>> make_network(VLAConfig.tiny(), dtype=torch.bfloat16).head.fc2.weight.dtype
+    torch.bfloat16
+    """
+    with torch.device(device), _default_dtype(dtype):
+        return VLANetwork(config)
+
+
+@contextmanager
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
