@@ -25,6 +25,7 @@ from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner
 __all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
 
 _ROPE_BASE = 10000.0
+_PER_TOKEN = ("hidden", "positions", "kind", "task")
 
 
 @dataclass
@@ -115,19 +116,11 @@ def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
     longest, shortest, packed = torch.stack(
         [lengths.max(), lengths.min(), (front == alive).all().long()]
     ).tolist()
-    if not packed:
-        order = (~alive).int().argsort(dim=1, stable=True)
-        state = replace(
-            state,
-            hidden=state.hidden.gather(1, order[..., None].expand_as(state.hidden)),
-            **{name: getattr(state, name).gather(1, order) for name in ("positions", "kind", "task")},
-        )
-    state = replace(
-        state,
-        hidden=state.hidden[:, :longest],
-        alive=front[:, :longest],
-        **{name: getattr(state, name)[:, :longest] for name in ("positions", "kind", "task")},
-    )
+    batch = torch.arange(len(alive), device=alive.device)[:, None]
+    order = None if packed else (~alive).int().argsort(dim=1, stable=True)[:, :longest]
+    values = {name: getattr(state, name) for name in _PER_TOKEN}
+    moved = {name: v[:, :longest] if packed else v[batch, order] for name, v in values.items()}
+    state = replace(state, alive=front[:, :longest], **moved)
     return state, None if shortest == longest else state.alive[:, None, None]
 
 
