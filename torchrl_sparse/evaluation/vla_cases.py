@@ -21,7 +21,7 @@ from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.policies.vla.decoder import pack, visual_scores
 from torchrl_sparse.policies.vla.network import make_network
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
-from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner
 from torchrl_sparse.policies.vla.text import WordTokenizer
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
@@ -80,10 +80,10 @@ class VLACase:
     def __init__(self, policy: VLAPolicy, pruners: dict[str, TokenPruner | None]):
         self.network = policy.network
         first, second = _queries(policy)
-        self._dense = _with_pruner(policy, None), second
+        self._dense = with_pruner(policy, None), second
         self.policies, self.queries = {}, {}
         for name, pruner in pruners.items():
-            self.policies[name] = _with_pruner(policy, pruner)
+            self.policies[name] = with_pruner(policy, pruner)
             answered = self.policies[name](first.clone(recurse=False))
             remembered = answered.select(*self.policies[name].in_keys, strict=False)
             self.queries[name] = remembered.update(second)
@@ -188,15 +188,8 @@ class _Watch(TokenPruner):
 def _watched(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Watch:
     """What ``pruner`` did in a query of this model."""
     watch = _Watch(pruner)
-    _with_pruner(policy, watch)(query.clone(recurse=False))
+    with_pruner(policy, watch)(query.clone(recurse=False))
     return watch
-
-
-def _with_pruner(policy: VLAPolicy, pruner: TokenPruner | None) -> VLAPolicy:
-    """The same model with another pruner."""
-    other = VLAPolicy(policy.network, policy.normalizer, policy.tokenizer)
-    other.pruner = pruner
-    return other
 
 
 def _queries(policy: VLAPolicy) -> tuple[TensorDict, TensorDict]:

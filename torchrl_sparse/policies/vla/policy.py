@@ -23,7 +23,7 @@ from torchrl_sparse.policies.vla.pruning import TokenPruner
 from torchrl_sparse.policies.vla.text import InstructionTokenizer, WordTokenizer
 from torchrl_sparse.policies.vla.vision import center_crop
 
-__all__ = ["VLAPolicy"]
+__all__ = ["VLAPolicy", "with_pruner"]
 
 
 class VLAPolicy(VLAWrapperBase):
@@ -191,3 +191,10 @@ class VLAPolicy(VLAWrapperBase):
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
         return cls(*read_vla(Path(path), config))
+
+
+def with_pruner(policy: VLAPolicy, pruner: TokenPruner | None) -> VLAPolicy:
+    """The same model under another method, None for dense; ``policy`` stays as it is."""
+    other = VLAPolicy(policy.network, policy.normalizer, policy.tokenizer)
+    other.pruner = pruner
+    return other
