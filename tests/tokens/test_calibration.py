@@ -138,7 +138,7 @@ def test_queries_of_demonstrations_begin_with_each_episode():
 
 
 def toy_env(seeds):
-    sizes = {"action_dim": 7, "state_dim": 8, "image_shape": (3, 28, 28), "success_steps": 9}
+    sizes = {"action_dim": 7, "state_dim": 14, "image_shape": (3, 28, 28), "success_steps": 9}
     env = TransformedEnv(ToyVLAEnv(**sizes, device="cpu", seed=seeds[0]), InitTracker())
     env.append_transform(StepCounter(5))
     return env
@@ -146,7 +146,7 @@ def toy_env(seeds):
 
 def toy_policy():
     torch.manual_seed(0)
-    sizes = {"cameras": (keys.IMAGE,), "llm": TransformerSize(32, LAYERS, 2, 64), "chunk_size": 2}
+    sizes = {"cameras": (keys.IMAGE,), "llm": TransformerSize(32, LAYERS, 2, 64), "state_dim": 14}
     return VLAPolicy(VLANetwork(VLAConfig.tiny(**sizes)))
 
 
