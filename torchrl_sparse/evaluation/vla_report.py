@@ -160,7 +160,7 @@ def plot_vla_times(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
     """
     methods = {name: row for name, row in results["methods"].items() if name != DENSE}
     figure, (above, below) = make_figure(
-        9, 2.9 + 0.5 * len(methods), rows=2, columns=1, heights=(1.0, 0.6 + 0.5 * len(methods))
+        9, 3.2 + 0.5 * len(methods), rows=2, columns=1, heights=(1.0, 0.6 + 0.5 * len(methods))
     )
     _draw_parts(above[0], results)
     _draw_speedups(below[0], methods)
@@ -184,7 +184,7 @@ def _draw_parts(axes: Any, results: Mapping[str, Any]) -> None:
     axes.set_xlim(0, left)
     axes.set_xlabel("dense query, median (ms)")
     axes.legend(
-        frameon=False, ncols=5, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9, columnspacing=1.2
+        frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9, columnspacing=1.2
     )
 
 
