@@ -27,7 +27,7 @@ constant                          shape, dtype           meaning
                                                          the decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
-``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, to see what changed
+``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, as the network saw them
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk

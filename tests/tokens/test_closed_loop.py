@@ -1,8 +1,10 @@
 """The design's collector line with a vision-language-action model and SpecPrune, on robosuite with two cameras."""
 
+from functools import partial
+
 import pytest
 import torch
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs.utils import ExplorationType
 
 from tests.tokens.helpers import LAYERS, PER_CAMERA, SIZE
@@ -17,11 +19,13 @@ HORIZON, FRAMES, N_ACTION_STEPS, WARMUP = 8, 10, 4, 6
 ANY_MOTION = Thresholds(9.0, 99.0, leave_translation=9.0, leave_rotation=99.0, leave_rise=9.0)
 
 
-@pytest.fixture(scope="module")
-def env():
-    env = make_env(
+OPTIONS = {"auto_register_policy_transforms": True, "exploration_type": ExplorationType.RANDOM}
+
+
+def rendered(seed):
+    return make_env(
         "Lift",
-        seeds=[0],
+        seeds=[seed],
         horizon=HORIZON,
         action_mode="delta",
         camera="agentview",
@@ -29,6 +33,11 @@ def env():
         image_size=SIZE,
         instruction=True,
     )
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = rendered(0)
     try:
         env.reset()
     except RuntimeError as error:  # no GL library
@@ -48,19 +57,29 @@ def make_actor():
 
 def test_tokens_are_pruned_by_history_and_speed(env):
     actor = make_actor()
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=FRAMES,
-        total_frames=FRAMES,
-        auto_register_policy_transforms=True,
-        exploration_type=ExplorationType.RANDOM,
-    )
-    steps = next(iter(collector)).clone()
-    collector.shutdown()
+    steps = first_batch(Collector(env, actor, frames_per_batch=FRAMES, total_frames=FRAMES, **OPTIONS))
     assert not set(actor.out_keys) - set(steps.keys(True, True))
     check_episode(steps[:HORIZON])
     assert steps[keys.KEPT][HORIZON] == 2 * PER_CAMERA  # the next episode knows nothing either
+
+
+@pytest.mark.usefixtures("env")  # skips without a GL library
+def test_processes_collect_the_same_episodes():
+    workers, frames = [partial(rendered, seed) for seed in (0, 1)], 2 * HORIZON
+    collector = MultiSyncCollector(
+        workers, make_actor(), frames_per_batch=frames, total_frames=frames, cat_results="stack", **OPTIONS
+    )
+    batch = first_batch(collector).reshape(2, HORIZON)
+    assert sorted(batch[keys.EPISODE_SEED][:, 0].flatten().tolist()) == [0, 1]
+    for steps in batch:
+        check_episode(steps)
+
+
+def first_batch(collector):
+    try:
+        return next(iter(collector)).clone()
+    finally:
+        collector.shutdown()
 
 
 def check_episode(steps):

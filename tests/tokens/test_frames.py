@@ -1,11 +1,17 @@
 """Which patches changed, and what the comparison remembers."""
 
+import dataclasses
+
 import pytest
 import torch
 from torch.nn import functional
 
-from tests.tokens.helpers import SPEC, later, patch, query
+from tests.tokens.helpers import CONFIG, SPEC, later, patch, query
 from torchrl_sparse import keys
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.policies.vla.vision import center_crop
+from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
 from torchrl_sparse.tokens.frames import compare_frames, patches, similarity
 
 
@@ -66,3 +72,22 @@ def test_without_a_history_there_is_nothing_to_compare_with():
     assert compare_frames(td, SPEC)[1].all()
     with pytest.raises(KeyError, match="is_init"):
         compare_frames(query().exclude(keys.IS_INIT), SPEC)
+
+
+def test_patches_are_those_of_the_crop_that_the_network_sees():
+    """A crop of half the sides: pixels 14 to 41 of 56 fill the network's image, so 7 of them are a patch."""
+    policy = VLAPolicy(VLANetwork(dataclasses.replace(CONFIG, crop_area=0.25)))
+    policy.pruner = FrameDifferencePruner(share=1 / SPEC.per_camera)
+    first = policy(query())
+    cropped = center_crop(query()[keys.IMAGE], 0.25)
+    assert torch.equal(first[keys.TOKEN_FRAMES][:, 0], cropped)
+    assert not torch.equal(cropped, query()[keys.IMAGE])
+    assert torch.equal(first[keys.IMAGE], query()[keys.IMAGE])  # nobody else sees a crop
+
+    second = first.clone().set(keys.IS_INIT, torch.zeros(3, 1, dtype=torch.bool))
+    second[keys.IMAGE][:, :, :14] = 255 - second[keys.IMAGE][:, :, :14]  # seen by no one
+    for camera in (keys.IMAGE, keys.WRIST_IMAGE):
+        area = second[camera][..., 28:34, 36:41]  # within row 2, column 3 of the crop's patches
+        area.copy_(255 - area)
+    kept = (policy(second)[keys.TOKEN_DEPTH] > 0).nonzero().reshape(3, 2, 2)[..., 1]
+    assert kept.tolist() == [[2 * 4 + 3, SPEC.per_camera + 2 * 4 + 3]] * 3

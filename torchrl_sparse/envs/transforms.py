@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv, UnsqueezeTransform
@@ -64,22 +64,24 @@ class EndEffectorVelocity(Transform):
     Args:
         task: tells where each arm's position and quaternion (xyzw) lie in the state.
         control_freq: steps a second.
+        key: of the state.
     """
 
-    def __init__(self, task: Task, control_freq: float = 20.0):
-        super().__init__(in_keys=[keys.STATE], out_keys=[keys.EEF_VEL])
+    def __init__(self, task: Task, control_freq: float = 20.0, key: NestedKey = keys.STATE):
+        super().__init__(in_keys=[key], out_keys=[keys.EEF_VEL])
         self.control_freq = control_freq
+        self._key = key
         self._poses = [
             (task.state_slice(f"robot{i}_eef_pos"), task.state_slice(f"robot{i}_eef_quat_site"))
             for i in range(task.arms)
         ]
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        state = tensordict_reset.get(keys.STATE)
+        state = tensordict_reset.get(self._key)
         return tensordict_reset.set(keys.EEF_VEL, state.new_zeros(*state.shape[:-1], 6 * len(self._poses)))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before, after = tensordict.get(keys.STATE), next_tensordict.get(keys.STATE)
+        before, after = tensordict.get(self._key), next_tensordict.get(self._key)
         twists = [
             torch.cat(
                 [after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat])],

@@ -1,14 +1,20 @@
 """Pictures of visual-token pruning: what a policy went on looking at, how deep, and how that followed the hand's speed."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchrl_sparse.evaluation.canvas import make_figure, save_figure
 
-__all__ = ["draw_tokens", "plot_control", "plot_token_strip", "plot_tokens_per_layer"]
+if TYPE_CHECKING:
+    from torchrl_sparse.tokens.calibration import TokenBudget
+
+__all__ = ["draw_tokens", "plot_control", "plot_token_budget", "plot_token_strip", "plot_tokens_per_layer"]
 
 _GONE = np.array((24, 24, 28), np.float32)
 _DIMMEST = 0.18  # of the image still shows through a token that was dropped before the decoder
@@ -145,4 +151,26 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
     axes.set_ylabel("visual tokens, mean")
     axes.set_ylim(bottom=0)
     axes.legend(frameon=False, ncols=min(4, len(depth)))
+    return save_figure(figure, path)
+
+
+def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
+    """What every alpha loses over the tokens that it keeps, with the tolerance and the choice.
+
+    Args:
+        budget: calibrated.
+        path: of the PNG.
+    """
+    points = sorted(budget.points, key=lambda point: point.kept)
+    figure, axes = make_figure(9, 4.2)
+    axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=_SPEED, linewidth=1.8)
+    for point in points:
+        place = (point.kept, point.loss)
+        axes.annotate(f"{point.alpha:g}", place, (4, 6), textcoords="offset points", fontsize=9)
+        if point.alpha == budget.alpha:
+            axes.plot(*place, "o", color=_QUERY, markersize=11, label=f"chosen: alpha {point.alpha:g}")
+    axes.axhline(budget.tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
+    axes.set_xlabel("visual tokens in a decoder layer, mean")
+    axes.set_ylabel("action error" if budget.measure == "action_error" else "success lost")
+    axes.legend(frameon=False)
     return save_figure(figure, path)

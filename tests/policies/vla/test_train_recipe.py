@@ -1,36 +1,18 @@
 """The recipe that trains a vision-language-action policy: stopped, run again, and its policy loaded and asked."""
 
-import json
-
-import h5py
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.policies.training_runs import stop_and_go_on, train_unbroken
+from tests.policies.vla.rendered import COLOURS, write_demos
 from torchrl_sparse import keys
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-
-STATE = {"robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
-COLOURS = ("red", "green", "blue")
 
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "images.h5"
-    random = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        for index in range(3):
-            demo = file.create_group(f"data/demo_{index}")
-            demo.attrs["num_samples"] = 9
-            demo.attrs["ep_meta"] = json.dumps({"lang": f"lift the {COLOURS[index]} cube"})
-            demo["actions"] = random.uniform(-1, 1, (9, 7))
-            for key, size in STATE.items():
-                demo[f"obs/{key}"] = random.uniform(-1, 1, (9, size))
-            for camera in ("agentview", "robot0_eye_in_hand"):
-                demo[f"obs/{camera}_image"] = random.integers(256, size=(9, 28, 28, 3), dtype=np.uint8)
-    return path
+    return write_demos(tmp_path_factory.mktemp("data") / "images.h5")
 
 
 def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):

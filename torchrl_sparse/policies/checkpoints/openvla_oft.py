@@ -12,8 +12,6 @@ head and the vocabulary projection take no part in OpenVLA-OFT and are left out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from torch import Tensor
 from torchrl_sparse.policies.checkpoints.files import read_json, read_tensors
 from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes, take
 from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.network import make_network
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.policies.vla.text import LlamaTokenizer
@@ -88,8 +86,7 @@ def load_openvla_oft(
     config = _config(path, tensors, heads, image_size, VLAConfig().cameras[:cameras])
     statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
     normalizer = _normalizer(path / "dataset_statistics.json", statistics, config)
-    with _default_dtype(dtype):
-        network = VLANetwork(config)
+    network = make_network(config, dtype=dtype)
     weights = _rename(tensors, config)
     check_shapes(str(path), weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
     check_finite(str(path), weights)
@@ -243,13 +240,3 @@ def _replace(name: str, names: dict[str, str]) -> str:
     for old, new in names.items():
         name = name.replace(old, new)
     return name
-
-
-@contextmanager
-def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(before)

@@ -22,9 +22,10 @@ from torchrl_sparse.policies.vla.backbones import (
 from torchrl_sparse.policies.vla.config import VLAConfig
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner
 
-__all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention"]
+__all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
 
 _ROPE_BASE = 10000.0
+_PER_TOKEN = ("hidden", "positions", "kind", "task")
 
 
 @dataclass
@@ -85,7 +86,7 @@ class BidirectionalLlama(nn.Module):
             rows = pruner.score_rows(state) if index in scored_layers else None
             state.hidden, query, key = _run_layer(layer, state.hidden, rotary, mask, self._head_dim)
             if rows is not None:
-                state.attention, state.scores = _visual_scores(state, query, key, rows)
+                state.attention, state.scores = visual_scores(state, query, key, rows)
                 scored = scored + rows.sum(1) * lengths
             keep = pruner.after_layer(index, state)
             if keep is not None:
@@ -115,19 +116,11 @@ def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
     longest, shortest, packed = torch.stack(
         [lengths.max(), lengths.min(), (front == alive).all().long()]
     ).tolist()
-    if not packed:
-        order = (~alive).int().argsort(dim=1, stable=True)
-        state = replace(
-            state,
-            hidden=state.hidden.gather(1, order[..., None].expand_as(state.hidden)),
-            **{name: getattr(state, name).gather(1, order) for name in ("positions", "kind", "task")},
-        )
-    state = replace(
-        state,
-        hidden=state.hidden[:, :longest],
-        alive=front[:, :longest],
-        **{name: getattr(state, name)[:, :longest] for name in ("positions", "kind", "task")},
-    )
+    batch = torch.arange(len(alive), device=alive.device)[:, None]
+    order = None if packed else (~alive).int().argsort(dim=1, stable=True)[:, :longest]
+    values = {name: getattr(state, name) for name in _PER_TOKEN}
+    moved = {name: v[:, :longest] if packed else v[batch, order] for name, v in values.items()}
+    state = replace(state, alive=front[:, :longest], **moved)
     return state, None if shortest == longest else state.alive[:, None, None]
 
 
@@ -156,7 +149,7 @@ def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Te
 
 
 @torch.no_grad()
-def _visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+def visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """``attention`` [B, R, N] and ``scores`` [B, N] of `LayerState`."""
     rows = rows & state.alive
     weights = row_attention(query, key, rows, state.alive)

@@ -7,6 +7,9 @@ last prompt token and all slots but the last.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -16,9 +19,9 @@ from torchrl_sparse.policies.vla.decoder import BidirectionalLlama, Decoded
 from torchrl_sparse.policies.vla.heads import L1ActionHead, ProprioProjector
 from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner
 from torchrl_sparse.policies.vla.text import BOS_ID, STOP_ID, Prompts
-from torchrl_sparse.policies.vla.vision import FusedProjector, VisionTowers, center_crop
+from torchrl_sparse.policies.vla.vision import FusedProjector, VisionTowers
 
-__all__ = ["VLANetwork"]
+__all__ = ["VLANetwork", "make_network"]
 
 
 class VLANetwork(nn.Module):
@@ -59,7 +62,7 @@ class VLANetwork(nn.Module):
         """Actions [B, H, A], f32, and what the decoder did.
 
         Args:
-            images: u8 [B, cameras, 3, h, w].
+            images: u8 [B, cameras, 3, h, w], cropped where the model was trained so.
             state: f32 [B, state_dim], normalised.
             prompts: tokenised prompts of the B samples.
             keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
@@ -73,8 +76,7 @@ class VLANetwork(nn.Module):
 
     def visual_tokens(self, images: Tensor) -> Tensor:
         """[B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
-        pixels = center_crop(images.flatten(0, 1), self.config.crop_area)
-        return self.projector(self.vision(pixels)).unflatten(0, images.shape[:2]).flatten(1, 2)
+        return self.projector(self.vision(images.flatten(0, 1))).unflatten(0, images.shape[:2]).flatten(1, 2)
 
     def _sequence(
         self, visual: Tensor, state: Tensor, prompts: Prompts, keep_mask: Tensor | None, td: TensorDictBase
@@ -116,3 +118,25 @@ class VLANetwork(nn.Module):
         first = decoded.lengths[:, None] - slots - 2
         index = first + torch.arange(slots, device=first.device)
         return decoded.hidden.gather(1, index[..., None].expand(-1, -1, decoded.hidden.shape[-1]))
+
+
+def make_network(
+    config: VLAConfig, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> VLANetwork:
+    """An untrained network whose weights are made as ``dtype`` on ``device``: the published size takes no room elsewhere.
+
+    >>> make_network(VLAConfig.tiny(), dtype=torch.bfloat16).head.fc2.weight.dtype
+    torch.bfloat16
+    """
+    with torch.device(device), _default_dtype(dtype):
+        return VLANetwork(config)
+
+
+@contextmanager
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)

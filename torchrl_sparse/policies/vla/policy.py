@@ -21,8 +21,9 @@ from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
 from torchrl_sparse.policies.vla.pruning import TokenPruner
 from torchrl_sparse.policies.vla.text import InstructionTokenizer, WordTokenizer
+from torchrl_sparse.policies.vla.vision import center_crop
 
-__all__ = ["VLAPolicy"]
+__all__ = ["VLAPolicy", "with_pruner"]
 
 
 class VLAPolicy(VLAWrapperBase):
@@ -132,8 +133,7 @@ class VLAPolicy(VLAWrapperBase):
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Normalised actions f32 [B, H, A] of a query [B], and what the decoder did; the pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
-        cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
-        images = read_images(query, cameras, config.image_size)
+        images = self._look(query)
         state = read_state(query, names.state, config.state_dim)
         prompts = self.tokenizer.encode(read_instructions(query, names.instruction))
         if self.pruner is not None:
@@ -149,6 +149,17 @@ class VLAPolicy(VLAWrapperBase):
         if self.pruner is not None:
             self.pruner.end(query)
         return actions, decoded
+
+    def _look(self, query: TensorDictBase) -> Tensor:
+        """The images, u8 [B, cameras, 3, h, w], cropped; in ``query`` too, where a pruner compares their patches."""
+        config, names = self.network.config, self.tensor_keys
+        cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
+        images = read_images(query, cameras, config.image_size)
+        if config.crop_area < 1:
+            images = center_crop(images.flatten(0, 1), config.crop_area).reshape(images.shape)
+            for camera, image in zip(cameras, images.unbind(1), strict=True):
+                query.set(camera, image)
+        return images
 
     def _answer(self, query: TensorDictBase, actions: Tensor, decoded: Decoded) -> TensorDict:
         """Everything but the latency, [B]."""
@@ -180,3 +191,10 @@ class VLAPolicy(VLAWrapperBase):
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
         return cls(*read_vla(Path(path), config))
+
+
+def with_pruner(policy: VLAPolicy, pruner: TokenPruner | None) -> VLAPolicy:
+    """The same model under another method, None for dense; ``policy`` stays as it is."""
+    other = VLAPolicy(policy.network, policy.normalizer, policy.tokenizer)
+    other.pruner = pruner
+    return other

@@ -15,11 +15,11 @@ There are two ways to prune, and both leave the model's code alone:
       pruner.end(td)
 
 **State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
-environment has them), and is the same object in `begin`, in ``state.td`` and in `end`: what must survive from one layer
-to the next is written there under any name. What is in the pruner's ``out_keys`` at `end` goes back to the environment,
-everything else is dropped. So what must outlive a query, such as ``("tokens", "score")`` or the previous frame, is an out_key
-and an in_key; it is missing at the first query of all, and rows with ``"is_init"`` start afresh. A pruner may write
-``("tokens", "keep_mask")`` in `begin`; the model reads it afterwards.
+environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
+`begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
+in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a query,
+such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key; it is missing at the first query of all, and
+rows with ``"is_init"`` start afresh. A pruner may write ``("tokens", "keep_mask")`` in `begin`; the model reads it afterwards.
 
 **Guarantees of the model.** BOS, proprio, text, action and stop tokens survive whatever a mask says. Tokens keep their
 original positions. Rows may keep different tokens: they are gathered to the front, padded to the longest row, and padding is

