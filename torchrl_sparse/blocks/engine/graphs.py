@@ -10,9 +10,8 @@ import torch
 __all__ = ["GraphCapture"]
 
 _WARM_UP = 3
-_CAPTURES = (
-    threading.Lock()
-)  # a thread that begins to capture waits for the device, which ends the capture of another
+# A thread that begins to capture waits for the device, which would end the capture of another.
+_CAPTURES = threading.Lock()
 
 
 class GraphCapture:
