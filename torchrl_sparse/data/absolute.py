@@ -35,9 +35,8 @@ from torchrl_sparse.files import atomic_path
 
 __all__ = ["AbsoluteActions", "convert_demos"]
 
-_TOLERANCE = (
-    1e-3  # m between a recorded hand and the same state's hand here; another robot or table is far off
-)
+# m between a recorded hand and the same state's hand here; another robot or table is far off
+_TOLERANCE = 1e-3
 
 
 def convert_demos(path: str | Path, out: str | Path) -> int:

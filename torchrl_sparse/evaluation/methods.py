@@ -27,9 +27,8 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
 _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
-EVALUATION_SEED = (
-    100_000  # of the first episode; Diffusion Policy's test_start_seed, which no demonstration has
-)
+# Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
+EVALUATION_SEED = 100_000
 CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
 METHODS = "dense, ddim<N>, uniform, " + ", ".join(SCHEDULES)
 

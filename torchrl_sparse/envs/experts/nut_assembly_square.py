@@ -12,9 +12,8 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 _HANDLE = np.array([0.059, 0.0, 0.004])  # m, where to grasp, in the nut's frame: well clear of the square
 _HANDLE_WIDTH = 0.032  # m
 _CLEAR = 0.052  # m along the handle from the nut's centre; nearer, fingers come to rest on the square
-_PLACED_YAW = (
-    np.pi
-)  # rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
+# rad, the nut's on the peg: of the four that fit, the one that keeps the arm from stretching
+_PLACED_YAW = np.pi
 _YAW_LIMITS = (-1.5, 3.4)  # rad, the hand's yaws that the last joint reaches, with a margin
 _PEG_TOP = 0.95  # m
 _ABOVE_PEG = 0.975  # m, the nut's height in travel
