@@ -71,8 +71,8 @@ def in_order(
                         ) from error
                     warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)
                 finally:
-                    for future in ahead:
-                        future.cancel()
+                    # Futures that are cancelled one by one can leave CPython 3.11's pool waiting for them for ever.
+                    pool.shutdown(cancel_futures=True)
 
 
 def _pool(backend: str, workers: int) -> Executor:
