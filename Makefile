@@ -14,7 +14,8 @@ $(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native.
 	touch $@
 
 demo: install
-	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo
+	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
+		methods=[ddim10,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
 test: install
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
