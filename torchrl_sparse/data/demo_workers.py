@@ -71,7 +71,6 @@ def in_order(
                         ) from error
                     warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)
                 finally:
-                    # Futures that are cancelled one by one can leave CPython 3.11's pool waiting for them for ever.
                     pool.shutdown(cancel_futures=True)
 
 
