@@ -24,7 +24,8 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
-from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate, make_reference
+from torchrl_sparse.blocks.pruner_reference import make_reference
+from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.blocks.static import Schedule
 from torchrl_sparse.data.robomimic import read_demos

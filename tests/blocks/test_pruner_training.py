@@ -9,11 +9,11 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.mask import prune_rate
+from torchrl_sparse.blocks.pruner_reference import make_reference
 from torchrl_sparse.blocks.pruner_training import (
     PrunerConfig,
     PrunerTrainer,
     imitate,
-    make_reference,
     sparsity_loss,
 )
 from torchrl_sparse.blocks.sag import PrunerNetwork

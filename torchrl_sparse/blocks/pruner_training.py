@@ -25,18 +25,17 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, prune_rate
+from torchrl_sparse.blocks.pruner_reference import ANSWER_BATCH
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.blocks.sag import check_rates, rate_threshold
-from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.trainer import batch_indices, step_seed
 
-__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "imitate", "make_reference", "sparsity_loss"]
+__all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "imitate", "sparsity_loss"]
 
 Cost = Literal["blocks", "flops", "seconds"]
-_ANSWER_BATCH = 16
 _IMITATION_BATCH = 4  # the coordinates' tokens, which no observation changes, cost the most
 
 
@@ -123,69 +122,6 @@ class PrunerConfig:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
-def make_reference(
-    policy: DiffusionPolicy,
-    demos: Demonstrations,
-    *,
-    share: float = 0.05,
-    target: Literal["teacher", "data"] = "teacher",
-    n_action_steps: int = 8,
-    seed: int = 0,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> TensorDict:
-    """A uniform sample of demonstration windows with the actions that a pruned policy should give there.
-
-    Args:
-        policy: the dense policy with the sampler that will be pruned.
-        demos: demonstrations.
-        share: of all windows, in (0, 1]; 5 % as published.
-        target: ``"teacher"``: what the dense policy answers on the same noise; ``"data"``: what was demonstrated,
-            as published. A regression to data averages over modes; the teacher's answer does not.
-        n_action_steps: actions executed of a chunk; decides how far windows reach over an episode's end.
-        seed: fixes the sample and its noise.
-        on_progress: called with (windows answered, all).
-
-    Returns:
-        [N]: ``("diffusion", "cond")`` f32 [N, To, D], ``("diffusion", "seed")`` i64 [N, 1], ``"target"``
-        f32 [N, H, A], normalised.
-
-    Raises:
-        ValueError: if the share leaves no window.
-    """
-    network, normalizer = policy.network, policy.normalizer
-    if target not in ("teacher", "data"):
-        raise ValueError(f"target: expected 'teacher' or 'data', got {target!r}")
-    rows = demos.window_rows(network.horizon, network.n_obs_steps, n_action_steps)
-    size = round(share * len(rows))
-    if not 0 < size <= len(rows):
-        raise ValueError(
-            f"share: expected at least one of {len(rows)} windows and not more than all, got {share}"
-        )
-    generator = torch.Generator().manual_seed(seed)
-    windows = demos.windows(rows[torch.randperm(len(rows), generator=generator)[:size]], network.n_obs_steps)
-    reference = TensorDict(
-        {
-            keys.COND: normalizer.normalize_state(windows[keys.HISTORY_STATE]),
-            keys.SEED: torch.randint(2**62, (size, 1), generator=generator),
-            "target": normalizer.normalize_action(windows[keys.ACTION]),
-        },
-        [size],
-    )
-    if target == "teacher":
-        reference["target"] = _dense_answers(policy, reference, on_progress)
-    return reference
-
-
-def _dense_answers(
-    policy: DiffusionPolicy, reference: TensorDict, on_progress: Callable[[int, int], None]
-) -> Tensor:
-    answers: list[Tensor] = []
-    for part in reference.split(_ANSWER_BATCH):
-        answers.append(policy.denoise(policy.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND]))
-        on_progress(sum(map(len, answers)), len(reference))
-    return torch.cat(answers)
-
-
 def imitate(
     gates: Gates,
     mask: Tensor,
@@ -205,7 +141,7 @@ def imitate(
     Args:
         gates: what will be trained, in place.
         mask: bool [K, 3L], True = pruned.
-        reference: of :func:`make_reference`; its observations are what the mask is learned on.
+        reference: see :mod:`torchrl_sparse.blocks.pruner_reference`; its observations are what the mask is learned on.
         updates, lr, seed: of the imitation.
         on_progress: called with (updates made, all).
 
@@ -259,7 +195,7 @@ class PrunerTrainer:
     Args:
         gates: :class:`~torchrl_sparse.blocks.sag.PrunerNetwork` or :class:`~torchrl_sparse.blocks.l2c.StaticGates`.
         policy: the policy, with the sampler that will be pruned; its weights get no gradient.
-        reference: of :func:`make_reference`; the last tenth is held out.
+        reference: see :mod:`torchrl_sparse.blocks.pruner_reference`; the last tenth is held out.
         config: how to train.
 
     Attributes:
@@ -335,7 +271,7 @@ class PrunerTrainer:
         actions = [
             self.policy.denoise(*part, reuse=self.config.reuse)
             for part in zip(
-                noise.split(_ANSWER_BATCH), cond.split(_ANSWER_BATCH), masks.split(_ANSWER_BATCH), strict=True
+                noise.split(ANSWER_BATCH), cond.split(ANSWER_BATCH), masks.split(ANSWER_BATCH), strict=True
             )
         ]
         error = (torch.cat(actions) - self.held_out["target"]).abs().mean()
@@ -347,7 +283,7 @@ class PrunerTrainer:
     def fixed_mask(self) -> Tensor:
         """The mean of the masks of all training observations, bool [K, 3L]: what the gates prune most often, as many
         cells as they prune on average. L2C's result, and of SAG the ablation that does not look."""
-        parts = self.train_set[keys.COND].split(_ANSWER_BATCH)
+        parts = self.train_set[keys.COND].split(ANSWER_BATCH)
         share = sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set)
         mask = torch.zeros(share.numel(), dtype=torch.bool)
         mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
