@@ -50,28 +50,28 @@ def in_order(
     failures = 0
     with backend_runtime(backend, workers):
         while True:
-            with _pool(backend, workers) as pool:
-                ahead: deque[Future] = deque()
-                try:
-                    numbers = count(first)
-                    while True:
-                        while len(ahead) < _AHEAD * workers:
-                            ahead.append(pool.submit(task, next(numbers)))
-                        ahead.popleft().result()
-                        failures, first = 0, first + 1
-                        yield first - 1
-                except Exception as error:
-                    death = _death(backend, error)
-                    if not death:
-                        raise
-                    failures += 1
-                    if failures == _FAILURES:
-                        raise RuntimeError(
-                            f"workers died {failures} times in a row at number {first}: {death}"
-                        ) from error
-                    warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)
-                finally:
-                    pool.shutdown(cancel_futures=True)
+            pool = _pool(backend, workers)
+            ahead: deque[Future] = deque()
+            try:
+                numbers = count(first)
+                while True:
+                    while len(ahead) < _AHEAD * workers:
+                        ahead.append(pool.submit(task, next(numbers)))
+                    ahead.popleft().result()
+                    failures, first = 0, first + 1
+                    yield first - 1
+            except Exception as error:
+                death = _death(backend, error)
+                if not death:
+                    raise
+                failures += 1
+                if failures == _FAILURES:
+                    raise RuntimeError(
+                        f"workers died {failures} times in a row at number {first}: {death}"
+                    ) from error
+                warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)
+            finally:
+                pool.shutdown(cancel_futures=True)
 
 
 def _pool(backend: str, workers: int) -> Executor:
