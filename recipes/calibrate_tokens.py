@@ -37,8 +37,6 @@ from torchrl_sparse.tokens.calibration import (
 )
 from torchrl_sparse.tokens.specprune import SpecPrune
 
-_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
-
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_tokens")
 def main(config: DictConfig) -> None:
@@ -83,11 +81,14 @@ def pruners(config: DictConfig) -> list[SpecPrune]:
 
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:
-    cameras = {name: key for name, key in config.cameras.items() if key}
     state_keys = get_task(config.task).proprioception_keys
-    return InstructedDemonstrations(
-        read_demos(config.demos, state_keys, cameras=cameras), read_instructions(config.demos)
-    )
+    episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config))
+    return InstructedDemonstrations(episodes, read_instructions(config.demos))
+
+
+def chosen_cameras(config: DictConfig) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations."""
+    return {name: key for name, key in config.cameras.items() if key is not None}
 
 
 def executor(policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
@@ -102,8 +103,8 @@ def seeds(config: DictConfig) -> range:
 
 def environment(policy: VLAPolicy, config: DictConfig) -> partial:
     from torchrl_sparse.envs.transforms import make_env  # queries of demonstrations need no simulator
+    from torchrl_sparse.evaluation.methods import camera_options
 
-    cameras = {_OPTIONS[name]: key.removesuffix("_image") for name, key in config.cameras.items() if key}
     return partial(
         make_env,
         get_task(config.task).name,
@@ -112,7 +113,7 @@ def environment(policy: VLAPolicy, config: DictConfig) -> partial:
         object_state=False,
         instruction=True,
         horizon=config.horizon,
-        **cameras,
+        **camera_options(chosen_cameras(config)),
     )
 
 

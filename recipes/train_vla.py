@@ -106,10 +106,9 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.envs.transforms import make_env
+    from torchrl_sparse.evaluation.methods import camera_options
     from torchrl_sparse.evaluation.paired import rollout_episodes
 
-    options = {"image": "camera", "wrist_image": "wrist_camera"}
-    cameras = {options[name]: key.removesuffix("_image") for name, key in chosen_cameras(config).items()}
     size = trainer.policy.network.config.image_size
     episodes = rollout_episodes(
         ChunkExecutor(averaged_policy(trainer), config.n_action_steps),
@@ -120,7 +119,7 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
             image_size=size,
             object_state=False,
             instruction=True,
-            **cameras,
+            **camera_options(chosen_cameras(config)),
         ),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),

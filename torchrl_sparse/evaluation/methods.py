@@ -164,11 +164,21 @@ def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
     if policy.vision is None:
         return options
     named = policy.source.get("cameras", {})
-    cameras = {name: named.get(name, "").removesuffix("_image") for name in policy.vision.cameras}
+    cameras = {name: named.get(name, "") for name in policy.vision.cameras}
     if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
         raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
-    options |= {_CAMERA_OPTIONS[name]: camera for name, camera in cameras.items()}
-    return options | {"image_size": policy.vision.image_size[0], "object_state": False}
+    return (
+        options | camera_options(cameras) | {"image_size": policy.vision.image_size[0], "object_state": False}
+    )
+
+
+def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
+    """Arguments of `make_env` for images by their names here and in demonstrations.
+
+    >>> camera_options({"image": "agentview_image"})
+    {'camera': 'agentview'}
+    """
+    return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}
 
 
 def calibrate_policy(
