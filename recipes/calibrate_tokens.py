@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
@@ -82,13 +83,8 @@ def pruners(config: DictConfig) -> list[SpecPrune]:
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:
     state_keys = get_task(config.task).proprioception_keys
-    episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config))
+    episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config.cameras))
     return InstructedDemonstrations(episodes, read_instructions(config.demos))
-
-
-def chosen_cameras(config: DictConfig) -> dict[str, str]:
-    """Name of an image here -> its name in the demonstrations."""
-    return {name: key for name, key in config.cameras.items() if key is not None}
 
 
 def executor(policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
@@ -113,7 +109,7 @@ def environment(policy: VLAPolicy, config: DictConfig) -> partial:
         object_state=False,
         instruction=True,
         horizon=config.horizon,
-        **camera_options(chosen_cameras(config)),
+        **camera_options(chosen_cameras(config.cameras)),
     )
 
 

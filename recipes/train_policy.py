@@ -17,6 +17,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.tasks import get_task
@@ -40,7 +41,7 @@ def main(config: DictConfig) -> None:
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Reads the demonstrations and builds what is trained on them."""
-    task, cameras = get_task(config.task), chosen_cameras(config)
+    task, cameras = get_task(config.task), chosen_cameras(config.cameras)
     demos = read_demos(
         config.demos,
         task.proprioception_keys if cameras else task.state_keys,
@@ -80,11 +81,6 @@ def untrained_policy(demos: Demonstrations, cameras: dict[str, str], config: Dic
     return DiffusionPolicy(network, normalizer, vision=vision, engine="reference")
 
 
-def chosen_cameras(config: DictConfig) -> dict[str, str]:
-    """Name of an image here -> its name in the demonstrations."""
-    return {name: key for name, key in config.cameras.items() if key is not None}
-
-
 def make_vision(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> VisionEncoder:
     image_size = demos.data["observation", next(iter(cameras))].shape[-2:]
     crop_size = [round(config.vision.crop * size) for size in image_size]
@@ -101,7 +97,7 @@ def averaged_policy(
 ) -> DiffusionPolicy:
     """With a note of the cameras, for whoever makes an environment for it."""
     policy = trainer.ema_policy(schedule)
-    if cameras := chosen_cameras(config):
+    if cameras := chosen_cameras(config.cameras):
         policy.source = {"task": get_task(config.task).alias, "cameras": cameras}
     return policy
 

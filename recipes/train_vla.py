@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.rotations import ABSOLUTE_DIM
@@ -49,7 +50,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     episodes = read_demos(
         config.demos,
         get_task(config.task).proprioception_keys,
-        cameras=chosen_cameras(config),
+        cameras=chosen_cameras(config.cameras),
         image_folder=Path(config.out) / "images",
     )
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos))
@@ -71,16 +72,11 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     return trainer
 
 
-def chosen_cameras(config: DictConfig) -> dict[str, str]:
-    """Name of an image here -> its name in the demonstrations."""
-    return {name: key for name, key in config.cameras.items() if key is not None}
-
-
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:
     """The size that was asked for, with what the demonstrations decide."""
     if config.size not in SIZES:
         raise ValueError(f"size: expected one of {', '.join(SIZES)}, got {config.size!r}")
-    cameras = [["observation", name] for name in chosen_cameras(config)]
+    cameras = [["observation", name] for name in chosen_cameras(config.cameras)]
     decided = {
         "cameras": cameras,
         "image_size": data[tuple(cameras[0])].shape[-1],
@@ -119,7 +115,7 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
             image_size=size,
             object_state=False,
             instruction=True,
-            **camera_options(chosen_cameras(config)),
+            **camera_options(chosen_cameras(config.cameras)),
         ),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),

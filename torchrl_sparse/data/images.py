@@ -14,7 +14,16 @@ from torch import Tensor
 from torchrl_sparse.data.hdf5_reader import naming
 from torchrl_sparse.files import atomic_path
 
-__all__ = ["read_images"]
+__all__ = ["chosen_cameras", "read_images"]
+
+
+def chosen_cameras(cameras: Mapping[str, str | None]) -> dict[str, str]:
+    """Name of an image here -> its name in the demonstrations, of those that have one.
+
+    >>> chosen_cameras({"image": "agentview_image", "wrist_image": None})
+    {'image': 'agentview_image'}
+    """
+    return {name: key for name, key in cameras.items() if key is not None}
 
 
 def read_images(
