@@ -43,7 +43,13 @@ from torchrl_sparse.evaluation.methods import (
 )
 from torchrl_sparse.evaluation.paired import rollout_episodes
 from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
-from torchrl_sparse.evaluation.report import MethodRun, build_results, format_table, save_results
+from torchrl_sparse.evaluation.report import (
+    MethodRun,
+    build_results,
+    format_pairs,
+    format_table,
+    save_results,
+)
 from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -107,7 +113,10 @@ def main(config: DictConfig) -> None:
     film(methods, environment, seeds[0], config)
     if config.wandb:
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}\n\n{config.episodes} paired episodes per method; files are in {out}")
+    print(f"\n{format_table(results)}")
+    if config.pairs:
+        print(f"\n{format_pairs(episodes, config.pairs, config.margin)}")
+    print(f"\n{config.episodes} paired episodes per method; files are in {out}")
 
 
 def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:

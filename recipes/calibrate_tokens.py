@@ -9,12 +9,14 @@ Writes ``out``, which `TokenBudget.load` reads, and a figure beside it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse.control.action_aware import ActionAwareController
@@ -97,20 +99,12 @@ def seeds(config: DictConfig) -> range:
     return range(config.seed, config.seed + config.episodes)
 
 
-def environment(policy: VLAPolicy, config: DictConfig) -> partial:
-    from torchrl_sparse.envs.transforms import make_env  # queries of demonstrations need no simulator
-    from torchrl_sparse.evaluation.methods import camera_options
+def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
+    from torchrl_sparse.evaluation.vla_methods import (
+        instructed_env,
+    )  # queries of demonstrations need no simulator
 
-    return partial(
-        make_env,
-        get_task(config.task).name,
-        n_obs_steps=1,
-        image_size=policy.network.config.image_size,
-        object_state=False,
-        instruction=True,
-        horizon=config.horizon,
-        **camera_options(chosen_cameras(config.cameras)),
-    )
+    return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 
 
 if __name__ == "__main__":

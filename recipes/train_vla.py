@@ -101,22 +101,13 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.methods import camera_options
     from torchrl_sparse.evaluation.paired import rollout_episodes
+    from torchrl_sparse.evaluation.vla_methods import instructed_env
 
-    size = trainer.policy.network.config.image_size
+    policy = averaged_policy(trainer)
     episodes = rollout_episodes(
-        ChunkExecutor(averaged_policy(trainer), config.n_action_steps),
-        partial(
-            make_env,
-            get_task(config.task).name,
-            n_obs_steps=1,
-            image_size=size,
-            object_state=False,
-            instruction=True,
-            **camera_options(chosen_cameras(config.cameras)),
-        ),
+        ChunkExecutor(policy, config.n_action_steps),
+        instructed_env(config.task, policy, chosen_cameras(config.cameras)),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult, totals
+from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult, TokenTotals, token_totals, totals
 from torchrl_sparse.files import atomic_path
 
 
@@ -18,10 +18,11 @@ def path(tmp_path):
 
 def test_log_survives_reopening(path):
     first = EpisodeLog(path, {"method": "bac"})
-    first.append(episode(3, latency=(0.1, 0.2)))
+    first.append(episode(3, latency=(0.1, 0.2), kept=(9.0, 4.5), fine=(False, True)))
     first.append(episode(1, success=False))
     again = EpisodeLog(path, {"method": "bac"})
-    assert list(again.episodes.values()) == [episode(3, latency=(0.1, 0.2)), episode(1, success=False)]
+    assert list(again.episodes.values()) == [*first.episodes.values()]
+    assert again.episodes[3].fine == (False, True)
     assert again.missing([0, 1, 2, 3]) == [0, 2]
 
 
@@ -95,6 +96,25 @@ def test_totals_weigh_queries():
     assert sums.episode_length == 40
     with pytest.raises(ValueError, match="got none in 0 episodes"):
         totals([])
+
+
+def test_tokens_are_averaged_over_queries_and_modes():
+    sighted = [
+        episode(0, kept=(100.0, 40.0), fine=(False, True)),
+        episode(1, kept=(60.0,), fine=(True,)),
+    ]
+    assert token_totals(sighted) == TokenTotals(mean=pytest.approx(200 / 3), fine=50.0, coarse=100.0)
+    assert token_totals([episode(0, kept=(100.0, 40.0))]) == TokenTotals(70.0, None, None)
+    assert token_totals([episode(0)]) is None
+
+
+def test_a_log_from_before_there_were_tokens_is_read(path):
+    log = EpisodeLog(path)
+    log.append(episode(0))
+    header, line = path.read_text().splitlines()
+    old = {key: value for key, value in json.loads(line).items() if key not in ("kept", "fine")}
+    path.write_text(f"{header}\n{json.dumps(old)}\n")
+    assert EpisodeLog(path).episodes == {0: episode(0)}
 
 
 def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path):

@@ -2,6 +2,7 @@ import copy
 import json
 import math
 import os
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ from torchrl_sparse.evaluation.latency import summarize_latency
 from torchrl_sparse.evaluation.report import (
     MethodRun,
     build_results,
+    format_pairs,
     format_table,
     load_results,
     save_results,
@@ -50,6 +52,36 @@ def test_build_computes_what_the_schema_promises():
     assert entry["episode_length"] == 30
     assert results["schema"] == 1
     assert results["seed"] == 3
+
+
+def test_visual_tokens_are_reported_where_there_are_any():
+    blind, sighted = run([1, 0]), run([1, 1])
+    kept = {"kept": (90.0, 30.0), "fine": (True, False)}
+    sighted = replace(sighted, episodes=[replace(episode, **kept) for episode in sighted.episodes])
+    results = build({"dense": sighted, "blind": blind})
+    assert results["methods"]["dense"]["tokens"] == {
+        "kept_mean": 60.0,
+        "kept_fine": 90.0,
+        "kept_coarse": 30.0,
+    }
+    assert "tokens" not in results["methods"]["blind"]
+    assert "60.0 (30 / 90)" in format_table({**results, "methods": {"dense": results["methods"]["dense"]}})
+    results["methods"]["dense"]["tokens"]["kept_fine"] = None
+    validate_results(results)
+    results["methods"]["dense"]["tokens"]["kept_fine"] = "many"
+    with pytest.raises(ValueError, match=r"methods.dense.tokens.kept_fine: expected a finite number or null"):
+        validate_results(results)
+
+
+def test_any_two_methods_are_compared_seed_by_seed():
+    won, lost = run([1, 1, 1, 0] * 5), run([1, 0, 0, 1] * 5)
+    low, high = tango_interval(10, 5, 20)
+    table = format_pairs({"a": won.episodes, "b": lost.episodes[::-1]}, [["a", "b"]], margin=0.05)
+    assert f"15 : 10 | +25.0 [{100 * low:+.1f}, {100 * high:+.1f}]" in table
+    with pytest.raises(ValueError, match=r"pairs: expected two of a, b, got \['a', 'c'\]"):
+        format_pairs({"a": won.episodes, "b": lost.episodes}, [["a", "c"]])
+    with pytest.raises(ValueError, match="expected the seeds of 'b'"):
+        format_pairs({"a": won.episodes, "b": run([1], first_seed=9).episodes}, [["a", "b"]])
 
 
 def test_dense_equals_itself_by_definition():

@@ -18,7 +18,7 @@ from torchrl_sparse.evaluation.vla_report import measure_vla
 from torchrl_sparse.policies.vla.flops import decoder_flops, fixed_flops
 from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "benchmark_vla.py"
+RECIPE = Path(__file__).parents[2] / "recipes" / "profile_vla.py"
 SPEC = SHAPES["toy"].visual_spec
 
 

@@ -57,12 +57,13 @@ def pruner(alpha):
 
 def test_replaying_is_what_a_rollout_does():
     policy, queries = make_policy(), episode()
-    chunks, kept = replay(policy, queries, pruner(0.2))
+    answers = replay(policy, queries, pruner(0.2))
     worker, td = make_policy(pruner(0.2)), TensorDict({}, [])
     for index, recorded in enumerate(queries):
         td = worker(td.update(recorded))
-        assert torch.equal(policy.normalizer.normalize_action(td[keys.CHUNK]), chunks[index])
-        assert td[keys.KEPT].item() == kept[index]
+        for key in (keys.CHUNK, keys.KEPT, keys.TOKEN_DEPTH):
+            assert torch.equal(td[key], answers[key][index])
+    kept = answers[keys.KEPT]
     assert kept[0] == CONFIG.num_visual > kept[1:].max()
     assert policy.pruner is None
     assert all(keys.TOKEN_SCORE not in recorded.keys(True) for recorded in queries)
@@ -73,7 +74,8 @@ def test_errors_are_those_of_the_executed_actions_after_the_first_query():
     tight, whole = measure_errors(
         policy, [queries, queries[:1]], [pruner(0.2), pruner(1.0)], n_action_steps=1
     )
-    dense, pruned = (replay(policy, queries, method)[0][1:, :1] for method in (None, pruner(0.2)))
+    answers = (replay(policy, queries, method)[keys.CHUNK] for method in (None, pruner(0.2)))
+    dense, pruned = (policy.normalizer.normalize_action(chunks)[1:, :1] for chunks in answers)
     assert tight.loss == pytest.approx((pruned - dense).abs().mean().item())
     assert tight.loss > 0 == whole.loss
     assert tight.kept < whole.kept == CONFIG.num_visual
@@ -154,10 +156,9 @@ def test_recorded_queries_are_those_that_the_executor_made():
     policy = toy_policy()
     found = [*recorded_queries(policy, ChunkExecutor(policy, 2), toy_env, [0, 1])]
     assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False, False]] * 2
-    chunks, _ = replay(policy, found[0], None)
+    answers = replay(policy, found[0], None)
     steps = toy_env([0]).rollout(9, ChunkExecutor(policy, 2))
-    expected = policy.normalizer.normalize_action(steps[keys.CHUNK][steps[keys.QUERIED].squeeze(-1)])
-    assert torch.equal(chunks, expected)
+    assert torch.equal(answers[keys.CHUNK], steps[keys.CHUNK][steps[keys.QUERIED].squeeze(-1)])
 
 
 def test_success_is_compared_with_dense_on_the_same_seeds():

@@ -8,6 +8,7 @@ from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_
 from torchrl_sparse.evaluation.report import (
     MethodRun,
     build_results,
+    format_pairs,
     format_table,
     load_results,
     save_results,
@@ -40,6 +41,7 @@ __all__ = [
     "describe_machine",
     "draw_tokens",
     "episodes_needed",
+    "format_pairs",
     "format_table",
     "load_results",
     "measure_latency",

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-__all__ = ["EpisodeLog", "EpisodeResult", "Totals", "totals"]
+__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
 
 _VERSION = 1
 
@@ -22,10 +22,12 @@ class EpisodeResult:
         length: environment steps.
         queries: calls of the policy.
         flops_total: FLOPs (2 * MAC) of all queries together, denoiser only.
-        prune_rate: mean of the masks of all queries, in [0, 1]; 0 where the policy writes no mask.
+        prune_rate: pruned share of the blocks, or of the visual tokens, mean over all queries, in [0, 1].
         latency: seconds of each query as the policy reported it. A batched call reports its duration for
             every row, so these describe the rollout; the figures of a table come from
             :func:`measure_latency`.
+        kept: visual tokens in a decoder layer, mean over the layers, of each query; empty for a policy without them.
+        fine: whether each query was made in the controller's fine mode; empty without a controller.
     """
 
     seed: int
@@ -35,18 +37,20 @@ class EpisodeResult:
     flops_total: float
     prune_rate: float
     latency: tuple[float, ...] = ()
+    kept: tuple[float, ...] = ()
+    fine: tuple[bool, ...] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "EpisodeResult":
         """Inverse of ``dataclasses.asdict``.
 
         Raises:
-            ValueError: if keys are missing or unknown.
+            ValueError: if keys are missing or unknown. What only policies with visual tokens have may be missing.
         """
         expected = {field.name for field in fields(cls)}
-        if set(data) != expected:
+        if not expected - {"kept", "fine"} <= set(data) <= expected:
             raise ValueError(f"expected the keys {sorted(expected)}, got {sorted(data)}")
-        return cls(**{**data, "latency": tuple(data["latency"])})
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,18 @@ class Totals:
     prune_rate: float
     episode_length: float
     queries: int
+
+
+@dataclass(frozen=True)
+class TokenTotals:
+    """Visual tokens in a decoder layer, mean over queries: of all, of those in fine mode, and of the others.
+
+    ``fine`` and ``coarse`` are None where there was no such query, as without a controller.
+    """
+
+    mean: float
+    fine: float | None
+    coarse: float | None
 
 
 def totals(episodes: Sequence[EpisodeResult]) -> Totals:
@@ -84,6 +100,26 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
         episode_length=sum(episode.length for episode in episodes) / len(episodes),
         queries=queries,
     )
+
+
+def token_totals(episodes: Sequence[EpisodeResult]) -> TokenTotals | None:
+    """Average the visual tokens of episodes, every query counting the same; None for a policy without them.
+
+    >>> token_totals([EpisodeResult(0, True, 8, 2, 10.0, 0.5, kept=(90.0, 30.0), fine=(True, False))])
+    TokenTotals(mean=60.0, fine=90.0, coarse=30.0)
+    """
+    kept = [count for episode in episodes for count in episode.kept]
+    if not kept:
+        return None
+    modes = [
+        pair for episode in episodes if episode.fine for pair in zip(episode.fine, episode.kept, strict=True)
+    ]
+    fine, coarse = ([count for mode, count in modes if mode is wanted] for wanted in (True, False))
+    return TokenTotals(_mean(kept), _mean(fine) if fine else None, _mean(coarse) if coarse else None)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
 
 
 class EpisodeLog:

@@ -54,7 +54,8 @@ def rollout_episodes(
 
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
-            "latency")`` and ``("diffusion", "prune_mask")`` are recorded where it writes them.
+            "latency")``, ``("diffusion", "prune_mask")``, ``("tokens", "kept")`` and ``("control", "fine")`` are recorded
+            where it writes them.
         make_env: called as ``make_env(seeds=[...])``; makes one environment whose episodes take these in
             turn and report them under ``("episode", "seed")``, with ``("next", "success")``.
         seeds: one episode each, all different.
@@ -175,6 +176,8 @@ class _OpenEpisode:
         self.flops = 0.0
         self.prune_rates: list[float] = []
         self.latency: list[float] = []
+        self.kept: list[float] = []
+        self.fine: list[bool] = []
         self.queries = 0
 
     def add(self, row: TensorDictBase) -> None:
@@ -185,14 +188,30 @@ class _OpenEpisode:
             return
         self.queries += 1
         self.flops += float(row[keys.FLOPS])
-        mask, latency = row.get(keys.PRUNE_MASK, None), row.get(keys.LATENCY, None)
-        self.prune_rates.append(0.0 if mask is None else float(mask.float().mean()))
-        if latency is not None:
-            self.latency.append(float(latency))
+        self.prune_rates.append(_prune_rate(row))
+        for key, values in ((keys.LATENCY, self.latency), (keys.KEPT, self.kept), (keys.FINE, self.fine)):
+            if (value := row.get(key, None)) is not None:
+                values.append(value.item())
 
     def close(self, seed: int) -> EpisodeResult:
         """The finished episode."""
-        prune_rate = sum(self.prune_rates) / max(self.queries, 1)
         return EpisodeResult(
-            seed, self.success, self.length, self.queries, self.flops, prune_rate, tuple(self.latency)
+            seed,
+            self.success,
+            self.length,
+            self.queries,
+            self.flops,
+            prune_rate=sum(self.prune_rates) / max(self.queries, 1),
+            latency=tuple(self.latency),
+            kept=tuple(self.kept),
+            fine=tuple(self.fine),
         )
+
+
+def _prune_rate(row: TensorDictBase) -> float:
+    """Of a query: the share of its blocks that were pruned or, where there are visual tokens, of those; else 0."""
+    if (mask := row.get(keys.PRUNE_MASK, None)) is not None:
+        return float(mask.float().mean())
+    if (kept := row.get(keys.KEPT, None)) is not None:
+        return 1 - kept.item() / row[keys.TOKEN_DEPTH].shape[-1]
+    return 0.0

@@ -3,11 +3,11 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
+from torchrl_sparse.evaluation.episodes import EpisodeResult, token_totals, totals
 from torchrl_sparse.evaluation.latency import Latency
 from torchrl_sparse.evaluation.schema import REFERENCE, SCHEMA, outcome_entry, validate_results
 from torchrl_sparse.evaluation.stats import (
@@ -19,7 +19,7 @@ from torchrl_sparse.evaluation.stats import (
 from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.files import atomic_path
 
-__all__ = ["MethodRun", "build_results", "format_table", "load_results", "save_results"]
+__all__ = ["MethodRun", "build_results", "format_pairs", "format_table", "load_results", "save_results"]
 
 
 @dataclass(frozen=True)
@@ -76,18 +76,14 @@ def build_results(
 
 def _method_entry(name: str, run: MethodRun, dense: MethodRun, margin: float) -> dict[str, Any]:
     ours, reference = _by_seed(run.episodes), _by_seed(dense.episodes)
-    if ours.keys() != reference.keys():
-        odd = sorted(ours.keys() ^ reference.keys())
-        raise ValueError(
-            f"{name}: expected the seeds of {REFERENCE!r}, got others: {odd[:10]} are in one only"
-        )
+    _check_seeds(name, ours, REFERENCE, reference)
     outcomes = [episode.success for episode in ours.values()]
     if name == REFERENCE:
         paired = PairedDifference(0.0, (0.0, 0.0), margin, "non-inferior", 0, 0, len(outcomes))
     else:
         paired = paired_difference(outcomes, [reference[seed].success for seed in ours], margin)
     cost, dense_cost = totals(run.episodes), totals(dense.episodes)
-    return {
+    entry = {
         **outcome_entry(outcomes, paired),
         "prune_rate": cost.prune_rate,
         "flops": {
@@ -99,6 +95,15 @@ def _method_entry(name: str, run: MethodRun, dense: MethodRun, margin: float) ->
         "action_error_vs_dense": {"mean": float(run.action_error[0]), "max": float(run.action_error[1])},
         "episode_length": cost.episode_length,
     }
+    if tokens := token_totals(run.episodes):
+        entry["tokens"] = {f"kept_{name}": count for name, count in asdict(tokens).items()}
+    return entry
+
+
+def _check_seeds(name: str, ours: Mapping[int, Any], other: str, theirs: Mapping[int, Any]) -> None:
+    if ours.keys() != theirs.keys():
+        odd = sorted(ours.keys() ^ theirs.keys())
+        raise ValueError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
 
 
 def _by_seed(episodes: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
@@ -155,12 +160,14 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
 def _table_row(name: str, method: Mapping[str, Any]) -> dict[str, str]:
     success, paired, latency = method["success"], method["paired_vs_dense"], method["latency_s"]
     error, reference = method["action_error_vs_dense"], name == REFERENCE
+    tokens = {"tokens (coarse / fine)": _tokens(**method["tokens"])} if "tokens" in method else {}
     return {
         "method": name,
         "success": f"{success['k']}/{success['n']} {_percent_range(success['ci95'])}",
         "vs dense, points": "" if reference else f"{_points(paired['diff'])} {_point_range(paired['ci95'])}",
         "verdict": "reference" if reference else paired["verdict"],
         "pruned": f"{100 * method['prune_rate']:.1f} %",
+        **tokens,
         "GFLOPs/query": f"{method['flops']['per_query'] / 1e9:.2f}",
         "FLOPs ratio": f"{method['flops']['ratio_to_dense']:.3f}",
         "p50, ms": _milliseconds(latency["p50"]),
@@ -171,20 +178,66 @@ def _table_row(name: str, method: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def format_pairs(
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    pairs: Sequence[Sequence[str]],
+    margin: float = DEFAULT_MARGIN,
+) -> str:
+    """A table of differences in success between methods of which none need be dense, paired by seed.
+
+    Args:
+        episodes: method -> its episodes.
+        pairs: of names, the first against the second; at least one pair.
+        margin: non-inferiority margin of the verdict on the first.
+
+    Raises:
+        ValueError: if a pair is not two of the methods, or they ran on different seeds.
+
+    >>> once = [EpisodeResult(0, True, 8, 1, 1.0, 0.0)]
+    >>> print(format_pairs({"a": once, "b": once}, [("a", "b")]))
+    | method | against | success |  difference, points | verdict   |
+    |:-------|:--------|--------:|--------------------:|:----------|
+    | a      | b       |   1 : 1 | +0.0 [-79.3, +79.3] | undecided |
+    """
+    rows = [_pair_row(episodes, pair, margin) for pair in pairs]
+    return markdown_table(rows, left=("method", "against", "verdict"))
+
+
+def _pair_row(
+    episodes: Mapping[str, Sequence[EpisodeResult]], pair: Sequence[str], margin: float
+) -> dict[str, str]:
+    if len(pair) != 2 or not set(pair) <= set(episodes):
+        raise ValueError(f"pairs: expected two of {', '.join(episodes)}, got {list(pair)}")
+    first, second = (_by_seed(episodes[name]) for name in pair)
+    _check_seeds(pair[0], first, pair[1], second)
+    ours, theirs = [e.success for e in first.values()], [second[seed].success for seed in first]
+    paired = paired_difference(ours, theirs, margin)
+    return {
+        "method": pair[0],
+        "against": pair[1],
+        "success": f"{sum(ours)} : {sum(theirs)}",
+        "difference, points": f"{_points(paired.diff)} {_point_range(paired.ci)}",
+        "verdict": paired.verdict,
+    }
+
+
 def results_note(results: Mapping[str, Any]) -> str:
     """The lines that explain the table."""
     machine, policy = results["machine"], results["policy"]
     reference = results["methods"][REFERENCE]
     n, margin = reference["success"]["n"], reference["paired_vs_dense"]["margin"]
     threads = f"{machine['threads']} thread{'s' if machine['threads'] != 1 else ''}"
+    steps, flops = f"{policy['num_inference_steps']} denoising steps", "denoiser only"
+    if "tokens" in reference:
+        steps, flops = f"chunks of {policy['horizon']} actions", "whole network"
     lines = [
         f"{results['task']}, {n} paired episodes a method (seed {results['seed']}): the same initial states "
         "and the same noise for every method. Success with Wilson's 95 % interval, difference to dense with "
         "Tango's.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell).",
-        f"Dense: {policy['params']:,} parameters, {policy['num_inference_steps']} denoising steps. FLOPs are "
-        "2·MAC of a query, denoiser only. Latency of a query, all methods interleaved in one process, on "
+        f"Dense: {policy['params']:,} parameters, {steps}. FLOPs are "
+        f"2·MAC of a query, {flops}. Latency of a query, all methods interleaved in one process, on "
         f"{machine['cpu']}, {machine['device']}, {threads}, torch {machine['torch']}, "
         f"{machine['date'][:10]}.",
     ]
@@ -198,6 +251,11 @@ def results_note(results: Mapping[str, Any]) -> str:
 
 def _percent_range(interval: Sequence[float]) -> str:
     return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}] %"
+
+
+def _tokens(kept_mean: float, kept_fine: float | None, kept_coarse: float | None) -> str:
+    modes = [f"{count:.0f}" if count is not None else "-" for count in (kept_coarse, kept_fine)]
+    return f"{kept_mean:.1f} ({' / '.join(modes)})"
 
 
 def _points(difference: float) -> str:

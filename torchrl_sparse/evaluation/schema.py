@@ -14,14 +14,17 @@ Schema version 1 (all numbers finite; no other keys)::
         "latency_s": {"p50": float, "p95": float, "n": int},
         "speedup_vs_dense": float,
         "action_error_vs_dense": {"mean": float, "max": float},
-        "episode_length": float}}}
+        "episode_length": float,
+        "tokens": {"kept_mean": float, "kept_fine": float | null, "kept_coarse": float | null}}}}
 
 ``success.ci95`` is Wilson's interval; ``paired_vs_dense`` compares success on the same seeds, with Tango's
 interval and a verdict ``"non-inferior"``, ``"inferior"`` or ``"undecided"`` against ``margin``;
-``prune_rate`` is the mean of the masks; ``flops`` are 2 * MAC of one query, denoiser only; ``latency_s`` is
+``prune_rate`` is the pruned share of the blocks, or of the visual tokens; ``flops`` are 2 * MAC of one
+query, denoiser only, or of a whole vision-language-action model; ``latency_s`` is
 in seconds per query and ``speedup_vs_dense`` the ratio of the medians; ``action_error_vs_dense`` is the
 absolute difference of an action entry, on the same observations and the same noise; ``episode_length`` is a
-mean in environment steps.
+mean in environment steps. ``tokens`` is there for policies with visual tokens alone: how many are in a decoder layer, mean over
+layers and queries, and over the queries in fine and in coarse mode, null without any.
 
 ``methods`` always holds ``"dense"``. Its own ``paired_vs_dense`` is ``diff 0, ci95 [0, 0], "non-
 inferior"``: a policy equals itself by definition, nothing is estimated.
@@ -52,6 +55,7 @@ _METHOD = {
     "action_error_vs_dense": {"mean": float, "max": float},
     "episode_length": float,
 }
+_TOKENS = {"kept_mean": float, "kept_fine": "number or null", "kept_coarse": "number or null"}
 _RESULTS = {
     "schema": int,
     "task": str,
@@ -106,7 +110,8 @@ def validate_results(results: Any) -> None:
     n = None
     for name, method in results["methods"].items():
         path = f"methods.{name}"
-        check_types(method, _METHOD, path)
+        has_tokens = isinstance(method, Mapping) and "tokens" in method
+        check_types(method, _METHOD | ({"tokens": _TOKENS} if has_tokens else {}), path)
         _check_method_values(method, path)
         n = method["success"]["n"] if n is None else n
         _require(
@@ -143,7 +148,8 @@ def _check_method_values(method: Mapping[str, Any], path: str) -> None:
 
 
 def check_types(value: Any, spec: Any, path: str) -> None:
-    """Check a value against a nested specification: a type, ``"interval"``, or a mapping of the only keys to theirs.
+    """Check a value against a nested specification: a type, ``"interval"``, ``"number or null"``, or a mapping of the only keys
+    to theirs.
 
     Raises:
         ValueError: naming the path, which is ``path`` and the keys below it.
@@ -164,6 +170,8 @@ def check_types(value: Any, spec: Any, path: str) -> None:
     elif spec == "interval":
         pair = isinstance(value, Sequence) and len(value) == 2 and all(_is_number(limit) for limit in value)
         _require(pair and value[0] <= value[1], path, "[low, high] with low <= high", value)
+    elif spec == "number or null":
+        _require(value is None or _is_number(value), path, "a finite number or null", value)
     elif spec is float:
         _require(_is_number(value), path, "a finite number", value)
     elif spec is int:

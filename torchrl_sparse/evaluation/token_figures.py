@@ -126,6 +126,7 @@ def plot_control(
         panel.set_ylim(bottom=0)
     axes[0].legend(frameon=False, ncols=3, loc="upper right")
     axes[-1].set_xlabel("environment step")
+    axes[-1].locator_params(axis="x", integer=True)
     return save_figure(figure, path)
 
 

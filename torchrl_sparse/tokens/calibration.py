@@ -15,7 +15,6 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
@@ -160,22 +159,21 @@ def _rollout(actor: Actor, make_env: Callable[..., EnvBase], seed: int) -> Tenso
 @torch.no_grad()
 def replay(
     policy: VLAPolicy, queries: Sequence[TensorDictBase], pruner: TokenPruner | None
-) -> tuple[Tensor, Tensor]:
+) -> TensorDictBase:
     """Answers an episode's queries in their order, each with what the one before left.
 
     Returns:
-        The normalised chunks, f32 [Q, H, A], and the visual tokens that were kept, f32 [Q].
+        The policy's ``out_keys`` under ``pruner``, [Q].
     """
     worker = with_pruner(policy, pruner)
     carried: list[NestedKey] = [key for key in worker.out_keys if key in worker.in_keys]
     device = next(policy.network.parameters()).device
-    chunks, kept, left = [], [], TensorDict({}, [])
+    answers, left = [], TensorDict({}, [])
     for recorded in queries:
         answer = worker(recorded.exclude(*carried).to(device).update(left))
         left = answer.select(*carried)
-        chunks.append(policy.normalizer.normalize_action(answer[keys.CHUNK]))
-        kept.append(answer[keys.KEPT].squeeze(-1))
-    return torch.stack(chunks), torch.stack(kept)
+        answers.append(answer.select(*worker.out_keys))
+    return torch.stack(answers)
 
 
 def measure_errors(
@@ -201,13 +199,15 @@ def measure_errors(
         raise ValueError(
             f"episodes: expected one with at least two queries, got {[len(q) for q in episodes]}"
         )
+    normalize = policy.normalizer.normalize_action
     errors, kept = ([[] for _ in pruners] for _ in range(2))
     for queries in episodes:
-        dense, _ = replay(policy, queries, None)
+        dense = normalize(replay(policy, queries, None)[keys.CHUNK])
         for index, pruner in enumerate(pruners):
-            chunks, tokens = replay(policy, queries, pruner)
-            errors[index].append((chunks - dense)[1:, :n_action_steps].abs().mean((-2, -1)))
-            kept[index].append(tokens[1:])
+            answers = replay(policy, queries, pruner)
+            difference = normalize(answers[keys.CHUNK]) - dense
+            errors[index].append(difference[1:, :n_action_steps].abs().mean((-2, -1)))
+            kept[index].append(answers[keys.KEPT][1:])
         on_episode()
     return [
         BudgetPoint(pruner.options.alpha, torch.cat(tokens).mean().item(), torch.cat(error).mean().item())

@@ -1,0 +1,62 @@
+"""Benchmarks a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
+
+    python recipes/profile_vla.py                                                      # reduced shape, one CPU thread
+    python recipes/profile_vla.py shape=published device=cuda dtype=bfloat16           # the published 7B shape
+
+Writes OUT/vla_latency.json, a table and a chart. Times are medians, everything interleaved in one process.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from torchrl_sparse.evaluation.latency import describe_machine, num_threads
+from torchrl_sparse.evaluation.vla_cases import VLACase, make_policy
+from torchrl_sparse.evaluation.vla_report import (
+    DENSE,
+    format_vla_table,
+    measure_vla,
+    plot_vla_times,
+    save_vla_results,
+)
+from torchrl_sparse.policies.vla.pruning import TokenPruner
+from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
+
+
+@hydra.main(version_base=None, config_path=".", config_name="profile_vla")
+def main(config: DictConfig) -> None:
+    with num_threads(config.threads), torch.no_grad():
+        policy = make_policy(config.shape, dtype=getattr(torch, config.dtype), device=config.device)
+        case = VLACase(policy, make_pruners(config))
+        with tqdm(total=config.repeats, unit="round") as bar:
+            measured = measure_vla(
+                case,
+                repeats=config.repeats,
+                warmup=config.warmup,
+                on_round=lambda done, total: bar.update(done - bar.n),
+            )
+    machine = describe_machine(config.device, config.threads)
+    results = {"schema": 1, "machine": machine, **measured}
+    results["shape"] = {"name": config.shape, **measured["shape"]}
+    out = Path(config.out)
+    save_vla_results(results, out / "vla_latency.json")
+    plot_vla_times(results, out / "vla_latency.png")
+    print(f"\n{format_vla_table(results)}\n\nfiles are in {out}")
+
+
+def make_pruners(config: DictConfig) -> dict[str, TokenPruner | None]:
+    """SpecPrune at every alpha, the others at every share, and dense."""
+    pruners: dict[str, TokenPruner | None] = {DENSE: None}
+    pruners |= {f"specprune, alpha {alpha:g}": SpecPrune(alpha=alpha) for alpha in config.alphas}
+    pruners |= {f"fastv, {share:.0%}": FastVPruner(share) for share in config.shares}
+    pruners |= {f"random, {share:.0%}": RandomPruner(share) for share in config.shares}
+    return pruners
+
+
+if __name__ == "__main__":
+    main()
