@@ -112,7 +112,7 @@ def test_the_recipe_leaves_json_table_and_chart(tmp_path):
     assert results["machine"]["threads"] == 1
     assert results["shape"]["name"] == "toy"
     assert list(results["methods"]) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
-    assert all(f"| {name} |" in done.stdout for name in [*results["methods"], *results["parts"]])
+    assert all(f"| {name} " in done.stdout for name in [*results["methods"], *results["parts"]])
     assert iio.imread(tmp_path / "vla_latency.png").std() > 5
 
 

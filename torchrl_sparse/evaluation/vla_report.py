@@ -29,6 +29,7 @@ import numpy as np
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.latency import Latency, measure_latency
+from torchrl_sparse.evaluation.tables import markdown_table
 from torchrl_sparse.evaluation.vla_cases import VLACase
 from torchrl_sparse.files import atomic_path
 
@@ -125,30 +126,36 @@ def save_vla_results(results: Mapping[str, Any], path: str | os.PathLike) -> Non
 def format_vla_table(results: Mapping[str, Any]) -> str:
     """The parts of a dense query and the methods, as two tables in Markdown."""
     shape, machine = results["shape"], results["machine"]
-    lines = [
+    about = (
         f"{shape['name']}: {shape['parameters']:,} parameters, {shape['dtype']}, {shape['tokens']} tokens, "
-        f"{shape['visual_tokens']} of them visual; {machine['device']}, {machine['cpu']}, threads {machine['threads']}",
-        "",
-        "| part of a dense query | p50 (ms) | share |",
-        "|---|---|---|",
-    ]
-    lines += [
-        f"| {name} | {1e3 * row['p50_s']:.2f} | {row['share']:.1%} |"
+        f"{shape['visual_tokens']} of them visual; {machine['device']}, {machine['cpu']}, threads {machine['threads']}"
+    )
+    parts = [
+        {
+            "part of a dense query": name,
+            "p50, ms": f"{1e3 * row['p50_s']:.2f}",
+            "share": f"{row['share']:.1%}",
+        }
         for name, row in results["parts"].items()
     ]
-    lines += [
-        "",
-        "| method | visual tokens kept | p50 (ms) | p10 – p90 | TFLOP | speed-up | by FLOPs | realised | helpers |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, row in results["methods"].items():
-        helpers = ", ".join(f"{part} {helper['share']:.1%}" for part, helper in row["helpers"].items())
-        lines.append(
-            f"| {name} | {row['kept']:.0f} | {1e3 * row['p50_s']:.1f} | {1e3 * row['p10_s']:.1f} – "
-            f"{1e3 * row['p90_s']:.1f} | {row['flops'] / 1e12:.3g} | {row['speedup']:.2f}× | {row['flops_speedup']:.2f}× "
-            f"| {row['realised']:.0%} | {row['helper_share']:.1%}{f' ({helpers})' if helpers else ''} |"
-        )
-    return "\n".join(lines)
+    methods = [_method_row(name, row) for name, row in results["methods"].items()]
+    tables = markdown_table(parts, left=("part of a dense query",)), markdown_table(methods, left=("method",))
+    return "\n\n".join([about, *tables])
+
+
+def _method_row(name: str, row: Mapping[str, Any]) -> dict[str, str]:
+    helpers = ", ".join(f"{part} {helper['share']:.1%}" for part, helper in row["helpers"].items())
+    return {
+        "method": name,
+        "visual tokens kept": f"{row['kept']:.0f}",
+        "p50, ms": f"{1e3 * row['p50_s']:.1f}",
+        "p10 – p90": f"{1e3 * row['p10_s']:.1f} – {1e3 * row['p90_s']:.1f}",
+        "TFLOP": f"{row['flops'] / 1e12:.3g}",
+        "speed-up": f"{row['speedup']:.2f}×",
+        "by FLOPs": f"{row['flops_speedup']:.2f}×",
+        "realised": f"{row['realised']:.0%}",
+        "helpers": f"{row['helper_share']:.1%}{f' ({helpers})' if helpers else ''}",
+    }
 
 
 def plot_vla_times(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
