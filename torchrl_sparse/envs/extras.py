@@ -1,0 +1,32 @@
+"""Importing simulators that come with optional extras."""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from types import ModuleType
+
+from torchrl_sparse.envs.simulator import stand_in_for_missing_cv2
+
+__all__ = ["import_extra"]
+
+
+def import_extra(module: str, extra: str) -> ModuleType:
+    """A module of an optional simulator, also where no GL library is installed.
+
+    Raises:
+        ImportError: without it, with the command that installs it.
+
+    >>> import_extra("no_such_simulator", "pusht")
+    Traceback (most recent call last):
+    ...
+    ImportError: no_such_simulator needs the extra pusht, pip install 'torchrl-sparse[pusht]': No module named 'no_such_simulator'
+    """
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    stand_in_for_missing_cv2()
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f"{module} needs the extra {extra}, pip install 'torchrl-sparse[{extra}]': {error}"
+        ) from error
