@@ -7,7 +7,7 @@ from torchrl.envs import check_env_specs
 
 from tests.envs import published
 from torchrl_sparse import keys
-from torchrl_sparse.envs.pusht import KEYPOINTS, PushTEnv, block_keypoints, published_start
+from torchrl_sparse.envs.pusht import KEYPOINTS, PushTEnv, published_start
 
 AWAY = torch.tensor([256.0, 40.0])
 
@@ -20,8 +20,8 @@ def test_another_start_per_seed_and_the_same_as_published():
     assert np.array_equal(published_start(5), published_start(5))
     starts = np.stack([published_start(seed) for seed in range(50)])
     assert len(np.unique(starts[:, 0])) > 40
-    assert (starts[:, :2] >= 50).all() and (starts[:, :2] < 450).all()
-    assert (starts[:, 2:4] >= 100).all() and (starts[:, 2:4] < 400).all()
+    assert ((starts[:, :2] >= 50) & (starts[:, :2] < 450)).all()
+    assert ((starts[:, 2:4] >= 100) & (starts[:, 2:4] < 400)).all()
 
 
 class TestWithSimulator:
@@ -77,7 +77,8 @@ class TestWithSimulator:
         env.sim_env.block.angle = np.pi / 4
         env.sim_env.block.position = (256, 256)
         td = env.step(td.set(keys.ACTION, AWAY))["next"]
-        assert td["success"] and td["terminated"] and td["done"] and not td["truncated"]
+        assert all(td[key].item() for key in ("success", "terminated", "done"))
+        assert not td["truncated"]
         torch.testing.assert_close(td["reward"], torch.ones(1))
 
     def test_reward_is_the_share_of_the_goal_that_is_covered(self):

@@ -17,10 +17,10 @@ def import_extra(module: str, extra: str) -> ModuleType:
     Raises:
         ImportError: without it, with the command that installs it.
 
-    >>> import_extra("no_such_simulator", "pusht")
+    >>> import_extra("nothing", "pusht")
     Traceback (most recent call last):
     ...
-    ImportError: no_such_simulator needs the extra pusht, pip install 'torchrl-sparse[pusht]': No module named 'no_such_simulator'
+    ImportError: nothing needs the extra pusht, pip install 'torchrl-sparse[pusht]': No module named 'nothing'
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     stand_in_for_missing_cv2()

@@ -34,20 +34,21 @@ KEYPOINTS = np.array(
         [23.54146122, -1.70028811],
     ]
 )
-"""The block's keypoints in its own frame, pixels, f64 [9, 2]: its bar spans -60 to 60 by 0 to 30, its stem -15 to 15 by 30 to 120.
+"""The block's keypoints in its own frame, f64 [9, 2]. The bar spans -60 to 60 by 0 to 30, the stem -15 to 15 by 30 to 120.
 
 The published code samples them when it starts: of the pixels of a drawn T one by ``numpy.random.default_rng(0)``, then eight
-times the pixel furthest from those chosen, then a shift below one pixel by the same generator. These were derived that way, with
-pygame 2.6.1, whose edges of a drawn T may differ from those of the published version by a pixel.
+times the pixel furthest from those chosen, then a shift below one pixel by the same generator. These were derived that way,
+with pygame 2.6.1, whose edges of a drawn T may differ from those of the published version by a pixel.
 """
 
 
 class PushTEnv(SeededEnv):
-    """Push-T at 10 Hz: push the T onto its goal; success is a coverage above 0.95. Episodes begin and end as in every `SeededEnv`.
+    """Push-T at 10 Hz: push the T onto its goal. Episodes begin and end as in every `SeededEnv`.
 
     The state is the published one, f32 [20] in pixels: the nine `KEYPOINTS` of the block, x and y each, then the agent's x and
-    y. The action is the agent's target position, 2 pixels in 0 to 512. The reward is coverage / 0.95, at most 1; the
-    published score is its maximum over an episode. The episode of seed s starts where the published one does.
+    y. The action is the agent's target position, f32 [2], pixels in 0 to 512. Success is a coverage of the goal above 0.95.
+    The reward is coverage / 0.95, at most 1; the published score is its maximum over an episode. The episode of seed s starts
+    where the published one does.
 
     Args:
         horizon: steps until truncation; 300 by default, as published.
@@ -120,6 +121,6 @@ def published_start(seed: int) -> np.ndarray:
     >>> published_start(100000).round(1).tolist()
     [235.0, 124.0, 335.0, 128.0, -0.9]
     """
-    rng = np.random.RandomState(seed)  # noqa: NPY002  (the published stream of random numbers)
+    rng = np.random.RandomState(seed)  # the published stream of random numbers
     positions = [rng.randint(50, 450), rng.randint(50, 450), rng.randint(100, 400), rng.randint(100, 400)]
     return np.array([*positions, rng.randn() * 2 * np.pi - np.pi])
