@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+from contextlib import redirect_stderr
 from importlib import import_module
 from types import ModuleType
 
@@ -22,10 +24,12 @@ def import_extra(module: str, extra: str) -> ModuleType:
     ...
     ImportError: nothing needs the extra pusht, pip install 'torchrl-sparse[pusht]': No module named 'nothing'
     """
+    os.environ.setdefault("MUJOCO_GL", "egl")  # only used if something is rendered
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     stand_in_for_missing_cv2()
     try:
-        return import_module(module)
+        with redirect_stderr(io.StringIO()):  # simulators greet there
+            return import_module(module)
     except ImportError as error:
         raise ImportError(
             f"{module} needs the extra {extra}, pip install 'torchrl-sparse[{extra}]': {error}"
