@@ -34,6 +34,16 @@ class Benchmark:
         """What demonstrations call the state."""
         return ("state",)
 
+    @property
+    def proprioception_keys(self) -> tuple[str, ...]:
+        """The state of image tasks, of which this is none: a ValueError says so."""
+        raise ValueError(f"cameras: expected none for {self.name}, whose policies see its state")
+
+    @property
+    def acts_in_poses(self) -> bool:
+        """Whether actions are absolute poses of arms."""
+        return False
+
     def make(self, **kwargs: Any) -> SeededEnv:
         """Its environment; see the class for ``kwargs`` and errors."""
         module = import_module(f"torchrl_sparse.envs.{self.alias}")
