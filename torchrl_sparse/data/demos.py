@@ -209,7 +209,10 @@ def _make_env(task: str) -> SeededEnv:
     return found.make() if isinstance(found, Benchmark) else RobosuiteEnv(found.name)
 
 
-_worker_env = cache(_make_env)  # of a worker process: making one takes longer than an episode
+@cache
+def _worker_env(task: str) -> SeededEnv:
+    """The environment of a worker process: making one takes longer than an episode."""
+    return _make_env(task)
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:

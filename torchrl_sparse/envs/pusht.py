@@ -19,6 +19,7 @@ from torchrl_sparse.envs.seeded import SeededEnv
 __all__ = ["KEYPOINTS", "PushTEnv", "block_keypoints", "published_start"]
 
 WINDOW = 512.0  # pixels, both sides of the world
+GOAL = np.array([256.0, 256.0, np.pi / 4])  # x, y in pixels and angle in rad, where the block should be
 HORIZON = 300
 
 KEYPOINTS = np.array(

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from torchrl_sparse.envs.experts.block_push import BlockPushExpert
+from torchrl_sparse.envs.experts.pusht import PushTExpert
 
 __all__ = ["BENCHMARK_EXPERTS", "BenchmarkExpert", "make_benchmark_expert"]
 
@@ -25,7 +26,7 @@ class BenchmarkExpert(Protocol):
         """The action, f64 [A], in a state [Ds]."""
 
 
-BENCHMARK_EXPERTS: Mapping[str, type[BenchmarkExpert]] = {"BlockPush": BlockPushExpert}
+BENCHMARK_EXPERTS: Mapping[str, type[BenchmarkExpert]] = {"BlockPush": BlockPushExpert, "PushT": PushTExpert}
 """The expert of each benchmark that has one, made from a random generator; Franka Kitchen has none."""
 
 
