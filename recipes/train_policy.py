@@ -34,7 +34,6 @@ from torchrl_sparse.policies.training_loop import train
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")
 def main(config: DictConfig) -> None:
-    as_published(config)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
@@ -54,7 +53,8 @@ def as_published(config: DictConfig) -> None:
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
-    """Reads the demonstrations and builds what is trained on them."""
+    """Reads the demonstrations and builds what is trained on them; ``config`` then holds what it had left open."""
+    as_published(config)
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
     demos = read_demos(
         config.demos,

@@ -38,7 +38,6 @@ def test_an_episode_follows_from_the_state_and_the_draw():
 
 
 def test_blocks_go_in_every_order_that_was_drawn():
-    pytest.importorskip("pybullet")
     orders = {tuple(make_benchmark_expert("BlockPush", np.random.default_rng(s))._order) for s in range(40)}
     assert orders == {((0, 0), (1, 1)), ((0, 1), (1, 0)), ((1, 1), (0, 0)), ((1, 0), (0, 1))}
 
