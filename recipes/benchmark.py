@@ -22,7 +22,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.fidelity import action_error, block_errors
@@ -53,13 +53,16 @@ from torchrl_sparse.evaluation.report import (
 from torchrl_sparse.evaluation.tracking import log_benchmark
 from torchrl_sparse.evaluation.video import Caption, write_video
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.published import published_shape
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 
 
 @hydra.main(version_base=None, config_path=".", config_name="benchmark")
 def main(config: DictConfig) -> None:
-    out, task = Path(config.out), get_task(config.task)
+    out, task = Path(config.out), find_task(config.task)
+    if config.n_action_steps is None:
+        config.n_action_steps = published_shape(task.name).n_action_steps
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)

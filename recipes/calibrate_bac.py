@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.methods import calibrate_policy, env_options
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -22,7 +22,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")
 def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy)
-    environment = partial(make_env, get_task(config.task).name, **env_options(policy))
+    environment = partial(make_env, find_task(config.task).name, **env_options(policy))
     seeds = range(config.seed, config.seed + config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))

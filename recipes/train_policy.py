@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -20,8 +21,9 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.published import published_shape
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.training import PolicyTrainer
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -39,15 +41,28 @@ def main(config: DictConfig) -> None:
     train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
 
 
+def as_published(config: DictConfig) -> None:
+    """Fills in what is left open with the published choices for the task."""
+    shape = asdict(published_shape(config.task))
+    for section in (config.network, config.train):
+        for name in section.keys() & shape.keys():
+            if section[name] is None:
+                section[name] = shape[name]
+    if config.state_normalization is None:
+        config.state_normalization = "global" if find_task(config.task).acts_in_poses else "range"
+
+
 def make_trainer(config: DictConfig) -> PolicyTrainer:
-    """Reads the demonstrations and builds what is trained on them."""
-    task, cameras = get_task(config.task), chosen_cameras(config.cameras)
+    """Reads the demonstrations and builds what is trained on them; ``config`` then holds what it had left open."""
+    as_published(config)
+    task, cameras = find_task(config.task), chosen_cameras(config.cameras)
     demos = read_demos(
         config.demos,
         task.proprioception_keys if cameras else task.state_keys,
         filter_key=config.filter_key,
         cameras=cameras,
         image_folder=Path(config.out) / "images",
+        poses=task.acts_in_poses,
     )
     if config.init is None:
         policy = untrained_policy(demos, cameras, config)
@@ -68,7 +83,8 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
 def untrained_policy(demos: Demonstrations, cameras: dict[str, str], config: DictConfig) -> DiffusionPolicy:
     """A network that fits the demonstrations."""
     state, action = demos.data[keys.STATE], demos.data[keys.ACTION]
-    normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization)
+    poses = find_task(config.task).acts_in_poses
+    normalizer = Normalizer.fit(state, action, state_mode=config.state_normalization, poses=poses)
     torch.manual_seed(config.seed)
     vision = make_vision(demos, cameras, config) if cameras else None
     features = 0 if vision is None else vision.feature_dim
@@ -98,7 +114,7 @@ def averaged_policy(
     """With a note of the cameras, for whoever makes an environment for it."""
     policy = trainer.ema_policy(schedule)
     if cameras := chosen_cameras(config.cameras):
-        policy.source = {"task": get_task(config.task).alias, "cameras": cameras}
+        policy.source = {"task": find_task(config.task).alias, "cameras": cameras}
     return policy
 
 
@@ -115,7 +131,7 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
     policy = averaged_policy(trainer, config, schedule)
     episodes = rollout_episodes(
         ChunkExecutor(policy, trainer.config.n_action_steps),
-        partial(make_env, get_task(config.task).name, **env_options(policy)),
+        partial(make_env, find_task(config.task).name, **env_options(policy)),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,

@@ -29,7 +29,7 @@ from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, i
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.blocks.static import Schedule
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
@@ -71,7 +71,8 @@ def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     }
     if path.exists():
         return read_reference(path, made_for)
-    demos = read_demos(config.demos, get_task(config.task).state_keys)
+    task = find_task(config.task)
+    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
     with progress("window", "dense answers") as show:
         reference = make_reference(policy, demos, **config.reference, on_progress=show)
     with atomic_path(path) as temporary:

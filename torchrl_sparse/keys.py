@@ -14,6 +14,7 @@ constant                          shape, dtype           meaning
 ``SUCCESS``                       bool [*B, 1]           the task's own predicate
 ``EPISODE_SEED``                  i64 [*B, 1]            the seed that fixed this episode's initial state
 ``EPISODE_STEP``                  i64 [*B, 1]            environment steps since the reset
+``EPISODE_COMPLETED``             i64 [*B, 1]            parts of the task done so far, where a benchmark counts them
 ``HISTORY_STATE``                 f32 [*B, To, Ds]       the last To states, oldest first
 ``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
@@ -59,6 +60,7 @@ SUCCESS = "success"
 
 EPISODE_SEED = ("episode", "seed")
 EPISODE_STEP = ("episode", "step")
+EPISODE_COMPLETED = ("episode", "completed")
 HISTORY_STATE = ("history", "state")
 IS_INIT = "is_init"
 

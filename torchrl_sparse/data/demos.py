@@ -22,15 +22,18 @@ import torch
 
 from torchrl_sparse import keys
 from torchrl_sparse.backends import check_backend
+from torchrl_sparse.data.benchmark_demos import benchmark_env_args, demonstrate_benchmark
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
+from torchrl_sparse.envs.benchmarks import Benchmark, find_task
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 from torchrl_sparse.envs.rotations import pose_to_absolute
+from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
-from torchrl_sparse.envs.tasks import Task, get_task
+from torchrl_sparse.envs.tasks import Task
 
 # Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
 _EXPERT_STREAM = 1
@@ -41,7 +44,7 @@ class Collection:
     """What to collect.
 
     Attributes:
-        task: robosuite's name of a task that has an expert.
+        task: name or alias of a task that has an expert.
         episodes: demonstrations to keep; with ``keep_failures``, episodes to attempt.
         quality: "proficient" or "mixed", see `torchrl_sparse.envs.experts.operators`.
         seed: the first episode's; the others follow in order.
@@ -72,7 +75,7 @@ class Summary:
 
 
 def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Episode:
-    """One scripted episode, to success or to the environment's horizon.
+    """One scripted episode of robosuite, to success or to the environment's horizon.
 
     Args:
         env: an environment of absolute actions.
@@ -125,7 +128,7 @@ def collect(
     path: str | Path,
     collection: Collection,
     *,
-    env: RobosuiteEnv | None = None,
+    env: SeededEnv | None = None,
     workers: int = 1,
     backend: str = "process",
     on_episode: Callable[[Summary], None] | None = None,
@@ -164,20 +167,21 @@ def collect(
                 on_episode(tally)
             if not collection.keep_failures:
                 _check_yield(tally)
-    made_in = env_args(get_task(collection.task))
+    task = find_task(collection.task)
+    made_in = benchmark_env_args(task) if isinstance(task, Benchmark) else env_args(task)
     merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
     shutil.rmtree(parts)
     return tally
 
 
 def _seeds_made(
-    parts: Path, collection: Collection, env: RobosuiteEnv | None, workers: int, backend: str
+    parts: Path, collection: Collection, env: SeededEnv | None, workers: int, backend: str
 ) -> Iterator[int]:
     """Makes one episode after the other, and yields its seed."""
     if workers == 1 and backend == "process":
-        own = cache(lambda: RobosuiteEnv(collection.task) if env is None else env)
-        return (_make_part(parts, collection.quality, own, seed) for seed in itertools.count(collection.seed))
-    make = partial(_make_part, parts, collection.quality, partial(_worker_env, collection.task))
+        own = cache(lambda: _make_env(collection.task) if env is None else env)
+        return (_make_part(parts, collection, own, seed) for seed in itertools.count(collection.seed))
+    make = partial(_make_part, parts, collection, partial(_worker_env, collection.task))
     return in_order(make, collection.seed, workers, backend=backend)
 
 
@@ -185,17 +189,30 @@ def _part(parts: Path, seed: int) -> Path:
     return parts / f"{seed:010d}.h5"
 
 
-def _make_part(parts: Path, quality: str, environment: Callable[[], RobosuiteEnv], seed: int) -> int:
+def _make_part(parts: Path, collection: Collection, environment: Callable[[], SeededEnv], seed: int) -> int:
     """Makes the episode of a seed, unless it is there; returns the seed."""
     if not _part(parts, seed).exists():
-        write_episode(_part(parts, seed), demonstrate(environment(), seed, quality))
+        write_episode(_part(parts, seed), _demonstrate(environment(), collection, seed))
     return seed
 
 
+def _demonstrate(env: SeededEnv, collection: Collection, seed: int) -> Episode:
+    task = find_task(collection.task)
+    if isinstance(task, Benchmark):
+        rng = np.random.default_rng([seed, _EXPERT_STREAM])
+        return demonstrate_benchmark(env, task, seed, rng, collection.quality)
+    return demonstrate(env, seed, collection.quality)
+
+
+def _make_env(task: str) -> SeededEnv:
+    found = find_task(task)
+    return found.make() if isinstance(found, Benchmark) else RobosuiteEnv(found.name)
+
+
 @cache
-def _worker_env(task: str) -> RobosuiteEnv:
+def _worker_env(task: str) -> SeededEnv:
     """The environment of a worker process: making one takes longer than an episode."""
-    return RobosuiteEnv(task)
+    return _make_env(task)
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:

@@ -34,11 +34,15 @@ from torchrl_sparse.files import atomic_path
 
 @dataclass(frozen=True)
 class Episode:
-    """One finished episode; the arrays are those of the table above, ``observations`` by key."""
+    """One finished episode; the arrays are those of the table above, ``observations`` by key.
+
+    Benchmarks outside robosuite have no ``model_file`` and no ``instruction``, their ``states`` are what they observe, and
+    their actions are those of the environment; the seed restores an episode's start.
+    """
 
     seed: int
     operator: str
-    instruction: str
+    instruction: str | None
     success: bool
     model_file: str
     states: np.ndarray

@@ -56,21 +56,28 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(
-        cls, state: Tensor, action: Tensor, *, state_mode: Literal["global", "range"] = "global"
+        cls,
+        state: Tensor,
+        action: Tensor,
+        *,
+        state_mode: Literal["global", "range"] = "global",
+        poses: bool = True,
     ) -> Normalizer:
         """Normaliser of a data set.
 
         Args:
             state: [N, Ds].
-            action: [N, 10 * arms], absolute poses.
+            action: [N, A].
             state_mode: ``"global"`` is the published choice, one scale for all dimensions; ``"range"`` maps
                 each dimension to [-1, 1], which short trainings need: in metres, objects move by a few
                 hundredths.
+            poses: actions are absolute poses, A = 10 * arms; False maps each of their dimensions to [-1, 1], as published
+                for the benchmarks outside robosuite.
 
         Raises:
             ValueError: if the shapes do not fit, a value is not finite or ``state_mode`` is unknown.
         """
-        _check_data(state, action)
+        _check_data(state, action, poses)
         if state_mode == "global":
             scale = state.abs().max().clamp(min=_MIN_RANGE).reciprocal().expand(state.shape[1])
             offset = torch.zeros_like(scale)
@@ -78,7 +85,7 @@ class Normalizer(nn.Module):
             scale, offset = _range_map(state)
         else:
             raise ValueError(f'state_mode must be "global" or "range", got {state_mode!r}')
-        return cls(scale.clone(), offset.clone(), *_pose_map(action))
+        return cls(scale.clone(), offset.clone(), *(_pose_map(action) if poses else _range_map(action)))
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """States [..., Ds] in environment units to the policy's."""
@@ -110,12 +117,12 @@ def _range_map(x: Tensor) -> tuple[Tensor, Tensor]:
     return scale, -(high + low) / 2 * scale
 
 
-def _check_data(state: Tensor, action: Tensor) -> None:
+def _check_data(state: Tensor, action: Tensor, poses: bool) -> None:
     if state.ndim != 2 or action.ndim != 2 or len(state) != len(action) or not len(state):
         raise ValueError(
             f"expected state [N, Ds] and action [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}"
         )
-    if action.shape[1] % ABSOLUTE_DIM:
+    if poses and action.shape[1] % ABSOLUTE_DIM:
         raise ValueError(
             f"action: expected {ABSOLUTE_DIM} numbers per arm, got a last axis of {action.shape[1]}"
         )

@@ -9,9 +9,10 @@ demonstration at a time is in memory.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -102,6 +103,7 @@ def read_demos(
     filter_key: str | None = None,
     cameras: Mapping[str, str] | None = None,
     image_folder: str | Path | None = None,
+    poses: bool = True,
 ) -> Demonstrations:
     """All demonstrations of a robomimic file, in the order of their numbers.
 
@@ -112,9 +114,10 @@ def read_demos(
         cameras: images to read: the name here -> the observation there, e.g. ``{"image": "agentview_image"}``.
         image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
             memory by default.
+        poses: actions are absolute poses of arms; False takes them as they are, as benchmarks outside robosuite want it.
 
     Returns:
-        f32 demonstrations; actions are converted from rotation vectors to 6-D rotations.
+        f32 demonstrations; poses are converted from rotation vectors to 6-D rotations.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -133,8 +136,9 @@ def read_demos(
         # Of files of other simulators only their maker knows whether actions are poses.
         with suppress(ValueError):
             control = read_control(path, file)
+        convert = partial(_absolute_poses, control=control) if poses else _as_they_are
         episodes = [
-            _read_episode(f"{path}, {name}", file["data"], name, state_keys, control) for name in names
+            _read_episode(f"{path}, {name}", file["data"], name, state_keys, convert) for name in names
         ]
         lengths = [len(action) for _, action in episodes]
         steps = dict(zip(names, lengths, strict=True))
@@ -151,21 +155,34 @@ def read_demos(
 
 
 def _read_episode(
-    where: str, data: h5py.Group, name: str, state_keys: Sequence[str], control: RecordedControl | None
+    where: str,
+    data: h5py.Group,
+    name: str,
+    state_keys: Sequence[str],
+    convert: Callable[[str, np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """State [T, Ds] and absolute action [T, 10 * arms] of one demonstration, f32."""
+    """State [T, Ds] and converted action [T, A] of one demonstration, f32."""
     with naming(where):
         demo = data[name]
         length = int(demo.attrs["num_samples"])
-    pose = read_array(where, demo, "actions", length)
+    action = convert(f"{where}, actions", read_array(where, demo, "actions", length))
+    state = [read_array(where, demo, f"obs/{key}", length) for key in state_keys]
+    return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32)
+
+
+def _absolute_poses(where: str, pose: np.ndarray, control: RecordedControl | None) -> np.ndarray:
+    """Absolute actions [T, 10 * arms] of recorded poses [T, 7 * arms]."""
     if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
-        raise ValueError(f"{where}, actions: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
+        raise ValueError(f"{where}: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
     if control is not None and control.are_deltas(pose):
         raise ValueError(
-            f"{where}, actions: expected absolute poses, got deltas; recipes/convert_robomimic.py converts them"
+            f"{where}: expected absolute poses, got deltas; recipes/convert_robomimic.py converts them"
         )
-    state = [read_array(where, demo, f"obs/{key}", length) for key in state_keys]
-    return np.concatenate(state, axis=1).astype(np.float32), pose_to_absolute(pose).astype(np.float32)
+    return pose_to_absolute(pose)
+
+
+def _as_they_are(where: str, action: np.ndarray) -> np.ndarray:
+    return action
 
 
 def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:

@@ -1,1 +1,1 @@
-"""robosuite tasks as TorchRL environments, and scripted experts for them."""
+"""robosuite tasks and other benchmarks of Diffusion Policy as TorchRL environments, and scripted experts for them."""

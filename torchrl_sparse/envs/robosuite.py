@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,12 +9,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
+from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
 from torchrl_sparse.envs.tasks import get_task
 
@@ -37,11 +36,10 @@ class InitialState:
     instruction: str | None = None
 
 
-class RobosuiteEnv(EnvBase):
+class RobosuiteEnv(SeededEnv):
     """One robosuite task with Panda arms at 20 Hz.
 
-    An episode is *terminated* on success and *truncated* at the horizon. Each reset is fixed by one integer, reported under
-    ``("episode", "seed")``: the next of ``seeds``, or one more than the last after `set_seed`.
+    Episodes begin and end as in every `SeededEnv`.
 
     Args:
         task: one of `torchrl_sparse.envs.tasks.TASKS`.
@@ -85,14 +83,12 @@ class RobosuiteEnv(EnvBase):
         reward_shaping: bool = False,
         device: torch.device | str = "cpu",
     ):
-        super().__init__(device=device, batch_size=[])
         if action_mode not in ("absolute", "delta"):
             raise ValueError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
-        if seeds is not None and not len(seeds):
-            raise ValueError("seeds: expected at least one seed, got none")
         self.task = get_task(task)
+        horizon = self.task.horizon if horizon is None else horizon
+        super().__init__(horizon=horizon, seeds=seeds, device=device)
         self.action_mode = action_mode
-        self.horizon = self.task.horizon if horizon is None else horizon
         self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
         self._image_size = image_size
@@ -101,78 +97,48 @@ class RobosuiteEnv(EnvBase):
         self._instruction = instruction
         if isinstance(instruction, str) and self.task.has_choice:
             self.task.check_instruction(instruction)
-        self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
-        self._next_seed = int(torch.randint(2**31, ()))
-        self._episode_seed = self._next_seed
         self._restored_xml: str | None = None
-        self._elapsed = 0
         self._renderers: dict[tuple[int, int], CameraRenderer] = {}
         self.sim_env = make_simulator(
             self.task, absolute=action_mode == "absolute", reward_shaping=reward_shaping
         )
-        self._make_specs()
+        self._describe()
 
     # -- specs ---------------------------------------------------------------------------------------------------------
 
-    def _make_specs(self) -> None:
+    def _describe(self) -> None:
         size = self._image_size
         slices = [self.task.state_slice(key) for key in self._state_keys]
-        observation = Composite(
-            state=Unbounded((sum(part.stop - part.start for part in slices),), device=self.device),
-            eef_vel=Unbounded((6 * self.task.arms,), device=self.device),
-        )
-        for _, name in self._cameras:
-            observation[name] = Bounded(0, 255, (3, size, size), dtype=torch.uint8, device=self.device)
-        self.observation_spec = Composite(
-            observation=observation,
-            success=self._flag_spec(),
-            episode=Composite(seed=self._count_spec(), step=self._count_spec()),
-        )
+        if self.action_mode == "absolute":
+            action = Unbounded((ABSOLUTE_DIM * self.task.arms,))
+        else:
+            action = Bounded(-1.0, 1.0, (POSE_DIM * self.task.arms,))
+        self._make_specs(sum(part.stop - part.start for part in slices), action)
+        observation = self.observation_spec
+        observation[keys.EEF_VEL] = Unbounded((6 * self.task.arms,), device=self.device)
+        for key in self._cameras:
+            observation[key] = Bounded(0, 255, (3, size, size), dtype=torch.uint8, device=self.device)
         if self._instruction:
             example = self.task.instructions[0]
-            self.observation_spec[keys.INSTRUCTION] = NonTensor((), example_data=example, device=self.device)
-        if self.action_mode == "absolute":
-            self.action_spec = Unbounded((ABSOLUTE_DIM * self.task.arms,), device=self.device)
-        else:
-            self.action_spec = Bounded(-1.0, 1.0, (POSE_DIM * self.task.arms,), device=self.device)
-        self.reward_spec = Unbounded((1,), device=self.device)
-        self.done_spec = Composite(
-            done=self._flag_spec(), terminated=self._flag_spec(), truncated=self._flag_spec()
-        )
-
-    def _flag_spec(self) -> Categorical:
-        return Categorical(2, (1,), dtype=torch.bool, device=self.device)
-
-    def _count_spec(self) -> Unbounded:
-        return Unbounded((1,), dtype=torch.int64, device=self.device)
+            observation[keys.INSTRUCTION] = NonTensor((), example_data=example, device=self.device)
+        self.observation_spec = observation
 
     # -- episodes ------------------------------------------------------------------------------------------------------
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self._next_seed = int(seed)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
     ) -> TensorDictBase:
         self._close_renderers()
         if initial_state is None:
-            self._start_from_seed(self._take_seed())
-        else:
-            self._start_from_state(initial_state)
+            return super()._reset(tensordict, **kwargs)
+        self._start_from_state(initial_state)
         self._elapsed = 0
         return self._observe()
 
-    def _take_seed(self) -> int:
-        if self._seeds is not None:
-            return next(self._seeds)
-        seed, self._next_seed = self._next_seed, self._next_seed + 1
-        return seed
-
-    def _start_from_seed(self, seed: int) -> None:
+    def _start(self, seed: int) -> None:
         # robosuite hands its generator to samplers when it builds them, so it is reseeded in place, never replaced.
         self.sim_env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-        self._episode_seed, self._restored_xml = seed, None
+        self._restored_xml = None
         self.sim_env.reset()
         self._ask_for(None)
 
@@ -214,28 +180,12 @@ class RobosuiteEnv(EnvBase):
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._check_action(tensordict.get(keys.ACTION))
+    def _advance(self, action: np.ndarray) -> float:
         command = absolute_to_pose(action) if self.action_mode == "absolute" else action
-        _, reward, _, _ = self.sim_env.step(command)
-        self._elapsed += 1
-        out = self._observe()
-        success = out[keys.SUCCESS]
-        truncated = (out[keys.EPISODE_STEP] >= self.horizon) & ~success
-        out["reward"] = torch.tensor([reward], dtype=torch.float32, device=self.device)
-        out["terminated"], out["truncated"], out["done"] = success.clone(), truncated, success | truncated
-        return out
+        return self.sim_env.step(command)[1]
 
-    def _check_action(self, action: torch.Tensor) -> np.ndarray:
-        expected = self.action_spec.shape
-        if action.shape != expected:
-            raise ValueError(
-                f"action: expected {self.action_mode} shape {tuple(expected)}, got {tuple(action.shape)}"
-            )
-        action = action.detach().cpu().numpy().astype(np.float64)
-        if not np.isfinite(action).all():
-            raise ValueError(f"action: expected finite numbers, got {action.tolist()}")
-        return action
+    def _is_solved(self) -> bool:
+        return bool(self.sim_env._check_success())
 
     # -- observations --------------------------------------------------------------------------------------------------
 
@@ -248,20 +198,18 @@ class RobosuiteEnv(EnvBase):
         parts = {name: np.asarray(observed[name]) for name in self.task.state_keys}
         return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
 
-    def _observe(self) -> TensorDict:
-        out = TensorDict(device=self.device)
+    def _observe_state(self) -> np.ndarray:
         parts = self.raw_observation()
-        state = np.concatenate([parts[key] for key in self._state_keys])
-        out[keys.STATE] = torch.as_tensor(state, dtype=torch.float32)
+        return np.concatenate([parts[key] for key in self._state_keys])
+
+    def _observe(self) -> TensorDict:
+        out = super()._observe()
         out[keys.EEF_VEL] = torch.as_tensor(self._eef_velocity(), dtype=torch.float32)
         for key, camera in self._cameras.items():
             image = self.render(camera, self._image_size, self._image_size)
             out[key] = torch.from_numpy(image).permute(2, 0, 1).contiguous()
         if self._instruction:
             out[keys.INSTRUCTION] = self.instruction
-        out[keys.SUCCESS] = torch.tensor([bool(self.sim_env._check_success())])
-        out[keys.EPISODE_SEED] = torch.tensor([self._episode_seed])
-        out[keys.EPISODE_STEP] = torch.tensor([self._elapsed])
         return out
 
     def _eef_velocity(self) -> np.ndarray:

@@ -20,7 +20,7 @@ def import_robosuite():
     os.environ.setdefault("MUJOCO_GL", "egl")  # read by mujoco at import; only used if something is rendered
     quiet = logging.getLogger("robosuite_logs")
     quiet.addFilter(_only_errors)
-    _stand_in_for_missing_cv2()
+    stand_in_for_missing_cv2()
     try:
         import robosuite
     except ImportError as error:
@@ -73,8 +73,8 @@ def _only_errors(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.ERROR
 
 
-def _stand_in_for_missing_cv2() -> None:
-    """robosuite imports cv2 for its on-screen viewer alone, and cv2 cannot be imported without libGL."""
+def stand_in_for_missing_cv2() -> None:
+    """Simulators import cv2 for what is drawn on a screen, and cv2 cannot be imported without libGL."""
     try:
         import cv2  # noqa: F401
     except ImportError:

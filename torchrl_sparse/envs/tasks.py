@@ -52,6 +52,11 @@ class Task:
         return tuple(f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
 
     @property
+    def acts_in_poses(self) -> bool:
+        """Whether actions are absolute poses of arms."""
+        return True
+
+    @property
     def state_dim(self) -> int:
         return self.object_dim + self.arms * sum(_PROPRIOCEPTION.values())
 

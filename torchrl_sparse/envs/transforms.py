@@ -1,4 +1,4 @@
-"""What stands between a robosuite environment and a policy: observation history, and velocity where no simulator gives it."""
+"""What stands between an environment and a policy: observation history, and velocity where no simulator gives it."""
 
 from __future__ import annotations
 
@@ -13,22 +13,25 @@ from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv, Unsque
 from torchrl.envs.transforms import Transform
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.benchmarks import Benchmark, find_task
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import Task
 
 
 def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
-    """A robosuite task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
+    """A task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
 
     Args:
-        task: see `RobosuiteEnv`, as are ``kwargs``; cameras asked for there get a history too.
+        task: of robosuite, see `RobosuiteEnv`, or another benchmark, see `torchrl_sparse.envs.benchmarks`.
         n_obs_steps: entries of a history; the first of an episode is repeated at its start.
+        kwargs: of the environment's class; cameras asked for there get a history too.
 
     Examples:
         >>> make_env("Lift").reset()["history", "state"].shape
         torch.Size([2, 19])
     """
-    env = RobosuiteEnv(task, **kwargs)
+    found = find_task(task)
+    env = found.make(**kwargs) if isinstance(found, Benchmark) else RobosuiteEnv(task, **kwargs)
     cameras = [key for key in (keys.IMAGE, keys.WRIST_IMAGE) if key in env.observation_spec.keys(True)]
     histories = [*state_history(n_obs_steps), *image_history(n_obs_steps, cameras)]
     return TransformedEnv(env, Compose(InitTracker(), *histories))

@@ -19,25 +19,14 @@ from torchrl_sparse.blocks.calibration import calibrate
 from torchrl_sparse.blocks.engine import NativeEngine, ReferenceEngine, TorchEngine
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.native import native_supports
+from torchrl_sparse.policies.diffusion.published import published_network
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["QUICK", "SHAPES", "EngineCase", "Query", "Variant", "make_network"]
 
-# The published networks (arXiv:2303.04137, Table VII); the robomimic image tasks differ from low_dim in their condition.
-_ROBOMIMIC = {"input_dim": 10, "output_dim": 10, "horizon": 10, "n_obs_steps": 2, "n_emb": 256}
-SHAPES = {
-    "low_dim": _ROBOMIMIC | {"cond_dim": 19},
-    "image": _ROBOMIMIC | {"cond_dim": 137},
-    "kitchen": {
-        "input_dim": 9,
-        "output_dim": 9,
-        "horizon": 16,
-        "n_obs_steps": 4,
-        "cond_dim": 60,
-        "n_emb": 768,
-    },
-}
+# The published networks by task, and what differs; the robomimic image tasks differ from low_dim in their condition.
+SHAPES = {"low_dim": ("lift", {}), "image": ("lift", {"cond_dim": 137}), "kitchen": ("kitchen", {})}
 QUICK = {"n_layer": 2, "n_emb": 32}
 
 _PRUNE_RATE = 0.91
@@ -57,8 +46,8 @@ def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
     if shape not in SHAPES:
         raise ValueError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")
     torch.manual_seed(0)
-    sizes = SHAPES[shape] | (QUICK if quick else {})
-    return TransformerForDiffusion(**sizes).eval().requires_grad_(False)
+    task, changes = SHAPES[shape]
+    return published_network(task, **changes, **(QUICK if quick else {})).eval().requires_grad_(False)
 
 
 @dataclass(frozen=True)

@@ -50,3 +50,20 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     )
     again = DiffusionPolicy.from_pretrained(tuned / "policy").state_dict()
     assert all(torch.equal(again[name], value) for name, value in policy.state_dict().items())
+
+
+def test_what_is_left_open_is_as_published_for_the_task(tmp_path):
+    random, path = np.random.default_rng(0), tmp_path / "demos.h5"
+    with h5py.File(path, "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo.attrs["num_samples"] = 30
+        demo["actions"], demo["obs/state"] = random.uniform(-3, 1, (30, 2)), random.uniform(0, 9, (30, 16))
+    small = ["network.n_layer=1", "network.n_emb=16", "network.n_head=2", "batch_size=4", "max_steps=1"]
+    options = ["task=block_push", f"demos={path}", "train.val_ratio=0", *small]
+    train_unbroken("train_policy", tmp_path / "run", options)
+    policy = DiffusionPolicy.from_pretrained(tmp_path / "run/policy")
+    network = policy.network
+    assert (network.horizon, network.n_obs_steps, network.cond_dim, network.output_dim) == (5, 3, 16, 2)
+    assert network.n_emb == 16
+    ends = policy.normalizer.normalize_action(torch.tensor([[-3.0, -3.0], [1.0, 1.0]]))
+    torch.testing.assert_close(ends, torch.tensor([[-1.0, -1.0], [1.0, 1.0]]), atol=0.2, rtol=0)

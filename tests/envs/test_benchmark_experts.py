@@ -1,0 +1,64 @@
+"""The scripted experts of Push-T and block pushing in their simulators."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.benchmarks import BENCHMARKS
+from torchrl_sparse.envs.experts.benchmarks import make_benchmark_expert
+
+
+def run(task, seeds):
+    """Successes and steps of clean episodes."""
+    env, results = BENCHMARKS[task].make(seeds=seeds), []
+    for seed in seeds:
+        expert, td = make_benchmark_expert(task, np.random.default_rng(seed)), env.reset()
+        while not td["done"]:
+            action = expert.command(td[keys.STATE].double().numpy())
+            td = env.step(td.set(keys.ACTION, torch.as_tensor(action, dtype=torch.float32)))["next"]
+        results.append((bool(td["success"]), int(td[keys.EPISODE_STEP])))
+    env.close()
+    return results
+
+
+@pytest.mark.parametrize(
+    ("task", "package", "steps"), [("PushT", "gym_pusht", 200), ("BlockPush", "pybullet", 160)]
+)
+def test_experts_solve_unseen_episodes_in_good_time(task, package, steps):
+    pytest.importorskip(package)
+    results = run(task, [100000, 100001, 100002])
+    assert all(success for success, _ in results)
+    assert np.mean([length for _, length in results]) < steps
+
+
+def test_an_episode_follows_from_the_state_and_the_draw():
+    pytest.importorskip("gym_pusht")
+    assert run("PushT", [8]) == run("PushT", [8])
+
+
+def test_blocks_go_in_every_order_that_was_drawn():
+    orders = {tuple(make_benchmark_expert("BlockPush", np.random.default_rng(s))._order) for s in range(40)}
+    assert orders == {((0, 0), (1, 1)), ((0, 1), (1, 0)), ((1, 1), (0, 0)), ((1, 0), (0, 1))}
+
+
+def test_a_push_begins_behind_the_block_and_walks_round_it():
+    expert = make_benchmark_expert("BlockPush", np.random.default_rng(1))
+    (block, square), _ = expert._order
+    state = np.zeros(16)
+    state[[0, 1, 3, 4]] = [0.4, -0.2, 0.2, -0.4]
+    state[[10, 11, 13, 14]] = [0.4, 0.2, 0.2, 0.2]
+    start = state[3 * block : 3 * block + 2]
+    goal = state[10 + 3 * square : 12 + 3 * square]
+    ahead = (goal - start) / np.linalg.norm(goal - start)
+    state[8:10] = start - 0.03 * ahead  # in place: push
+    assert expert.command(state) @ ahead == pytest.approx(np.linalg.norm(expert.command(state)))
+    state[8:10] = start + 0.06 * ahead  # on the wrong side: round it, not through it
+    assert abs(expert.command(state) @ ahead) < 0.5 * np.linalg.norm(expert.command(state))
+
+
+def test_tasks_without_an_expert_are_named():
+    with pytest.raises(
+        ValueError, match=r"expected one with an expert \(BlockPush, PushT\), got 'FrankaKitchen'"
+    ):
+        make_benchmark_expert("FrankaKitchen", np.random.default_rng(0))
