@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at
+from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward
 
 _UP = np.array([0.0, 0.0, 1.0])
 _FRAME_GRIP = np.array([0.04375, 0.0, 0.0525])  # m, the grip's centre in the frame's axes
@@ -54,7 +54,7 @@ class ToolHangExpert(Expert):
     def _assemble(self, hand, frame, hole):
         grip = frame.point(_FRAME_GRIP)
         aligned = frame.rotation @ _frame_grasp()
-        if self._between(hand, frame) and hand.opening < _FRAME_WIDTH + 0.004:
+        if self._between(hand, frame) and abs(hand.opening - _FRAME_WIDTH) < 0.004:
             self.phase = "carry frame"
             return self._insert(hand, frame, hole)
         if at(hand, grip, aligned, position=0.01):
@@ -72,43 +72,55 @@ class ToolHangExpert(Expert):
         upright = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         turn = Rotation.from_matrix(upright @ frame.rotation.T)
         angle = turn.magnitude()
-        error = max(np.linalg.norm((tip - hole)[:2] + s * hand.velocity[:2]) for s in (0.0, 0.1)) 
-        inside = tip[2] < hole[2] - 0.005 and np.linalg.norm((tip - hole)[:2]) < 0.006
-        free = 1.0 if inside else np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)
-        over = 1.0 if inside else np.clip((tip[2] - hole[2]) / 0.02, 0.0, 1.0)
-        misfit = error + 0.03 * angle
-        slack = max(0.0, misfit - (0.012 if inside else 0.003))
-        goal = hole + _UP * np.clip(-0.155 + 80 * slack, -0.155, 0.02)
-        goal[:2] = tip[:2] + over * (goal - tip)[:2]
+        off = tip - hole
+        inside = off[2] < -0.005 and np.abs(off[:2]).max() < 0.0055
+        up = frame.rotation[:, 2]
+        goal = hole.copy()
+        if inside:
+            rim = np.abs(off[:2] - up[:2] * off[2] / up[2]).max()  # of the rod's axis, where the hole begins
+            fit = 0.001 if off[2] > -0.05 else 0.002
+            goal[2] = tip[2] - np.clip(0.015 - 30 * max(0.0, rim - fit), -0.01, 0.015)
+            free, pace = 1.0, 0.4
+        else:
+            rim = 0
+            error = max(np.linalg.norm(off[:2] + s * hand.velocity[:2]) for s in (0.0, 0.1)) 
+            misfit = error + 0.03 * angle
+            slack = max(0.0, misfit - 0.003)
+            goal[2] += np.clip(-0.015 + 10 * slack, -0.015, 0.02)
+            over = np.clip(off[2] / 0.02, 0.0, 1.0)
+            free = np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)
+            pace = 0.4 if misfit < 0.08 else 0.8
         part = Rotation.from_rotvec(free * turn.as_rotvec())
         position = goal + turn.apply(hand.position - tip)
-        position[:2] = hand.position[:2] + over * (position - hand.position)[:2]
-        self.phase += f" ang {angle:.2f} err {error:.4f} tip {tip-hole} in {inside} tilt {hand.tilt:.2f} yaw {hand.yaw:.2f}"
-        pace = 0.2 if inside else 0.4 if misfit < 0.08 else 0.8
+        if not inside:
+            position[:2] = hand.position[:2] + over * (position - hand.position)[:2]
+        self.phase += f" ang {angle:.2f} rim {rim:.4f} tip {tip-hole} in {inside} tilt {hand.tilt:.2f} yaw {hand.yaw:.2f}"
         return Waypoint(position, part.as_matrix() @ hand.rotation, CLOSED, pace)
 
     # -- the tool
 
     def _hang(self, hand, frame, tool):
-        grip = frame.point(_FRAME_GRIP)
-        if np.linalg.norm(hand.position - grip) < 0.1:
-            self.phase = "leave frame"
-            back = -hand.rotation[:, 2]
-            return Waypoint(hand.position + (0.15 if hand.opening > 0.035 else 0) * back, hand.rotation, OPEN)
         out = self._axes(frame)[0] @ (tool.point(_TOOL_HOLE) - frame.point(_FRAME_HOOK))
         if self._around(frame, tool) and out < -0.012:
             self.phase = "let go"
             back = -hand.rotation[:, 2] * (0.15 if hand.opening > 0.04 else 0)
             return Waypoint(hand.position + back, hand.rotation, OPEN, 0.5)
-        if np.linalg.norm(hand.position - tool.position) < 0.025 and hand.opening < _TOOL_WIDTH + 0.004:
+        if np.linalg.norm(hand.position - tool.position) < 0.025 and abs(hand.opening - _TOOL_WIDTH) < 0.004:
             self.phase = "carry tool"
             return self._thread(hand, frame, tool)
+        grip = frame.point(_FRAME_GRIP)
+        if np.linalg.norm(hand.position - grip) < 0.16:
+            self.phase = "leave frame"
+            back = -hand.rotation[:, 2]
+            return Waypoint(hand.position + (0.15 if hand.opening > 0.035 else 0) * back, hand.rotation, OPEN)
         aligned = tool.rotation @ _tool_grasp()
         if at(hand, tool.position, aligned, position=0.01):
             self.phase = "close tool"
             return Waypoint(tool.position, aligned, CLOSED)
         self.phase = "approach tool"
-        return Waypoint(self.above(hand, tool.position), aligned, OPEN, 0.7)
+        near = np.linalg.norm(hand.position - frame.point(_FRAME_HOOK)) < 0.2
+        left = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
+        return Waypoint(self.above(hand, tool.position, turn=left), downward(hand.yaw) if near else aligned, OPEN, 0.7)
 
     def _thread(self, hand, frame, tool):
         axes = self._axes(frame)
