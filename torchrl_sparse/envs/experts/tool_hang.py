@@ -10,169 +10,212 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward
 
-_UP = np.array([0.0, 0.0, 1.0])
-_FRAME_GRIP = np.array([0.04375, 0.0, 0.0525])  # m, the grip's centre in the frame's axes
-_FRAME_TIP = np.array([0.04375, 0.0, -0.13445])
-_FRAME_HOOK = np.array([-0.04375, 0.0, 0.08625])  # the corner of arm and upturned end, at half thickness
-_FRAME_WIDTH = 0.0254
-_TOOL_HOLE = np.array([-0.0936, 0.0, 0.0])
-_TOOL_WIDTH = 0.03
-_LEAN_TOOL = 0.0
-_LEAN = np.pi / 4  # rad to the vertical of the hand that grasps either
+# The frame's own axes: z along the rod from its tip to the corner, x from the arm's hook to the rod.
+FRAME_TIP = np.array([0.04375, 0.0, -0.13445])  # m
+FRAME_HOOK = np.array([-0.04375, 0.0, 0.08625])  # m, where arm and upturned end meet, at half thickness
+_FRAME_GRIP = np.array([0.04375, 0.0, 0.0525])  # m, centre of the grip on the rod
+_FRAME_SIZE = (0.0254, 0.032)  # m, the grip's width and half its length
+_ROD_END = (0.038, 0.055)  # m from the tip: where the thin tip ends and the square rod begins, with a margin
+# The tool's: x along the handle from the hole that is hung to the other one, z along the holes.
+TOOL_HOLE = np.array([-0.0936, 0.0, 0.0])  # m
+_TOOL_SIZE = (0.030, 0.04)  # m, the same of the tool's grip
+# The stand's.
+STAND_HOLE = np.array([0.0, 0.045, 0.08])  # m, centre of the hole's rim
+
+_STANDING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""The frame's rotation in the hole: of the four that fit, the one that turns the wrist least before the hang."""
+_LEAN = np.radians(55.0)  # of the hand across the lying frame; over the standing one, it leans the rest of 90 degrees
+_BOTTOM = 0.145  # m of the tip below the rim: the frame stands. It ends at 0.15
+_INSIDE = 0.0055  # m from the hole's axis, a tip below the rim is in the hole and not beside it
+_FIT = 0.0035  # m, misalignment at which the tip may go in; the play is 0.004
+_ROD_FIT = 0.0011  # m, the same for the rod; the play is 0.00125
+_FORESIGHT = 0.05  # s, how far ahead misalignment is looked at: a frame in motion is not lowered
+_RETREAT = 0.16  # m from the grip that an open hand withdraws, before it goes for the tool
+_NEAR_HOOK = 0.2  # m, where the hand stays above the hook
+_OVER_HOOK = 0.28  # m over the tool, the height of travel there
+_HOOK_TOP = 0.016  # m over the arm, the top of its upturned end
+_HUNG = 0.012  # m along the arm, where the tool is let go of
 
 
 @dataclass(frozen=True)
 class Pose:
+    """A body's f64 [3] position, m, and f64 [3, 3] rotation."""
+
     position: np.ndarray
     rotation: np.ndarray
 
-    def point(self, local):
+    def point(self, local: np.ndarray) -> np.ndarray:
+        """f64 [3] where a point of the body is in the world, m."""
         return self.position + self.rotation @ local
 
 
 class ToolHangExpert(Expert):
+    """Grasps the frame with a leaning hand and the tool from above, so that neither hangs with a wrist at its limit."""
+
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
-        frame = Pose(*self.body(self.sim_env.frame.root_body))
-        tool = Pose(*self.body(self.sim_env.tool.root_body))
-        hole = self._hole()
-        if not self._assembled(frame, hole):
-            self.phase = "frame"
-            return [self._assemble(hand, frame, hole)]
-        return [self._hang(hand, frame, tool)]
+        frame, tool, stand = (Pose(*self.body(part.root_body)) for part in self._parts)
+        off = frame.point(FRAME_TIP) - stand.point(STAND_HOLE)
+        if in_hole(off) and off[2] < -_BOTTOM:
+            return [self._hang(hand, frame, tool)]
+        if holds(hand, frame, _FRAME_GRIP, 2, _FRAME_SIZE):
+            return [self._insert(hand, frame, off)]
+        return [self._grasp(hand, frame.point(_FRAME_GRIP), frame.rotation @ _FRAME_GRASP)]
 
-    def _hole(self):
-        position, rotation = self.body(self.sim_env.stand.root_body)
-        return position + rotation @ np.array([0.0, 0.045, 0.08])
+    @property
+    def _parts(self):
+        return self.sim_env.frame, self.sim_env.tool, self.sim_env.stand
 
-    def _assembled(self, frame, hole):
-        tip = frame.point(_FRAME_TIP) - hole
-        return np.linalg.norm(tip[:2]) < 0.007 and tip[2] < -0.145
-
-    # -- the frame
-
-    def _assemble(self, hand, frame, hole):
-        grip = frame.point(_FRAME_GRIP)
-        aligned = frame.rotation @ _frame_grasp()
-        if self._between(hand, frame) and abs(hand.opening - _FRAME_WIDTH) < 0.004:
-            self.phase = "carry frame"
-            return self._insert(hand, frame, hole)
+    def _grasp(self, hand: Hand, grip: np.ndarray, aligned: np.ndarray) -> Waypoint:
         if at(hand, grip, aligned, position=0.01):
-            self.phase = "close frame"
             return Waypoint(grip, aligned, CLOSED)
-        self.phase = "approach frame"
-        return Waypoint(self.above(hand, grip), aligned, OPEN, 0.7)
+        return Waypoint(self.above(hand, grip), aligned, OPEN, pace=0.7)
 
-    def _between(self, hand, frame):
-        local = frame.rotation.T @ (hand.position - frame.point(_FRAME_GRIP))
-        return abs(local[2]) < 0.032 and np.linalg.norm(local[:2]) < 0.022
+    # -- the frame --------------------------------------------------------------------------------
 
-    def _insert(self, hand, frame, hole):
-        tip = frame.point(_FRAME_TIP)
-        upright = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        turn = Rotation.from_matrix(upright @ frame.rotation.T)
-        angle = turn.magnitude()
-        off = tip - hole
-        inside = off[2] < -0.005 and np.abs(off[:2]).max() < 0.0055
-        up = frame.rotation[:, 2]
-        goal = hole.copy()
-        if inside:
-            rim = np.abs(off[:2] - up[:2] * off[2] / up[2]).max()  # of the rod's axis, where the hole begins
-            fit = 0.001 if off[2] > -0.05 else 0.002
-            goal[2] = tip[2] - np.clip(0.015 - 30 * max(0.0, rim - fit), -0.01, 0.015)
-            free, pace = 1.0, 0.4
+    def _insert(self, hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
+        """Carries the frame over the hole or lowers it; ``off`` is the tip's f64 [3] offset from the rim's centre, m."""
+        turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
+        tip = frame.point(FRAME_TIP)
+        if in_hole(off):
+            goal = tip - np.array([off[0], off[1], _descent(off, frame.rotation[:, 2])])
+            return Waypoint(*_carried(hand, tip, goal, turn), CLOSED, pace=0.4)
+        ahead = [np.abs(off[:2] + time * hand.velocity[:2]).max() for time in (0.0, _FORESIGHT)]
+        misfit = max(ahead) + 0.03 * turn.magnitude()
+        height = np.clip(20.0 * (misfit - _FIT) - 0.015, -0.015, 0.02)
+        position, _ = _carried(hand, tip, tip + [0.0, 0.0, height] - off, turn)
+        travels = np.clip(off[2] / 0.02, 0.0, 1.0)
+        position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
+        lifted = np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)  # lower, the tip would turn into the table
+        turned = Rotation.from_rotvec(lifted * turn.as_rotvec()).as_matrix() @ hand.rotation
+        return Waypoint(position, turned, CLOSED, pace=0.4 if misfit < 0.08 else 0.8)
+
+    # -- the tool ---------------------------------------------------------------------------------
+
+    def _hang(self, hand: Hand, frame: Pose, tool: Pose) -> Waypoint:
+        hole = from_hook(frame, tool.point(TOOL_HOLE))
+        if around(hole) and hole[0] < -_HUNG:
+            return self._let_go(hand, backwards=hand.opening > _TOOL_SIZE[0] + 0.01)
+        if holds(hand, tool, np.zeros(3), 0, _TOOL_SIZE):
+            return self._thread(hand, frame, tool, hole)
+        if np.linalg.norm(hand.position - frame.point(_FRAME_GRIP)) < _RETREAT:
+            return self._let_go(hand, backwards=hand.opening > _FRAME_SIZE[0] + 0.01)
+        aligned = tool.rotation @ _TOOL_GRASP
+        if np.linalg.norm(hand.position - frame.point(FRAME_HOOK)) > _NEAR_HOOK:
+            return self._grasp(hand, tool.position, aligned)
+        return Waypoint(
+            self.above(hand, tool.position, clearance=_OVER_HOOK), downward(hand.yaw), OPEN, pace=0.7
+        )
+
+    @staticmethod
+    def _let_go(hand: Hand, backwards: bool) -> Waypoint:
+        back = -0.15 * hand.rotation[:, 2] if backwards else np.zeros(3)
+        return Waypoint(hand.position + back, hand.rotation, OPEN, pace=0.7)
+
+    @staticmethod
+    def _thread(hand: Hand, frame: Pose, tool: Pose, hole: np.ndarray) -> Waypoint:
+        """Brings the tool's hole, at ``hole`` m from the hook, over its upturned end, and round the corner."""
+        threaded = around(hole)
+        misfit = max(0.0, float(np.hypot(hole[0], hole[1])) - 0.003)
+        if threaded:
+            goal, pitch = along_hook(hole)
         else:
-            rim = 0
-            error = max(np.linalg.norm(off[:2] + s * hand.velocity[:2]) for s in (0.0, 0.1)) 
-            misfit = error + 0.03 * angle
-            slack = max(0.0, misfit - 0.003)
-            goal[2] += np.clip(-0.015 + 10 * slack, -0.015, 0.02)
-            over = np.clip(off[2] / 0.02, 0.0, 1.0)
-            free = np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)
-            pace = 0.4 if misfit < 0.08 else 0.8
-        part = Rotation.from_rotvec(free * turn.as_rotvec())
-        position = goal + turn.apply(hand.position - tip)
-        if not inside:
-            position[:2] = hand.position[:2] + over * (position - hand.position)[:2]
-        self.phase += f" ang {angle:.2f} rim {rim:.4f} tip {tip-hole} in {inside} tilt {hand.tilt:.2f} yaw {hand.yaw:.2f}"
-        return Waypoint(position, part.as_matrix() @ hand.rotation, CLOSED, pace)
-
-    # -- the tool
-
-    def _hang(self, hand, frame, tool):
-        out = self._axes(frame)[0] @ (tool.point(_TOOL_HOLE) - frame.point(_FRAME_HOOK))
-        if self._around(frame, tool) and out < -0.012:
-            self.phase = "let go"
-            back = -hand.rotation[:, 2] * (0.15 if hand.opening > 0.04 else 0)
-            return Waypoint(hand.position + back, hand.rotation, OPEN, 0.5)
-        if np.linalg.norm(hand.position - tool.position) < 0.025 and abs(hand.opening - _TOOL_WIDTH) < 0.004:
-            self.phase = "carry tool"
-            return self._thread(hand, frame, tool)
-        grip = frame.point(_FRAME_GRIP)
-        if np.linalg.norm(hand.position - grip) < 0.16:
-            self.phase = "leave frame"
-            back = -hand.rotation[:, 2]
-            return Waypoint(hand.position + (0.15 if hand.opening > 0.035 else 0) * back, hand.rotation, OPEN)
-        aligned = tool.rotation @ _tool_grasp()
-        if at(hand, tool.position, aligned, position=0.01):
-            self.phase = "close tool"
-            return Waypoint(tool.position, aligned, CLOSED)
-        self.phase = "approach tool"
-        near = np.linalg.norm(hand.position - frame.point(_FRAME_HOOK)) < 0.2
-        left = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
-        return Waypoint(self.above(hand, tool.position, turn=left), downward(hand.yaw) if near else aligned, OPEN, 0.7)
-
-    def _thread(self, hand, frame, tool):
-        axes = self._axes(frame)
-        out, side, up = axes @ (tool.point(_TOOL_HOLE) - frame.point(_FRAME_HOOK))
-        if self._around(frame, tool):
-            s = -out - max(up, 0.0) + 0.008
-            goal = np.array([-max(s, 0.0) , 0.0, max(-s, 0.0)])
-            if abs(s) < 0.003:
-                goal = np.array([-(0.003 + s) / 2, 0.0, (0.003 - s) / 2])
-            pitch, pace = np.interp(s, [-0.02, -0.004, 0.006, 0.02], np.radians([25, 40, 50, 65])), 0.3
-            position, turn = self._carried(hand, frame, tool, goal, pitch)
-        else:
-            slack = max(0.0, float(np.hypot(out, side)) - 0.003)
-            pitch, pace = np.radians(25), 0.7
-            goal = np.array([0.0, 0.0, min(0.01 + 10 * slack, 0.05)])
-            position, turn = self._carried(hand, frame, tool, goal, pitch)
-            over = np.clip((up - 0.015) / 0.01, 0.0, 1.0)
-            position[:2] = hand.position[:2] + over * (position - hand.position)[:2]
-            if slack < 0.02:
-                pace = 0.3
-        self.phase += f" out {out:.4f} side {side:.4f} up {up:.4f} ang {turn.magnitude():.3f} pitch {pitch:.2f} around {self._around(frame, tool)}"
-        return Waypoint(position, turn.as_matrix() @ hand.rotation, CLOSED, pace)
-
-    def _axes(self, frame):
-        return np.stack([-frame.rotation[:, 0], frame.rotation[:, 1], frame.rotation[:, 2]])  # outward, sideways, up
-
-    def _around(self, frame, tool):
-        out, side, up = self._axes(frame) @ (tool.point(_TOOL_HOLE) - frame.point(_FRAME_HOOK))
-        tip = -0.008 < up < 0.017 and abs(out) < 0.008
-        arm = out < 0 and abs(up) < 0.009
-        return abs(side) < 0.007 and (tip or arm)
-
-    def _carried(self, hand, frame, tool, goal, pitch):
-        axes = self._axes(frame)
-        z = axes.T @ np.array([np.sin(pitch), 0, np.cos(pitch)])
-        x = axes.T @ np.array([np.cos(pitch), 0, -np.sin(pitch)])
-        rotation = np.stack([x, np.cross(z, x), z], axis=1)
-        turn = Rotation.from_matrix(rotation @ tool.rotation.T)
-        position = frame.point(_FRAME_HOOK) + axes.T @ goal + turn.apply(hand.position - tool.point(_TOOL_HOLE))
-        return position, turn
+            goal, pitch = np.array([0.0, 0.0, min(0.01 + 10.0 * misfit, 0.05)]), along_hook(hole + [0, 0, 1])[1]
+        turn = Rotation.from_matrix(frame.rotation @ hanging(pitch) @ tool.rotation.T)
+        target = frame.point(FRAME_HOOK) + frame.rotation @ (_HOOK_AXES @ goal)
+        position, rotation = _carried(hand, tool.point(TOOL_HOLE), target, turn)
+        if not threaded:  # from below, it would push the frame over
+            travels = np.clip((hole[2] - _HOOK_TOP) / 0.01, 0.0, 1.0)
+            position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
+        return Waypoint(position, rotation, CLOSED, pace=0.3 if threaded or misfit < 0.02 else 0.7)
 
 
-def _frame_grasp():
-    """a = y cos - z sin."""
-    c, s = np.cos(_LEAN), np.sin(_LEAN)
-    z = np.array([0.0, c, -s])
-    y = np.array([0.0, -s, -c])
-    return np.stack([np.cross(y, z), y, z], axis=1)
+# -- geometry ---------------------------------------------------------------------------------------
+
+_HOOK_AXES = np.diag([-1.0, 1.0, 1.0])  # from (outward, sideways, up) to the frame's own axes
 
 
-def _tool_grasp():
-    c, s = np.cos(_LEAN_TOOL), np.sin(_LEAN_TOOL)
-    z = np.array([s, 0.0, -c])
-    y = np.array([-c, 0.0, -s])
-    return np.stack([np.cross(y, z), y, z], axis=1)
+def from_hook(frame: Pose, point: np.ndarray) -> np.ndarray:
+    """f64 [3] of a point of the world, m from the hook's corner: outward along the arm, sideways and along the rod."""
+    return _HOOK_AXES @ frame.rotation.T @ (point - frame.point(FRAME_HOOK))
+
+
+def in_hole(off: np.ndarray) -> bool:
+    """Is a tip, ``off`` f64 [3] m from the centre of the hole's rim, in the hole?"""
+    return bool(off[2] < -0.005 and np.abs(off[:2]).max() < _INSIDE)
+
+
+def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float, float]) -> bool:
+    """Are the fingers around a body's grip, and as far apart as it is wide?
+
+    Args:
+        hand: whose fingers.
+        body: the body's pose.
+        grip: f64 [3] its grip's centre, m, in its own axes.
+        axis: the grip's long axis.
+        size: the grip's width and half its length, m.
+    """
+    offset = body.rotation.T @ (hand.position - body.point(grip))
+    across = np.delete(offset, axis)
+    near = abs(offset[axis]) < size[1] and np.linalg.norm(across) < 0.022
+    return bool(near and abs(hand.opening - size[0]) < 0.005)
+
+
+def around(hole: np.ndarray) -> bool:
+    """Is the tool's hole, its centre ``hole`` f64 [3] m from the hook's corner, around the hook?"""
+    outward, sideways, up = hole
+    around_end = -0.008 < up < _HOOK_TOP + 0.001 and abs(outward) < 0.008
+    around_arm = outward < 0.0 and abs(up) < 0.009
+    return bool(abs(sideways) < 0.007 and (around_end or around_arm))
+
+
+def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
+    """Where the hole's centre should be next on its way down the hook's end and inward along its arm.
+
+    The hole is 19 mm wide and the hook 20 mm high, so the tool cannot be slid over it level: its axis turns from
+    near the upturned end's direction to near the arm's.
+
+    Args:
+        hole: f64 [3] its centre now, m from the hook's corner.
+
+    Returns:
+        f64 [3] the next one, and the tool's pitch, rad, see `hanging`.
+    """
+    done = -hole[0] - max(hole[2], 0.0) + 0.008  # m along the way, 0 at the corner; a little more than now
+    inward, up = max(done, 0.0), max(-done, 0.0)
+    if abs(done) < 0.003:  # cut the corner, the ring is thick
+        inward, up = (0.003 + done) / 2, (0.003 - done) / 2
+    pitch = np.interp(done, [-0.02, -0.004, 0.006, 0.02], np.radians([25.0, 40.0, 50.0, 65.0]))
+    return np.array([-inward, 0.0, up]), float(pitch)
+
+
+def hanging(pitch: float) -> np.ndarray:
+    """f64 [3, 3] rotation of the tool in the frame's axes: handle outward, ``pitch`` rad below the arm's direction."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    return _HOOK_AXES @ np.array([[c, 0.0, s], [0.0, -1.0, 0.0], [-s, 0.0, c]])
+
+
+def _leaning(forward: np.ndarray, down: np.ndarray, angle: float) -> np.ndarray:
+    """f64 [3, 3] of a hand that points along ``down``, leaning by ``angle`` rad to ``forward``."""
+    approach = np.cos(angle) * down + np.sin(angle) * forward
+    palm = np.cos(angle) * forward - np.sin(angle) * down
+    return np.stack([np.cross(palm, approach), palm, approach], axis=1)
+
+
+_X, _Y, _Z = np.eye(3)
+_FRAME_GRASP = _leaning(-_Z, _Y, _LEAN)  # the frame lies with y down
+_TOOL_GRASP = _leaning(-_X, -_Z, 0.0)
+
+
+def _descent(off: np.ndarray, up: np.ndarray) -> float:
+    """By how much, m, a frame with its tip in the hole may go down: not at all while its rod would land on the rim."""
+    misfit = np.abs(off[:2] - off[2] * up[:2] / up[2]).max()  # of the rod's axis, at the height of the rim
+    at_rod = _ROD_END[0] < -off[2] < _ROD_END[1]
+    return float(np.clip(0.015 - 30.0 * max(0.0, misfit - (_ROD_FIT if at_rod else 0.003)), -0.005, 0.015))
+
+
+def _carried(
+    hand: Hand, point: np.ndarray, goal: np.ndarray, turn: Rotation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and rotation of a hand that turns what it holds by ``turn`` and brings its ``point`` to ``goal``."""
+    return goal + turn.apply(hand.position - point), turn.as_matrix() @ hand.rotation
