@@ -24,7 +24,7 @@ STAND_HOLE = np.array([0.0, 0.045, 0.08])  # m, centre of the hole's rim
 
 _STANDING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """The frame's rotation in the hole: of the four that fit, the one that turns the wrist least before the hang."""
-_LEAN = np.radians(55.0)  # of the hand across the lying frame; over the standing one, it leans the rest of 90 degrees
+_LEAN = np.radians(55.0)  # of the hand that grasps the lying frame; over the standing one it leans by 35 degrees
 _BOTTOM = 0.145  # m of the tip below the rim: the frame stands. It ends at 0.15
 _INSIDE = 0.0055  # m from the hole's axis, a tip below the rim is in the hole and not beside it
 _FIT = 0.0035  # m, misalignment at which the tip may go in; the play is 0.004
@@ -34,6 +34,7 @@ _RETREAT = 0.16  # m from the grip that an open hand withdraws, before it goes f
 _NEAR_HOOK = 0.2  # m, where the hand stays above the hook
 _OVER_HOOK = 0.28  # m over the tool, the height of travel there
 _HOOK_TOP = 0.016  # m over the arm, the top of its upturned end
+_PITCHES = np.radians([25.0, 40.0, 50.0, 65.0])  # the tool's, from above the hook's end to its arm
 _HUNG = 0.012  # m along the arm, where the tool is let go of
 
 
@@ -69,7 +70,8 @@ class ToolHangExpert(Expert):
     def _grasp(self, hand: Hand, grip: np.ndarray, aligned: np.ndarray) -> Waypoint:
         if at(hand, grip, aligned, position=0.01):
             return Waypoint(grip, aligned, CLOSED)
-        return Waypoint(self.above(hand, grip), aligned, OPEN, pace=0.7)
+        left = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
+        return Waypoint(self.above(hand, grip, turn=left), aligned, OPEN, pace=0.7)
 
     # -- the frame --------------------------------------------------------------------------------
 
@@ -83,7 +85,8 @@ class ToolHangExpert(Expert):
         ahead = [np.abs(off[:2] + time * hand.velocity[:2]).max() for time in (0.0, _FORESIGHT)]
         misfit = max(ahead) + 0.03 * turn.magnitude()
         height = np.clip(20.0 * (misfit - _FIT) - 0.015, -0.015, 0.02)
-        position, _ = _carried(hand, tip, tip + [0.0, 0.0, height] - off, turn)
+        goal = tip - np.array([off[0], off[1], off[2] - height])
+        position, _ = _carried(hand, tip, goal, turn)
         travels = np.clip(off[2] / 0.02, 0.0, 1.0)
         position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
         lifted = np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)  # lower, the tip would turn into the table
@@ -98,14 +101,16 @@ class ToolHangExpert(Expert):
             return self._let_go(hand, backwards=hand.opening > _TOOL_SIZE[0] + 0.01)
         if holds(hand, tool, np.zeros(3), 0, _TOOL_SIZE):
             return self._thread(hand, frame, tool, hole)
-        if np.linalg.norm(hand.position - frame.point(_FRAME_GRIP)) < _RETREAT:
-            return self._let_go(hand, backwards=hand.opening > _FRAME_SIZE[0] + 0.01)
-        aligned = tool.rotation @ _TOOL_GRASP
-        if np.linalg.norm(hand.position - frame.point(FRAME_HOOK)) > _NEAR_HOOK:
-            return self._grasp(hand, tool.position, aligned)
-        return Waypoint(
-            self.above(hand, tool.position, clearance=_OVER_HOOK), downward(hand.yaw), OPEN, pace=0.7
+        grip, hook, handle = (
+            np.linalg.norm(hand.position - point)
+            for point in (frame.point(_FRAME_GRIP), frame.point(FRAME_HOOK), tool.position)
         )
+        if grip < min(_RETREAT, handle):
+            return self._let_go(hand, backwards=hand.opening > _FRAME_SIZE[0] + 0.01)
+        if hook < min(_NEAR_HOOK, handle):
+            goal = self.above(hand, tool.position, clearance=_OVER_HOOK)
+            return Waypoint(goal, downward(hand.yaw), OPEN, pace=0.7)
+        return self._grasp(hand, tool.position, tool.rotation @ _TOOL_GRASP)
 
     @staticmethod
     def _let_go(hand: Hand, backwards: bool) -> Waypoint:
@@ -116,18 +121,15 @@ class ToolHangExpert(Expert):
     def _thread(hand: Hand, frame: Pose, tool: Pose, hole: np.ndarray) -> Waypoint:
         """Brings the tool's hole, at ``hole`` m from the hook, over its upturned end, and round the corner."""
         threaded = around(hole)
-        misfit = max(0.0, float(np.hypot(hole[0], hole[1])) - 0.003)
-        if threaded:
-            goal, pitch = along_hook(hole)
-        else:
-            goal, pitch = np.array([0.0, 0.0, min(0.01 + 10.0 * misfit, 0.05)]), along_hook(hole + [0, 0, 1])[1]
+        goal, pitch = along_hook(hole) if threaded else over_hook(hole)
         turn = Rotation.from_matrix(frame.rotation @ hanging(pitch) @ tool.rotation.T)
         target = frame.point(FRAME_HOOK) + frame.rotation @ (_HOOK_AXES @ goal)
         position, rotation = _carried(hand, tool.point(TOOL_HOLE), target, turn)
         if not threaded:  # from below, it would push the frame over
             travels = np.clip((hole[2] - _HOOK_TOP) / 0.01, 0.0, 1.0)
             position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
-        return Waypoint(position, rotation, CLOSED, pace=0.3 if threaded or misfit < 0.02 else 0.7)
+        careful = threaded or np.hypot(hole[0], hole[1]) < 0.023
+        return Waypoint(position, rotation, CLOSED, pace=0.3 if careful else 0.7)
 
 
 # -- geometry ---------------------------------------------------------------------------------------
@@ -158,7 +160,7 @@ def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float
     offset = body.rotation.T @ (hand.position - body.point(grip))
     across = np.delete(offset, axis)
     near = abs(offset[axis]) < size[1] and np.linalg.norm(across) < 0.022
-    return bool(near and abs(hand.opening - size[0]) < 0.005)
+    return bool(near and -0.005 < hand.opening - size[0] < 0.007)  # what is held askew is wider
 
 
 def around(hole: np.ndarray) -> bool:
@@ -167,6 +169,12 @@ def around(hole: np.ndarray) -> bool:
     around_end = -0.008 < up < _HOOK_TOP + 0.001 and abs(outward) < 0.008
     around_arm = outward < 0.0 and abs(up) < 0.009
     return bool(abs(sideways) < 0.007 and (around_end or around_arm))
+
+
+def over_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
+    """Where the hole's centre should be next on its way to the hook's upturned end; see `along_hook`."""
+    misfit = max(0.0, float(np.hypot(hole[0], hole[1])) - 0.003)
+    return np.array([0.0, 0.0, min(0.01 + 10.0 * misfit, 0.05)]), float(_PITCHES[0])
 
 
 def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
@@ -183,10 +191,9 @@ def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
     """
     done = -hole[0] - max(hole[2], 0.0) + 0.008  # m along the way, 0 at the corner; a little more than now
     inward, up = max(done, 0.0), max(-done, 0.0)
-    if abs(done) < 0.003:  # cut the corner, the ring is thick
+    if abs(done) < 0.003:  # cut the corner: the ring is thick
         inward, up = (0.003 + done) / 2, (0.003 - done) / 2
-    pitch = np.interp(done, [-0.02, -0.004, 0.006, 0.02], np.radians([25.0, 40.0, 50.0, 65.0]))
-    return np.array([-inward, 0.0, up]), float(pitch)
+    return np.array([-inward, 0.0, up]), float(np.interp(done, [-0.02, -0.004, 0.006, 0.02], _PITCHES))
 
 
 def hanging(pitch: float) -> np.ndarray:
