@@ -23,8 +23,8 @@ _TOOL_SIZE = (0.030, 0.04)  # m, the same of the tool's grip
 STAND_HOLE = np.array([0.0, 0.045, 0.08])  # m, centre of the hole's rim
 
 _STANDING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""The frame's rotation in the hole: of the four that fit, the one that turns the wrist least before the hang."""
-_LEAN = np.radians(55.0)  # of the hand that grasps the lying frame; over the standing one it leans by 35 degrees
+"""The frame's rotation in the hole. Of the four that fit, its hook points to where the tool lies: little to turn."""
+_LEAN = np.radians(55.0)  # of the hand on the lying frame; it leans by 35 degrees on the standing one
 _BOTTOM = 0.145  # m of the tip below the rim: the frame stands. It ends at 0.15
 _INSIDE = 0.0055  # m from the hole's axis, a tip below the rim is in the hole and not beside it
 _FIT = 0.0035  # m, misalignment at which the tip may go in; the play is 0.004
@@ -51,7 +51,12 @@ class Pose:
 
 
 class ToolHangExpert(Expert):
-    """Grasps the frame with a leaning hand and the tool from above, so that neither hangs with a wrist at its limit."""
+    """Grasps the frame with a leaning hand, which stands it up by turning from one side of the vertical to the other.
+
+    The tool is grasped from above: with a hand that leans, the forearm would knock the frame over. Both things are
+    placed by their own pose in the hand, whatever that is, and the tool relative to the frame as it really stands:
+    it has play, up to 25 degrees about the vertical.
+    """
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -60,7 +65,7 @@ class ToolHangExpert(Expert):
         if in_hole(off) and off[2] < -_BOTTOM:
             return [self._hang(hand, frame, tool)]
         if holds(hand, frame, _FRAME_GRIP, 2, _FRAME_SIZE):
-            return [self._insert(hand, frame, off)]
+            return [self._insert(hand, frame, off) if in_hole(off) else self._stand_up(hand, frame, off)]
         return [self._grasp(hand, frame.point(_FRAME_GRIP), frame.rotation @ _FRAME_GRASP)]
 
     @property
@@ -75,20 +80,24 @@ class ToolHangExpert(Expert):
 
     # -- the frame --------------------------------------------------------------------------------
 
-    def _insert(self, hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
-        """Carries the frame over the hole or lowers it; ``off`` is the tip's f64 [3] offset from the rim's centre, m."""
-        turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
+    @staticmethod
+    def _insert(hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
+        """The next step down the hole; ``off`` is the tip's f64 [3] offset from the centre of the hole's rim, m."""
         tip = frame.point(FRAME_TIP)
-        if in_hole(off):
-            goal = tip - np.array([off[0], off[1], _descent(off, frame.rotation[:, 2])])
-            return Waypoint(*_carried(hand, tip, goal, turn), CLOSED, pace=0.4)
+        goal = tip - np.array([off[0], off[1], descent(off, frame.rotation[:, 2])])
+        turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
+        return Waypoint(*_carried(hand, tip, goal, turn), CLOSED, pace=0.4)
+
+    @staticmethod
+    def _stand_up(hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
+        """The next step of the frame to over the hole, and of its tip into it once they are aligned."""
+        tip = frame.point(FRAME_TIP)
+        turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
         ahead = [np.abs(off[:2] + time * hand.velocity[:2]).max() for time in (0.0, _FORESIGHT)]
         misfit = max(ahead) + 0.03 * turn.magnitude()
         height = np.clip(20.0 * (misfit - _FIT) - 0.015, -0.015, 0.02)
-        goal = tip - np.array([off[0], off[1], off[2] - height])
-        position, _ = _carried(hand, tip, goal, turn)
-        travels = np.clip(off[2] / 0.02, 0.0, 1.0)
-        position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
+        position, _ = _carried(hand, tip, tip - np.array([off[0], off[1], off[2] - height]), turn)
+        position = _sideways(hand, position, off[2] / 0.02)
         lifted = np.clip((tip[2] - 0.84) / 0.05, 0.0, 1.0)  # lower, the tip would turn into the table
         turned = Rotation.from_rotvec(lifted * turn.as_rotvec()).as_matrix() @ hand.rotation
         return Waypoint(position, turned, CLOSED, pace=0.4 if misfit < 0.08 else 0.8)
@@ -126,8 +135,7 @@ class ToolHangExpert(Expert):
         target = frame.point(FRAME_HOOK) + frame.rotation @ (_HOOK_AXES @ goal)
         position, rotation = _carried(hand, tool.point(TOOL_HOLE), target, turn)
         if not threaded:  # from below, it would push the frame over
-            travels = np.clip((hole[2] - _HOOK_TOP) / 0.01, 0.0, 1.0)
-            position[:2] = hand.position[:2] + travels * (position - hand.position)[:2]
+            position = _sideways(hand, position, (hole[2] - _HOOK_TOP) / 0.01)
         careful = threaded or np.hypot(hole[0], hole[1]) < 0.023
         return Waypoint(position, rotation, CLOSED, pace=0.3 if careful else 0.7)
 
@@ -145,6 +153,13 @@ def from_hook(frame: Pose, point: np.ndarray) -> np.ndarray:
 def in_hole(off: np.ndarray) -> bool:
     """Is a tip, ``off`` f64 [3] m from the centre of the hole's rim, in the hole?"""
     return bool(off[2] < -0.005 and np.abs(off[:2]).max() < _INSIDE)
+
+
+def descent(off: np.ndarray, up: np.ndarray) -> float:
+    """By how much, m, a frame with its tip in the hole may go down: not at all while its rod would land on the rim."""
+    misfit = np.abs(off[:2] - off[2] * up[:2] / up[2]).max()  # of the rod's axis, at the height of the rim
+    at_rod = _ROD_END[0] < -off[2] < _ROD_END[1]
+    return float(np.clip(0.015 - 30.0 * max(0.0, misfit - (_ROD_FIT if at_rod else 0.003)), -0.005, 0.015))
 
 
 def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float, float]) -> bool:
@@ -214,15 +229,15 @@ _FRAME_GRASP = _leaning(-_Z, _Y, _LEAN)  # the frame lies with y down
 _TOOL_GRASP = _leaning(-_X, -_Z, 0.0)
 
 
-def _descent(off: np.ndarray, up: np.ndarray) -> float:
-    """By how much, m, a frame with its tip in the hole may go down: not at all while its rod would land on the rim."""
-    misfit = np.abs(off[:2] - off[2] * up[:2] / up[2]).max()  # of the rod's axis, at the height of the rim
-    at_rod = _ROD_END[0] < -off[2] < _ROD_END[1]
-    return float(np.clip(0.015 - 30.0 * max(0.0, misfit - (_ROD_FIT if at_rod else 0.003)), -0.005, 0.015))
-
-
 def _carried(
     hand: Hand, point: np.ndarray, goal: np.ndarray, turn: Rotation
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position and rotation of a hand that turns what it holds by ``turn`` and brings its ``point`` to ``goal``."""
     return goal + turn.apply(hand.position - point), turn.as_matrix() @ hand.rotation
+
+
+def _sideways(hand: Hand, position: np.ndarray, share: float) -> np.ndarray:
+    """f64 [3] ``position`` with this share, 0 to 1, of the horizontal way there: what is held rises first."""
+    travelled = position.copy()
+    travelled[:2] = hand.position[:2] + np.clip(share, 0.0, 1.0) * (position - hand.position)[:2]
+    return travelled
