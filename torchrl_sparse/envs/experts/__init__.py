@@ -11,6 +11,7 @@ from torchrl_sparse.envs.experts.lift import LiftExpert, LiftMovingExpert
 from torchrl_sparse.envs.experts.nut_assembly_square import NutAssemblySquareExpert
 from torchrl_sparse.envs.experts.operators import OPERATORS, Operator, Style, draw_operator
 from torchrl_sparse.envs.experts.pick_place_can import PickPlaceCanExpert
+from torchrl_sparse.envs.experts.two_arm_transport import TwoArmTransportExpert
 
 EXPERTS: Mapping[str, type[Expert]] = {
     "Lift": LiftExpert,
@@ -18,6 +19,7 @@ EXPERTS: Mapping[str, type[Expert]] = {
     "LiftNamed": LiftExpert,
     "PickPlaceCan": PickPlaceCanExpert,
     "NutAssemblySquare": NutAssemblySquareExpert,
+    "TwoArmTransport": TwoArmTransportExpert,
 }
 """The expert of each robosuite task that has one."""
 

@@ -1,0 +1,214 @@
+"""TwoArmTransport: one arm uncovers the hammer and offers it in the middle, the other clears its bin and takes it.
+
+The first arm ("giver", robot 0) lifts the lid off the start bin, puts it beside, and holds the hammer out between
+the tables. The second ("taker", robot 1) carries the trash out of the target bin meanwhile, grasps the hammer by
+the other end of its handle, waits until it has been let go, and puts it into the target bin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward, nearest
+
+_FACING = (np.pi / 2, -np.pi / 2)  # rad, each hand's yaw at rest: its fingers move along the world's x axis
+_WALL_TOP = 0.951  # m, of all three bins
+_STEEP = 6.0  # slope of the way into a bin: between its walls there is room for the hand, but not for much more
+_ROOM = 0.14  # m from the middle of a bin to its walls
+
+_LID_WIDTH, _TRASH_WIDTH, _HANDLE_WIDTH = 0.02, 0.04, 0.03  # m between the fingers
+_LID_HANDLE = np.array([0.0, 0.0, 0.005])  # m, in the lid's frame
+_LID_PLACE = np.array([-0.22, -0.45, 0.828])  # m, its handle's on the free half of the table
+_LID_CLEAR = -0.12  # m, x of the lid from which it leaves the start bin open
+_LID_LOW = 0.845  # m, height of the lid's handle from which it may be let go
+
+_TRASH_LOW = 0.90  # m, the trash's height when let go
+_GIVER_GRASP, _TAKER_GRASP = -0.03, 0.075  # m along the handle, from its middle towards the taker
+_HANDLE_HALF = 0.1  # m
+_OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's middle where it changes hands
+_PLACED = 0.89  # m, the hammer's height in the target bin when let go
+_PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and the arm need not fold up
+_PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the hand is nearer to it
+_BRAKE = 0.25  # s, how much of a hand's sideways drift is taken back while it rises
+_BASE = 0.81  # m, y of the taker's base, and less that of the giver's
+_FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
+_FREE = 0.02  # m of play between fingers and what they let go, from which they may leave
+_FOLDED = 0.37  # m from the arm's base; nearer, the elbow is at its limit and the hand cannot rise
+_HOMES = np.array([[0.0, -0.35, 1.12], [0.0, 0.24, 1.15]])  # m, where a hand waits
+
+
+@dataclass(frozen=True)
+class Hammer:
+    """The hammer's handle.
+
+    Attributes:
+        middle: f64 [3] m.
+        along: f64 [3] unit vector of its axis; of the two, the one that points to the taker (+y).
+    """
+
+    middle: np.ndarray
+    along: np.ndarray
+
+    @property
+    def yaw(self) -> float:
+        """Of a hand whose fingers move across the handle, rad; modulo pi."""
+        return float(np.arctan2(self.along[1], self.along[0]))
+
+    def point(self, ahead: float) -> np.ndarray:
+        """f64 [3] point ``ahead`` m from the middle towards the taker."""
+        return self.middle + ahead * self.along
+
+    def distance(self, hand: Hand) -> float:
+        """From the hand to the nearest point of the handle's axis, m."""
+        ahead = np.clip((hand.position - self.middle) @ self.along, -_HANDLE_HALF, _HANDLE_HALF)
+        return float(np.linalg.norm(hand.position - self.point(ahead)))
+
+    def held_by(self, hand: Hand) -> bool:
+        return self.distance(hand) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.004
+
+
+class TwoArmTransportExpert(Expert):
+    """Both arms decide for themselves; they meet where the state tells that the other one is ready."""
+
+    def waypoints(self) -> Sequence[Waypoint]:
+        giver, taker, hammer = self.hand(0), self.hand(1), self._hammer()
+        return [self._give(giver, taker, hammer), self._take(giver, taker, hammer)]
+
+    def _hammer(self) -> Hammer:
+        middle, rotation = self.body(self.sim_env.transport.payload.root_body)
+        axis = rotation[:, 2]
+        return Hammer(middle, axis if axis[1] >= 0 else -axis)
+
+    # -- the giver --------------------------------------------------------------------------------
+
+    def _give(self, hand: Hand, taker: Hand, hammer: Hammer) -> Waypoint:
+        if hammer.held_by(taker):
+            return self._hand_over(hand, hammer)
+        handle = self._lid_handle()
+        if handle[0] > _LID_CLEAR or _near(hand, handle) and hand.opening < _LID_WIDTH + _FREE:
+            return self._clear_lid(hand, handle)
+        if hammer.held_by(hand):
+            return self._carry(hand, hammer.middle, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi))
+        if hammer.middle[1] > 0:
+            return self._wait(hand, 0)
+        return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.yaw)
+
+    def _lid_handle(self) -> np.ndarray:
+        position, rotation = self.body(self.sim_env.transport.lid.root_body)
+        return position + rotation @ _LID_HANDLE
+
+    def _clear_lid(self, hand: Hand, handle: np.ndarray) -> Waypoint:
+        if handle[0] < _LID_CLEAR and handle[2] < _LID_LOW:
+            return Waypoint(hand.position, hand.rotation, OPEN)
+        if not _holds(hand, handle, _LID_WIDTH):
+            return self._grasp(hand, handle, _FACING[0])
+        return self._carry(hand, handle, _LID_PLACE, _FACING[0] - hand.yaw, slack=0.04)
+
+    def _hand_over(self, hand: Hand, hammer: Hammer) -> Waypoint:
+        if hammer.distance(hand) > 0.08:
+            return self._wait(hand, 0)
+        up = np.array([0.0, 0.0, 0.0 if hand.opening < _HANDLE_WIDTH + _FREE else 0.1])
+        return Waypoint(hand.position + up, hand.rotation, OPEN)
+
+    # -- the taker --------------------------------------------------------------------------------
+
+    def _take(self, giver: Hand, hand: Hand, hammer: Hammer) -> Waypoint:
+        if hammer.held_by(hand):
+            return self._place(giver, hand, hammer)
+        trash, rotation = self.body(self.sim_env.transport.trash.root_body)
+        trash_bin = self.sim_env.transport.trash_bin_pos
+        cleared = _within(trash, trash_bin) and trash[2] < _TRASH_LOW
+        if cleared and _near(hand, trash) and hand.opening < _TRASH_WIDTH + _FREE:
+            return Waypoint(hand.position, hand.rotation, OPEN)
+        if _holds(hand, trash, _TRASH_WIDTH):
+            place = np.array([*trash_bin[:2], _TRASH_LOW - 0.015])
+            return self._carry(hand, trash, place, nearest(_FACING[1] - hand.yaw, 0.0, np.pi), slack=0.05)
+        if not cleared:
+            yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+            return self._grasp(hand, trash, yaw, period=np.pi / 2)
+        offered = hammer.held_by(giver) and np.linalg.norm(hammer.middle - _OFFER) < 0.05
+        dropped = hammer.middle[1] > 0.25 and not self._is_placed(hammer)
+        if offered or dropped:
+            return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.yaw)
+        return self._wait(hand, 1)
+
+    def _place(self, giver: Hand, hand: Hand, hammer: Hammer) -> Waypoint:
+        if hammer.distance(giver) < 0.05:
+            return Waypoint(hand.position, hand.rotation, CLOSED)
+        if self._is_placed(hammer):
+            return Waypoint(hand.position, hand.rotation, OPEN)
+        place = np.array([*self.sim_env.transport.target_bin_pos[:2], _PLACED - 0.015]) - _PLACED_BACK * hammer.along
+        turn = nearest(_PLACED_YAW - hammer.yaw, 0.0, np.pi)
+        return self._carry(hand, hammer.middle, place, turn, slack=0.025)
+
+    def _is_placed(self, hammer: Hammer) -> bool:
+        return _within(hammer.middle, self.sim_env.transport.target_bin_pos) and hammer.middle[2] < _PLACED
+
+    # -- skills of both ---------------------------------------------------------------------------
+
+    def _grasp(self, hand: Hand, goal: np.ndarray, yaw: float, period: float = np.pi) -> Waypoint:
+        aligned = downward(nearest(yaw, hand.yaw, period))
+        grasp = goal + self.style.offset * aligned[:, 1]
+        if at(hand, grasp, aligned, position=0.012):
+            return Waypoint(grasp, aligned, CLOSED)
+        turn = nearest(yaw - hand.yaw, 0.0, period)
+        return self._move(hand, hand.position, grasp, turn, OPEN, slack=0.018)
+
+    def _wait(self, hand: Hand, arm: int) -> Waypoint:
+        turn = nearest(_FACING[arm] - hand.yaw, 0.0, 2 * np.pi)
+        return self._move(hand, hand.position, _HOMES[arm], turn, OPEN)
+
+    def _carry(
+        self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float = 0.01
+    ) -> Waypoint:
+        return self._move(hand, held, place, turn, CLOSED, slack)
+
+    def _move(
+        self,
+        hand: Hand,
+        moved: np.ndarray,
+        goal: np.ndarray,
+        turn: float,
+        gripper: float,
+        slack: float = 0.01,
+    ) -> Waypoint:
+        """One step of the way over the walls, for the hand or what it holds: up, then sideways, then down."""
+        clearance = max(self.style.hover, _WALL_TOP + self.style.hover - goal[2])
+        start = replace(hand, position=moved)
+        point = self.above(start, goal, clearance=clearance, slope=_STEEP, slack=slack, turn=turn)
+        missing = min(point[2], _WALL_TOP + 0.06) - moved[2]
+        travels = float(np.clip(1.5 - missing / 0.04, 0.0, 1.0))
+        rising = self._middle(moved) - _BRAKE * hand.velocity[:2]
+        point[:2] = travels * point[:2] + (1.0 - travels) * rising
+        turned = travels * float(np.clip(turn, -1.0, 1.0))
+        grip = Rotation.from_euler("z", turned).apply(hand.position - moved)
+        left = point + grip - hand.position
+        return Waypoint(hand.position + _FIRM * left, downward(hand.yaw + turned), gripper)
+
+    def _middle(self, moved: np.ndarray) -> np.ndarray:
+        """f64 [2] m where to rise: the middle of the bin around, if any, or right here but not too near the arm's base."""
+        transport = self.sim_env.transport
+        for bin_ in (transport.start_bin, transport.target_bin, transport.trash_bin):
+            middle, _ = self.body(bin_.root_body)
+            if _within(moved, middle):
+                return middle[:2]
+        base = np.array([0.0, np.copysign(_BASE, moved[1])])
+        away = moved[:2] - base
+        return base + max(1.0, _FOLDED / np.linalg.norm(away)) * away
+
+
+def _near(hand: Hand, thing: np.ndarray) -> bool:
+    return bool(np.linalg.norm(hand.position - thing) < 0.025)
+
+
+def _holds(hand: Hand, thing: np.ndarray, width: float) -> bool:
+    return _near(hand, thing) and hand.opening < width + 0.004
+
+
+def _within(thing: np.ndarray, floor: np.ndarray) -> bool:
+    """Is a thing between the walls of the bin with this floor?"""
+    return bool((np.abs(thing[:2] - floor[:2]) < _ROOM - 0.01).all() and thing[2] < _WALL_TOP)
