@@ -35,6 +35,7 @@ _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and t
 _PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the hand is nearer to it
 _BRAKE = 0.25  # s, how much of a hand's sideways drift is taken back while it rises
 _BASE = 0.81  # m, y of the taker's base, and less that of the giver's
+_CAREFUL = 0.6  # pace of vertical motion: near its base, an arm that is sped up or down drifts sideways
 _FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
 _FREE = 0.02  # m of play between fingers and what they let go, from which they may leave
 _FOLDED = 0.37  # m from the arm's base; nearer, the elbow is at its limit and the hand cannot rise
@@ -92,7 +93,7 @@ class TwoArmTransportExpert(Expert):
         if handle[0] > _LID_CLEAR or _near(hand, handle) and hand.opening < _LID_WIDTH + _FREE:
             return self._clear_lid(hand, handle)
         if hammer.held_by(hand):
-            return self._carry(hand, hammer.middle, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi))
+            return self._carry(hand, hammer.middle, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi), slack=0.03)
         if hammer.middle[1] > 0:
             return self._wait(hand, 0)
         return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.yaw)
@@ -112,7 +113,7 @@ class TwoArmTransportExpert(Expert):
         if hammer.distance(hand) > 0.08:
             return self._wait(hand, 0)
         up = np.array([0.0, 0.0, 0.0 if hand.opening < _HANDLE_WIDTH + _FREE else 0.1])
-        return Waypoint(hand.position + up, hand.rotation, OPEN)
+        return Waypoint(hand.position + up, hand.rotation, OPEN, _CAREFUL)
 
     # -- the taker --------------------------------------------------------------------------------
 
@@ -187,7 +188,8 @@ class TwoArmTransportExpert(Expert):
         turned = travels * float(np.clip(turn, -1.0, 1.0))
         grip = Rotation.from_euler("z", turned).apply(hand.position - moved)
         left = point + grip - hand.position
-        return Waypoint(hand.position + _FIRM * left, downward(hand.yaw + turned), gripper)
+        pace = 1.0 if np.linalg.norm(left[:2]) > abs(left[2]) else _CAREFUL
+        return Waypoint(hand.position + _FIRM * left, downward(hand.yaw + turned), gripper, pace)
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
         """f64 [2] m where to rise: the middle of the bin around, if any, or right here but not too near the arm's base."""
