@@ -29,6 +29,8 @@ _LID_LOW = 0.845  # m, height of the lid's handle from which it may be let go
 _TRASH_LOW = 0.90  # m, the trash's height when let go
 _GIVER_GRASP, _TAKER_GRASP = -0.03, 0.075  # m along the handle, from its middle towards the taker
 _HANDLE_HALF = 0.1  # m
+_HEAD_SHIFT = 0.017  # m from the handle's middle towards the head: the centre of the whole hammer
+_LEAN = 0.6  # sine of how far a hand leans with the handle at most
 _OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's middle where it changes hands
 _PLACED = 0.89  # m, the hammer's height in the target bin when let go
 _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and the arm need not fold up
@@ -44,14 +46,16 @@ _HOMES = np.array([[0.0, -0.35, 1.12], [0.0, 0.24, 1.15]])  # m, where a hand wa
 
 @dataclass(frozen=True)
 class Hammer:
-    """The hammer's handle.
+    """How the hammer lies.
 
     Attributes:
-        middle: f64 [3] m.
+        middle: f64 [3] m, of its handle.
+        centre: f64 [3] m, of the whole hammer: half-way between the tip of its handle and its head.
         along: f64 [3] unit vector of its axis; of the two, the one that points to the taker (+y).
     """
 
     middle: np.ndarray
+    centre: np.ndarray
     along: np.ndarray
 
     @property
@@ -60,8 +64,14 @@ class Hammer:
         return float(np.arctan2(self.along[1], self.along[0]))
 
     def point(self, ahead: float) -> np.ndarray:
-        """f64 [3] point ``ahead`` m from the middle towards the taker."""
+        """f64 [3] point ``ahead`` m from the handle's middle towards the taker."""
         return self.middle + ahead * self.along
+
+    def across(self, hand: Hand) -> np.ndarray:
+        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way and leaning as the handle does."""
+        level = downward(nearest(self.yaw, hand.yaw, np.pi))
+        lean = np.arcsin(np.clip(self.along[2], -_LEAN, _LEAN)) * np.sign(level[:, 1] @ self.along)
+        return level @ Rotation.from_euler("x", lean).as_matrix().T
 
     def distance(self, hand: Hand) -> float:
         """From the hand to the nearest point of the handle's axis, m."""
@@ -69,7 +79,7 @@ class Hammer:
         return float(np.linalg.norm(hand.position - self.point(ahead)))
 
     def held_by(self, hand: Hand) -> bool:
-        return self.distance(hand) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.004
+        return self.distance(hand) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.007
 
 
 class TwoArmTransportExpert(Expert):
@@ -81,8 +91,8 @@ class TwoArmTransportExpert(Expert):
 
     def _hammer(self) -> Hammer:
         middle, rotation = self.body(self.sim_env.transport.payload.root_body)
-        axis = rotation[:, 2]
-        return Hammer(middle, axis if axis[1] >= 0 else -axis)
+        head = rotation[:, 2]
+        return Hammer(middle, middle + _HEAD_SHIFT * head, head if head[1] >= 0 else -head)
 
     # -- the giver --------------------------------------------------------------------------------
 
@@ -93,10 +103,10 @@ class TwoArmTransportExpert(Expert):
         if handle[0] > _LID_CLEAR or _near(hand, handle) and hand.opening < _LID_WIDTH + _FREE:
             return self._clear_lid(hand, handle)
         if hammer.held_by(hand):
-            return self._carry(hand, hammer.middle, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi), slack=0.03)
+            return self._carry(hand, hammer.centre, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi), slack=0.03)
         if hammer.middle[1] > 0:
             return self._wait(hand, 0)
-        return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.yaw)
+        return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.across(hand))
 
     def _lid_handle(self) -> np.ndarray:
         position, rotation = self.body(self.sim_env.transport.lid.root_body)
@@ -106,7 +116,7 @@ class TwoArmTransportExpert(Expert):
         if handle[0] < _LID_CLEAR and handle[2] < _LID_LOW:
             return Waypoint(hand.position, hand.rotation, OPEN)
         if not _holds(hand, handle, _LID_WIDTH):
-            return self._grasp(hand, handle, _FACING[0])
+            return self._grasp(hand, handle, downward(_FACING[0]))
         return self._carry(hand, handle, _LID_PLACE, _FACING[0] - hand.yaw, slack=0.04)
 
     def _hand_over(self, hand: Hand, hammer: Hammer) -> Waypoint:
@@ -130,11 +140,11 @@ class TwoArmTransportExpert(Expert):
             return self._carry(hand, trash, place, nearest(_FACING[1] - hand.yaw, 0.0, np.pi), slack=0.05)
         if not cleared:
             yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-            return self._grasp(hand, trash, yaw, period=np.pi / 2)
-        offered = hammer.held_by(giver) and np.linalg.norm(hammer.middle - _OFFER) < 0.05
+            return self._grasp(hand, trash, downward(nearest(yaw, hand.yaw, np.pi / 2)))
+        offered = hammer.held_by(giver) and np.linalg.norm(hammer.centre - _OFFER) < 0.05
         dropped = hammer.middle[1] > 0.25 and not self._is_placed(hammer)
         if offered or dropped:
-            return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.yaw)
+            return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.across(hand))
         return self._wait(hand, 1)
 
     def _place(self, giver: Hand, hand: Hand, hammer: Hammer) -> Waypoint:
@@ -144,40 +154,41 @@ class TwoArmTransportExpert(Expert):
             return Waypoint(hand.position, hand.rotation, OPEN)
         place = np.array([*self.sim_env.transport.target_bin_pos[:2], _PLACED - 0.015]) - _PLACED_BACK * hammer.along
         turn = nearest(_PLACED_YAW - hammer.yaw, 0.0, np.pi)
-        return self._carry(hand, hammer.middle, place, turn, slack=0.025)
+        return self._carry(hand, hammer.centre, place, turn, slack=0.025)
 
     def _is_placed(self, hammer: Hammer) -> bool:
         return _within(hammer.middle, self.sim_env.transport.target_bin_pos) and hammer.middle[2] < _PLACED
 
     # -- skills of both ---------------------------------------------------------------------------
 
-    def _grasp(self, hand: Hand, goal: np.ndarray, yaw: float, period: float = np.pi) -> Waypoint:
-        aligned = downward(nearest(yaw, hand.yaw, period))
+    def _grasp(self, hand: Hand, goal: np.ndarray, aligned: np.ndarray) -> Waypoint:
         grasp = goal + self.style.offset * aligned[:, 1]
         if at(hand, grasp, aligned, position=0.012):
             return Waypoint(grasp, aligned, CLOSED)
-        turn = nearest(yaw - hand.yaw, 0.0, period)
-        return self._move(hand, hand.position, grasp, turn, OPEN, slack=0.018)
+        return self._reach(hand, grasp, aligned, slack=0.018)
 
     def _wait(self, hand: Hand, arm: int) -> Waypoint:
-        turn = nearest(_FACING[arm] - hand.yaw, 0.0, 2 * np.pi)
-        return self._move(hand, hand.position, _HOMES[arm], turn, OPEN)
+        return self._reach(hand, _HOMES[arm], downward(_FACING[arm]))
+
+    def _reach(self, hand: Hand, goal: np.ndarray, aligned: np.ndarray, slack: float = 0.01) -> Waypoint:
+        """A step of the empty hand on its way over the walls."""
+        turn = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
+        point, travels = self._over(hand, hand.position, goal, turn, slack)
+        return Waypoint(point, aligned if travels == 1.0 else downward(hand.yaw), OPEN)
 
     def _carry(
-        self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float = 0.01
+        self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float
     ) -> Waypoint:
-        return self._move(hand, held, place, turn, CLOSED, slack)
+        """A step on the way over the walls with something held, which is turned about the vertical while it travels."""
+        point, travels = self._over(hand, held, place, turn, slack)
+        turned = travels * float(np.clip(turn, -1.0, 1.0))
+        grip = Rotation.from_euler("z", turned).apply(hand.position - held)
+        return Waypoint(point + grip, downward(hand.yaw + turned), CLOSED)
 
-    def _move(
-        self,
-        hand: Hand,
-        moved: np.ndarray,
-        goal: np.ndarray,
-        turn: float,
-        gripper: float,
-        slack: float = 0.01,
-    ) -> Waypoint:
-        """One step of the way over the walls, for the hand or what it holds: up, then sideways, then down."""
+    def _over(
+        self, hand: Hand, moved: np.ndarray, goal: np.ndarray, turn: float, slack: float
+    ) -> tuple[np.ndarray, float]:
+        """Where to move something next, f64 [3] m: up, then sideways over the walls, then down; and 1 if it may travel."""
         clearance = max(self.style.hover, _WALL_TOP + self.style.hover - goal[2])
         start = replace(hand, position=moved)
         point = self.above(start, goal, clearance=clearance, slope=_STEEP, slack=slack, turn=turn)
@@ -185,11 +196,9 @@ class TwoArmTransportExpert(Expert):
         travels = float(np.clip(1.5 - missing / 0.04, 0.0, 1.0))
         rising = self._middle(moved) - _BRAKE * hand.velocity[:2]
         point[:2] = travels * point[:2] + (1.0 - travels) * rising
-        turned = travels * float(np.clip(turn, -1.0, 1.0))
-        grip = Rotation.from_euler("z", turned).apply(hand.position - moved)
-        left = point + grip - hand.position
-        pace = 1.0 if np.linalg.norm(left[:2]) > abs(left[2]) else _CAREFUL
-        return Waypoint(hand.position + _FIRM * left, downward(hand.yaw + turned), gripper, pace)
+        step = _FIRM * (point - moved)
+        step[2] = np.clip(step[2], -_CAREFUL * self.style.reach, _CAREFUL * self.style.reach)
+        return moved + step, travels
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
         """f64 [2] m where to rise: the middle of the bin around, if any, or right here but not too near the arm's base."""
