@@ -17,7 +17,8 @@ from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoin
 
 _FACING = (np.pi / 2, -np.pi / 2)  # rad, each hand's yaw at rest: its fingers move along the world's x axis
 _WALL_TOP = 0.951  # m, of all three bins
-_STEEP = 6.0  # slope of the way into a bin: between its walls there is room for the hand, but not for much more
+_OVER_WALLS = 1.02  # m, height at which a hand, or what it holds, travels sideways at least
+_STEEP = 6.0  # slope of the way into a bin: between the walls there is room for the hand, not for much more
 _ROOM = 0.14  # m from the middle of a bin to its walls
 
 _LID_WIDTH, _TRASH_WIDTH, _HANDLE_WIDTH = 0.02, 0.04, 0.03  # m between the fingers
@@ -35,7 +36,8 @@ _OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's middle where it changes
 _PLACED = 0.89  # m, the hammer's height in the target bin when let go
 _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and the arm need not fold up
 _PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the hand is nearer to it
-_BRAKE = 0.25  # s, how much of a hand's sideways drift is taken back while it rises
+_BELOW = 0.015  # m below the height at which something is let go that is aimed at
+_BRAKE = 0.15  # s, how much of a hand's sideways drift is taken back while it rises
 _BASE = 0.81  # m, y of the taker's base, and less that of the giver's
 _CAREFUL = 0.6  # pace of vertical motion: near its base, an arm that is sped up or down drifts sideways
 _FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
@@ -100,10 +102,12 @@ class TwoArmTransportExpert(Expert):
         if hammer.held_by(taker):
             return self._hand_over(hand, hammer)
         handle = self._lid_handle()
-        if handle[0] > _LID_CLEAR or _near(hand, handle) and hand.opening < _LID_WIDTH + _FREE:
-            return self._clear_lid(hand, handle)
+        aside = handle[0] < _LID_CLEAR and handle[2] < _LID_LOW
+        if not aside or _around(hand, handle, _LID_WIDTH):
+            return self._clear_lid(hand, handle, aside)
         if hammer.held_by(hand):
-            return self._carry(hand, hammer.centre, _OFFER, nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi), slack=0.03)
+            turn = nearest(_FACING[0] - hammer.yaw, 0.0, np.pi)
+            return self._carry(hand, hammer.centre, _OFFER, turn, slack=0.03)
         if hammer.middle[1] > 0:
             return self._wait(hand, 0)
         return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.across(hand))
@@ -112,18 +116,19 @@ class TwoArmTransportExpert(Expert):
         position, rotation = self.body(self.sim_env.transport.lid.root_body)
         return position + rotation @ _LID_HANDLE
 
-    def _clear_lid(self, hand: Hand, handle: np.ndarray) -> Waypoint:
-        if handle[0] < _LID_CLEAR and handle[2] < _LID_LOW:
-            return Waypoint(hand.position, hand.rotation, OPEN)
-        if not _holds(hand, handle, _LID_WIDTH):
-            return self._grasp(hand, handle, downward(_FACING[0]))
-        return self._carry(hand, handle, _LID_PLACE, _FACING[0] - hand.yaw, slack=0.04)
+    def _clear_lid(self, hand: Hand, handle: np.ndarray, aside: bool) -> Waypoint:
+        if aside:
+            return _stay(hand, OPEN)
+        if _holds(hand, handle, _LID_WIDTH):
+            return self._carry(hand, handle, _LID_PLACE, _FACING[0] - hand.yaw, slack=0.04)
+        return self._grasp(hand, handle, downward(_FACING[0]))
 
     def _hand_over(self, hand: Hand, hammer: Hammer) -> Waypoint:
         if hammer.distance(hand) > 0.08:
             return self._wait(hand, 0)
-        up = np.array([0.0, 0.0, 0.0 if hand.opening < _HANDLE_WIDTH + _FREE else 0.1])
-        return Waypoint(hand.position + up, hand.rotation, OPEN, _CAREFUL)
+        if hand.opening < _HANDLE_WIDTH + _FREE:
+            return _stay(hand, OPEN)
+        return Waypoint(hand.position + np.array([0.0, 0.0, 0.1]), hand.rotation, OPEN, _CAREFUL)
 
     # -- the taker --------------------------------------------------------------------------------
 
@@ -131,30 +136,33 @@ class TwoArmTransportExpert(Expert):
         if hammer.held_by(hand):
             return self._place(giver, hand, hammer)
         trash, rotation = self.body(self.sim_env.transport.trash.root_body)
-        trash_bin = self.sim_env.transport.trash_bin_pos
-        cleared = _within(trash, trash_bin) and trash[2] < _TRASH_LOW
-        if cleared and _near(hand, trash) and hand.opening < _TRASH_WIDTH + _FREE:
-            return Waypoint(hand.position, hand.rotation, OPEN)
-        if _holds(hand, trash, _TRASH_WIDTH):
-            place = np.array([*trash_bin[:2], _TRASH_LOW - 0.015])
-            return self._carry(hand, trash, place, nearest(_FACING[1] - hand.yaw, 0.0, np.pi), slack=0.05)
-        if not cleared:
-            yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-            return self._grasp(hand, trash, downward(nearest(yaw, hand.yaw, np.pi / 2)))
+        cleared = _within(trash, self.sim_env.transport.trash_bin_pos) and trash[2] < _TRASH_LOW
+        if not cleared or _around(hand, trash, _TRASH_WIDTH):
+            return self._clear_trash(hand, trash, rotation, cleared)
         offered = hammer.held_by(giver) and np.linalg.norm(hammer.centre - _OFFER) < 0.05
         dropped = hammer.middle[1] > 0.25 and not self._is_placed(hammer)
         if offered or dropped:
             return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.across(hand))
         return self._wait(hand, 1)
 
+    def _clear_trash(self, hand: Hand, trash: np.ndarray, rotation: np.ndarray, cleared: bool) -> Waypoint:
+        if cleared:
+            return _stay(hand, OPEN)
+        if _holds(hand, trash, _TRASH_WIDTH):
+            place = np.array([*self.sim_env.transport.trash_bin_pos[:2], _TRASH_LOW - _BELOW])
+            return self._carry(hand, trash, place, _FACING[1] - hand.yaw, slack=0.05)
+        side = np.arctan2(rotation[1, 0], rotation[0, 0])
+        between_bins = abs(trash[0]) < 0.06  # where a hand has room with its fingers along them only
+        return self._grasp(hand, trash, downward(nearest(side, 0.0 if between_bins else hand.yaw, np.pi / 2)))
+
     def _place(self, giver: Hand, hand: Hand, hammer: Hammer) -> Waypoint:
         if hammer.distance(giver) < 0.05:
-            return Waypoint(hand.position, hand.rotation, CLOSED)
+            return _stay(hand, CLOSED)
         if self._is_placed(hammer):
-            return Waypoint(hand.position, hand.rotation, OPEN)
-        place = np.array([*self.sim_env.transport.target_bin_pos[:2], _PLACED - 0.015]) - _PLACED_BACK * hammer.along
+            return _stay(hand, OPEN)
+        middle = np.array([*self.sim_env.transport.target_bin_pos[:2], _PLACED - _BELOW])
         turn = nearest(_PLACED_YAW - hammer.yaw, 0.0, np.pi)
-        return self._carry(hand, hammer.centre, place, turn, slack=0.025)
+        return self._carry(hand, hammer.centre, middle - _PLACED_BACK * hammer.along, turn, slack=0.025)
 
     def _is_placed(self, hammer: Hammer) -> bool:
         return _within(hammer.middle, self.sim_env.transport.target_bin_pos) and hammer.middle[2] < _PLACED
@@ -176,9 +184,7 @@ class TwoArmTransportExpert(Expert):
         point, travels = self._over(hand, hand.position, goal, turn, slack)
         return Waypoint(point, aligned if travels == 1.0 else downward(hand.yaw), OPEN)
 
-    def _carry(
-        self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float
-    ) -> Waypoint:
+    def _carry(self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float) -> Waypoint:
         """A step on the way over the walls with something held, which is turned about the vertical while it travels."""
         point, travels = self._over(hand, held, place, turn, slack)
         turned = travels * float(np.clip(turn, -1.0, 1.0))
@@ -189,11 +195,11 @@ class TwoArmTransportExpert(Expert):
         self, hand: Hand, moved: np.ndarray, goal: np.ndarray, turn: float, slack: float
     ) -> tuple[np.ndarray, float]:
         """Where to move something next, f64 [3] m: up, then sideways over the walls, then down; and 1 if it may travel."""
-        clearance = max(self.style.hover, _WALL_TOP + self.style.hover - goal[2])
+        clearance = max(self.style.hover, _OVER_WALLS + self.style.hover - goal[2])
         start = replace(hand, position=moved)
         point = self.above(start, goal, clearance=clearance, slope=_STEEP, slack=slack, turn=turn)
-        missing = min(point[2], _WALL_TOP + 0.06) - moved[2]
-        travels = float(np.clip(1.5 - missing / 0.04, 0.0, 1.0))
+        missing = min(point[2], _OVER_WALLS) - moved[2]
+        travels = float(np.clip(1.25 - missing / 0.04, 0.0, 1.0))
         rising = self._middle(moved) - _BRAKE * hand.velocity[:2]
         point[:2] = travels * point[:2] + (1.0 - travels) * rising
         step = _FIRM * (point - moved)
@@ -212,12 +218,17 @@ class TwoArmTransportExpert(Expert):
         return base + max(1.0, _FOLDED / np.linalg.norm(away)) * away
 
 
-def _near(hand: Hand, thing: np.ndarray) -> bool:
-    return bool(np.linalg.norm(hand.position - thing) < 0.025)
+def _stay(hand: Hand, gripper: float) -> Waypoint:
+    return Waypoint(hand.position, hand.rotation, gripper)
+
+
+def _around(hand: Hand, thing: np.ndarray, width: float) -> bool:
+    """Are the fingers around a thing, closed on it or not yet free of it?"""
+    return bool(np.linalg.norm(hand.position - thing) < 0.025 and hand.opening < width + _FREE)
 
 
 def _holds(hand: Hand, thing: np.ndarray, width: float) -> bool:
-    return _near(hand, thing) and hand.opening < width + 0.004
+    return _around(hand, thing, width) and hand.opening < width + 0.004
 
 
 def _within(thing: np.ndarray, floor: np.ndarray) -> bool:
