@@ -39,7 +39,7 @@ _PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the ha
 _BELOW = 0.015  # m below the height at which something is let go that is aimed at
 _BRAKE = 0.15  # s, how much of a hand's sideways drift is taken back while it rises
 _BASE = 0.81  # m, y of the taker's base, and less that of the giver's
-_CAREFUL = 0.6  # pace of vertical motion: near its base, an arm that is sped up or down drifts sideways
+_CAREFUL = 0.042  # m up or down at a time: near its base, an arm that is sped up or down drifts sideways
 _FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
 _FREE = 0.02  # m of play between fingers and what they let go, from which they may leave
 _FOLDED = 0.37  # m from the arm's base; nearer, the elbow is at its limit and the hand cannot rise
@@ -107,7 +107,7 @@ class TwoArmTransportExpert(Expert):
             return self._clear_lid(hand, handle, aside)
         if hammer.held_by(hand):
             turn = nearest(_FACING[0] - hammer.yaw, 0.0, np.pi)
-            return self._carry(hand, hammer.centre, _OFFER, turn, slack=0.03)
+            return self._carry(hand, hammer.centre, _OFFER, turn, slack=0.06)
         if hammer.middle[1] > 0:
             return self._wait(hand, 0)
         return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.across(hand))
@@ -128,7 +128,7 @@ class TwoArmTransportExpert(Expert):
             return self._wait(hand, 0)
         if hand.opening < _HANDLE_WIDTH + _FREE:
             return _stay(hand, OPEN)
-        return Waypoint(hand.position + np.array([0.0, 0.0, 0.1]), hand.rotation, OPEN, _CAREFUL)
+        return Waypoint(hand.position + np.array([0.0, 0.0, _CAREFUL]), hand.rotation, OPEN)
 
     # -- the taker --------------------------------------------------------------------------------
 
@@ -203,7 +203,7 @@ class TwoArmTransportExpert(Expert):
         rising = self._middle(moved) - _BRAKE * hand.velocity[:2]
         point[:2] = travels * point[:2] + (1.0 - travels) * rising
         step = _FIRM * (point - moved)
-        step[2] = np.clip(step[2], -_CAREFUL * self.style.reach, _CAREFUL * self.style.reach)
+        step[2] = np.clip(step[2], -_CAREFUL, _CAREFUL)
         return moved + step, travels
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
