@@ -99,8 +99,8 @@ class Expert(ABC):
 
     def _step_towards(self, hand: Hand, waypoint: Waypoint) -> np.ndarray:
         left = Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec()
-        step = _clip(waypoint.position - hand.position, waypoint.pace * self.style.reach)
-        turn = _clip(left, waypoint.pace * self.style.turn)
+        step = clipped(waypoint.position - hand.position, waypoint.pace * self.style.reach)
+        turn = clipped(left, waypoint.pace * self.style.turn)
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
         return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
 
@@ -177,5 +177,6 @@ def nearest(angle: float, reference: float, period: float) -> float:
     return reference + (angle - reference + period / 2) % period - period / 2
 
 
-def _clip(vector: np.ndarray, length: float) -> np.ndarray:
+def clipped(vector: np.ndarray, length: float) -> np.ndarray:
+    """The vector, shortened to ``length`` where it is longer."""
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-9))

@@ -13,9 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Hand, Waypoint, at, downward, nearest
+from torchrl_sparse.envs.experts.base import (
+    CLOSED,
+    OPEN,
+    Expert,
+    Hand,
+    Waypoint,
+    at,
+    clipped,
+    downward,
+    nearest,
+)
 
-_FACING = (np.pi / 2, -np.pi / 2)  # rad, each hand's yaw at rest: its fingers move along the world's x axis
+_BASES = np.array([[0.0, -0.81], [0.0, 0.81]])  # m, where the arms stand
 _WALL_TOP = 0.951  # m, of all three bins
 _OVER_WALLS = 1.02  # m, height at which a hand, or what it holds, travels sideways at least
 _STEEP = 6.0  # slope of the way into a bin: between the walls there is room for the hand, not for much more
@@ -38,11 +48,12 @@ _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and t
 _PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the hand is nearer to it
 _BELOW = 0.015  # m below the height at which something is let go that is aimed at
 _BRAKE = 0.15  # s, how much of a hand's sideways drift is taken back while it rises
-_BASE = 0.81  # m, y of the taker's base, and less that of the giver's
 _CAREFUL = 0.042  # m up or down at a time: near its base, an arm that is sped up or down drifts sideways
 _FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
 _FREE = 0.02  # m of play between fingers and what they let go, from which they may leave
 _FOLDED = 0.37  # m from the arm's base; nearer, the elbow is at its limit and the hand cannot rise
+_SWING = 0.44  # m, the same on the way sideways
+_NEARLY = 0.12  # m from the goal, the end of that way
 _HOMES = np.array([[0.0, -0.35, 1.12], [0.0, 0.24, 1.15]])  # m, where a hand waits
 
 
@@ -101,27 +112,24 @@ class TwoArmTransportExpert(Expert):
     def _give(self, hand: Hand, taker: Hand, hammer: Hammer) -> Waypoint:
         if hammer.held_by(taker):
             return self._hand_over(hand, hammer)
-        handle = self._lid_handle()
+        lid, rotation = self.body(self.sim_env.transport.lid.root_body)
+        handle = lid + rotation @ _LID_HANDLE
         aside = handle[0] < _LID_CLEAR and handle[2] < _LID_LOW
         if not aside or _around(hand, handle, _LID_WIDTH):
-            return self._clear_lid(hand, handle, aside)
+            return self._clear_lid(hand, handle, rotation, aside)
         if hammer.held_by(hand):
-            turn = nearest(_FACING[0] - hammer.yaw, 0.0, np.pi)
+            turn = nearest(np.pi / 2 - hammer.yaw, 0.0, np.pi)
             return self._carry(hand, hammer.centre, _OFFER, turn, slack=0.06)
         if hammer.middle[1] > 0:
             return self._wait(hand, 0)
         return self._grasp(hand, hammer.point(_GIVER_GRASP), hammer.across(hand))
 
-    def _lid_handle(self) -> np.ndarray:
-        position, rotation = self.body(self.sim_env.transport.lid.root_body)
-        return position + rotation @ _LID_HANDLE
-
-    def _clear_lid(self, hand: Hand, handle: np.ndarray, aside: bool) -> Waypoint:
+    def _clear_lid(self, hand: Hand, handle: np.ndarray, rotation: np.ndarray, aside: bool) -> Waypoint:
         if aside:
             return _stay(hand, OPEN)
         if _holds(hand, handle, _LID_WIDTH):
-            return self._carry(hand, handle, _LID_PLACE, _FACING[0] - hand.yaw, slack=0.04)
-        return self._grasp(hand, handle, downward(_FACING[0]))
+            return self._carry(hand, handle, _LID_PLACE, _azimuth(hand.position, 0) - hand.yaw, slack=0.04)
+        return self._grasp(hand, handle, downward(nearest(_yaw(rotation) + np.pi / 2, np.pi / 2, np.pi)))
 
     def _hand_over(self, hand: Hand, hammer: Hammer) -> Waypoint:
         if hammer.distance(hand) > 0.08:
@@ -150,10 +158,10 @@ class TwoArmTransportExpert(Expert):
             return _stay(hand, OPEN)
         if _holds(hand, trash, _TRASH_WIDTH):
             place = np.array([*self.sim_env.transport.trash_bin_pos[:2], _TRASH_LOW - _BELOW])
-            return self._carry(hand, trash, place, _FACING[1] - hand.yaw, slack=0.05)
-        side = np.arctan2(rotation[1, 0], rotation[0, 0])
-        between_bins = abs(trash[0]) < 0.06  # where a hand has room with its fingers along them only
-        return self._grasp(hand, trash, downward(nearest(side, 0.0 if between_bins else hand.yaw, np.pi / 2)))
+            return self._carry(hand, trash, place, _azimuth(hand.position, 1) - hand.yaw, slack=0.05)
+        # Between the bins a hand has room only with its fingers along them.
+        reference = 0.0 if abs(trash[0]) < 0.06 else _azimuth(trash, 1)
+        return self._grasp(hand, trash, downward(nearest(_yaw(rotation), reference, np.pi / 2)))
 
     def _place(self, giver: Hand, hand: Hand, hammer: Hammer) -> Waypoint:
         if hammer.distance(giver) < 0.05:
@@ -176,7 +184,7 @@ class TwoArmTransportExpert(Expert):
         return self._reach(hand, grasp, aligned, slack=0.018)
 
     def _wait(self, hand: Hand, arm: int) -> Waypoint:
-        return self._reach(hand, _HOMES[arm], downward(_FACING[arm]))
+        return self._reach(hand, _HOMES[arm], downward(_azimuth(hand.position, arm)))
 
     def _reach(self, hand: Hand, goal: np.ndarray, aligned: np.ndarray, slack: float = 0.01) -> Waypoint:
         """A step of the empty hand on its way over the walls."""
@@ -204,18 +212,34 @@ class TwoArmTransportExpert(Expert):
         point[:2] = travels * point[:2] + (1.0 - travels) * rising
         step = _FIRM * (point - moved)
         step[2] = np.clip(step[2], -_CAREFUL, _CAREFUL)
+        if travels > 0.5 and np.linalg.norm(goal[:2] - moved[:2]) > _NEARLY:
+            step[:2] = _round(moved[:2] + clipped(step[:2], self.style.reach), _SWING) - moved[:2]
         return moved + step, travels
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
-        """f64 [2] m where to rise: the middle of the bin around, if any, or right here but not too near the arm's base."""
+        """f64 [2] m where to rise: the middle of the bin around, if any, or right here."""
         transport = self.sim_env.transport
         for bin_ in (transport.start_bin, transport.target_bin, transport.trash_bin):
             middle, _ = self.body(bin_.root_body)
             if _within(moved, middle):
                 return middle[:2]
-        base = np.array([0.0, np.copysign(_BASE, moved[1])])
-        away = moved[:2] - base
-        return base + max(1.0, _FOLDED / np.linalg.norm(away)) * away
+        return _round(moved[:2], _FOLDED)
+
+
+def _round(place: np.ndarray, distance: float) -> np.ndarray:
+    """f64 [2] the place, moved away from the nearer arm's base where it is within ``distance`` m of it."""
+    base = _BASES[int(place[1] > 0)]
+    return base + (place - base) * max(1.0, distance / np.linalg.norm(place - base))
+
+
+def _azimuth(place: np.ndarray, arm: int) -> float:
+    """The yaw of a hand there that leaves the wrist straight, rad: near the base, others drive it to its limits."""
+    away = place[:2] - _BASES[arm]
+    return float(np.arctan2(away[1], away[0]))
+
+
+def _yaw(rotation: np.ndarray) -> float:
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
 def _stay(hand: Hand, gripper: float) -> Waypoint:
