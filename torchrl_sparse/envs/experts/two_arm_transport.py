@@ -39,9 +39,9 @@ _LID_LOW = 0.845  # m, height of the lid's handle from which it may be let go
 
 _TRASH_LOW = 0.90  # m, the trash's height when let go
 _GIVER_GRASP, _TAKER_GRASP = -0.03, 0.075  # m along the handle, from its middle towards the taker
+_LEAST_LEVEL = 0.85  # horizontal part of a leaning handle; below, the taker would grasp its end or the head
 _HANDLE_HALF = 0.1  # m
 _HEAD_SHIFT = 0.017  # m from the handle's middle towards the head: the centre of the whole hammer
-_LEAN = 0.6  # sine of how far a hand leans with the handle at most
 _OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's centre where it changes hands
 _PLACED = 0.89  # m, the hammer's height in the target bin when let go
 _PLACED_YAW = 0.75 * np.pi  # rad, along the diagonal: there is more room, and the arm need not fold up
@@ -81,10 +81,8 @@ class Hammer:
         return self.middle + ahead * self.along
 
     def across(self, hand: Hand) -> np.ndarray:
-        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way and leaning as the handle does."""
-        level = downward(nearest(self.yaw, hand.yaw, np.pi))
-        lean = np.arcsin(np.clip(self.along[2], -_LEAN, _LEAN)) * np.sign(level[:, 1] @ self.along)
-        return level @ Rotation.from_euler("x", lean).as_matrix().T
+        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way. It never leans: palms would meet."""
+        return downward(nearest(self.yaw, hand.yaw, np.pi))
 
     def distance(self, hand: Hand) -> float:
         """From the hand to the nearest point of the handle's axis, m."""
@@ -150,7 +148,10 @@ class TwoArmTransportExpert(Expert):
         offered = hammer.held_by(giver) and np.linalg.norm(hammer.centre - _OFFER) < 0.05
         dropped = hammer.middle[1] > 0.25 and not self._is_placed(hammer)
         if offered or dropped:
-            return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.across(hand))
+            level = max(
+                _LEAST_LEVEL, np.linalg.norm(hammer.along[:2])
+            )  # the hands need their room also where it leans
+            return self._grasp(hand, hammer.point(_TAKER_GRASP / level), hammer.across(hand))
         return self._wait(hand, 1)
 
     def _clear_trash(self, hand: Hand, trash: np.ndarray, rotation: np.ndarray, cleared: bool) -> Waypoint:
