@@ -38,8 +38,8 @@ _LID_CLEAR = -0.12  # m, x of the lid from which it leaves the start bin open
 _LID_LOW = 0.845  # m, height of the lid's handle from which it may be let go
 
 _TRASH_LOW = 0.90  # m, the trash's height when let go
-_GIVER_GRASP, _TAKER_GRASP = -0.03, 0.075  # m along the handle, from its middle towards the taker
-_LEAST_LEVEL = 0.85  # horizontal part of a leaning handle; below, the taker would grasp its end or the head
+_GIVER_GRASP, _TAKER_GRASP = -0.04, 0.078  # m along the handle, from its middle towards the taker
+_LEAN = 0.3  # rad by which the taker leans back, since upright both palms would meet
 _HANDLE_HALF = 0.1  # m
 _HEAD_SHIFT = 0.017  # m from the handle's middle towards the head: the centre of the whole hammer
 _OFFER = np.array([0.0, -0.01, 1.08])  # m, the hammer's centre where it changes hands
@@ -80,9 +80,10 @@ class Hammer:
         """f64 [3] point ``ahead`` m from the handle's middle towards the taker."""
         return self.middle + ahead * self.along
 
-    def across(self, hand: Hand) -> np.ndarray:
-        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way. It never leans: palms would meet."""
-        return downward(nearest(self.yaw, hand.yaw, np.pi))
+    def across(self, hand: Hand, lean: float = 0.0) -> np.ndarray:
+        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way, its palm ``lean`` rad back."""
+        level = downward(nearest(self.yaw, hand.yaw, np.pi))
+        return level @ Rotation.from_euler("x", -lean).as_matrix()
 
     def distance(self, hand: Hand) -> float:
         """From the hand to the nearest point of the handle's axis, m."""
@@ -148,10 +149,7 @@ class TwoArmTransportExpert(Expert):
         offered = hammer.held_by(giver) and np.linalg.norm(hammer.centre - _OFFER) < 0.05
         dropped = hammer.middle[1] > 0.25 and not self._is_placed(hammer)
         if offered or dropped:
-            level = max(
-                _LEAST_LEVEL, np.linalg.norm(hammer.along[:2])
-            )  # the hands need their room also where it leans
-            return self._grasp(hand, hammer.point(_TAKER_GRASP / level), hammer.across(hand))
+            return self._grasp(hand, hammer.point(_TAKER_GRASP), hammer.across(hand, _LEAN))
         return self._wait(hand, 1)
 
     def _clear_trash(self, hand: Hand, trash: np.ndarray, rotation: np.ndarray, cleared: bool) -> Waypoint:
