@@ -71,15 +71,24 @@ def sideways(expert, arm, thing):
 # -- the hammer ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lean", [-0.5, 0.0, 0.3])
+@pytest.mark.parametrize("pitch", [-0.5, 0.0, 0.3])
 @pytest.mark.parametrize("hammer_yaw", np.linspace(0.1, np.pi - 0.1, 7))
 @pytest.mark.parametrize("hand_yaw", [-1.6, 1.6])
-def test_a_hand_across_the_handle_points_down_with_its_fingers_square_to_it(lean, hammer_yaw, hand_yaw):
-    along = np.array([np.cos(lean) * np.cos(hammer_yaw), np.cos(lean) * np.sin(hammer_yaw), np.sin(lean)])
+def test_a_hand_across_the_handle_points_down_with_its_fingers_square_to_it(pitch, hammer_yaw, hand_yaw):
+    along = np.array([np.cos(pitch) * np.cos(hammer_yaw), np.cos(pitch) * np.sin(hammer_yaw), np.sin(pitch)])
     across = Hammer(np.zeros(3), np.zeros(3), along).across(hand(np.zeros(3), 0.08, hand_yaw))
     np.testing.assert_allclose(across[:, 2], [0.0, 0.0, -1.0], atol=1e-12)
     assert across[:, 0] @ along == pytest.approx(0.0)
     assert across[:, 0] @ downward(hand_yaw)[:, 0] > -1e-9  # the nearer of both ways
+
+
+def test_a_taker_that_leans_holds_its_palm_away_from_the_giver():
+    hammer = Hammer(np.zeros(3), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    across = hammer.across(hand(np.zeros(3), 0.08, -0.5 * np.pi), lean=0.3)
+    np.testing.assert_allclose(
+        across[:, 2], [0.0, -np.sin(0.3), -np.cos(0.3)], atol=1e-12
+    )  # its fingers point back
+    np.testing.assert_allclose(np.abs(across[:, 0]), [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_held_needs_closed_fingers_anywhere_on_the_handle():
