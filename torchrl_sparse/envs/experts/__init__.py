@@ -12,6 +12,7 @@ from torchrl_sparse.envs.experts.nut_assembly_square import NutAssemblySquareExp
 from torchrl_sparse.envs.experts.operators import OPERATORS, Operator, Style, draw_operator
 from torchrl_sparse.envs.experts.pick_place_can import PickPlaceCanExpert
 from torchrl_sparse.envs.experts.tool_hang import ToolHangExpert
+from torchrl_sparse.envs.experts.two_arm_transport import TwoArmTransportExpert
 
 EXPERTS: Mapping[str, type[Expert]] = {
     "Lift": LiftExpert,
@@ -20,6 +21,7 @@ EXPERTS: Mapping[str, type[Expert]] = {
     "PickPlaceCan": PickPlaceCanExpert,
     "NutAssemblySquare": NutAssemblySquareExpert,
     "ToolHang": ToolHangExpert,
+    "TwoArmTransport": TwoArmTransportExpert,
 }
 """The expert of each robosuite task that has one."""
 

@@ -99,8 +99,8 @@ class Expert(ABC):
 
     def _step_towards(self, hand: Hand, waypoint: Waypoint) -> np.ndarray:
         left = Rotation.from_matrix(waypoint.rotation @ hand.rotation.T).as_rotvec()
-        step = _clip(waypoint.position - hand.position, waypoint.pace * self.style.reach)
-        turn = _clip(left, waypoint.pace * self.style.turn)
+        step = clipped(waypoint.position - hand.position, waypoint.pace * self.style.reach)
+        turn = clipped(left, waypoint.pace * self.style.turn)
         rotation = Rotation.from_rotvec(turn) * Rotation.from_matrix(hand.rotation)
         return np.concatenate([hand.position + step, rotation.as_rotvec(), [waypoint.gripper]])
 
@@ -128,7 +128,14 @@ class Expert(ABC):
     # -- skills -----------------------------------------------------------------------------------
 
     def above(
-        self, hand: Hand, goal: np.ndarray, *, clearance: float | None = None, turn: float = 0.0
+        self,
+        hand: Hand,
+        goal: np.ndarray,
+        *,
+        clearance: float | None = None,
+        slope: float | None = None,
+        slack: float = 0.01,
+        turn: float = 0.0,
     ) -> np.ndarray:
         """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
 
@@ -136,12 +143,15 @@ class Expert(ABC):
             hand: where the hand is.
             goal: f64 [3] where it should go, m.
             clearance: height of the funnel, m; the operator's ``hover`` by default.
+            slope: metres of height for each metre left; the operator's by default.
+            slack: horizontal distance from the goal within which the hand may be all the way down, m.
             turn: rad that the hand still has to turn before it may go down.
         """
         clearance = self.style.hover if clearance is None else clearance
+        slope = self.style.slope if slope is None else slope
         away = goal[:2] - hand.position[:2]
         distance = float(np.linalg.norm(away))
-        height = min(clearance, self.style.slope * max(0.0, distance + 0.05 * abs(turn) - 0.01))
+        height = min(clearance, slope * max(0.0, distance + 0.05 * abs(turn) - slack))
         sideways = np.array([-away[1], away[0]]) / max(distance, 1e-6)
         bow = self.style.bow * np.clip((distance - 0.03) / 0.05, 0.0, 1.0)
         return goal + np.array([*(bow * sideways), height])
@@ -167,5 +177,6 @@ def nearest(angle: float, reference: float, period: float) -> float:
     return reference + (angle - reference + period / 2) % period - period / 2
 
 
-def _clip(vector: np.ndarray, length: float) -> np.ndarray:
+def clipped(vector: np.ndarray, length: float) -> np.ndarray:
+    """The vector, shortened to ``length`` where it is longer."""
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-9))
