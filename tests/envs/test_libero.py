@@ -1,9 +1,15 @@
 """What stands between LIBERO and a policy; LIBERO itself where it is installed."""
 
 import importlib.util
+from pathlib import Path
 
+import hydra
+import imageio.v3 as iio
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sparse import keys
@@ -53,3 +59,59 @@ def test_a_task_gives_what_the_policy_and_the_controller_read():
     moved = steps["next", "observation", "pose"][0, :3] - pose[0, :3]
     torch.testing.assert_close(steps[keys.EEF_VEL][1, :3], 20 * moved)
     assert set(SUITES) == {"libero_spatial", "libero_object", "libero_goal", "libero_10"}
+
+
+class StillScene(EnvBase):
+    """What `make_libero_env` gives, of a scene in which nothing ever happens."""
+
+    def __init__(self, image_size):
+        super().__init__(batch_size=[])
+        image = Bounded(0, 255, (3, image_size, image_size), dtype=torch.uint8)
+        observation = {
+            "image": image,
+            "wrist_image": image.clone(),
+            "state": Unbounded(8),
+            "eef_vel": Unbounded(6),
+        }
+        self.observation_spec = Composite(
+            observation=Composite(observation),
+            success=Categorical(2, (1,), dtype=torch.bool),
+            language_instruction=NonTensor((), example_data="wait"),
+        )
+        self.action_spec, self.reward_spec = Bounded(-1, 1, (7,)), Unbounded((1,))
+
+    def _reset(self, tensordict=None, **kwargs):
+        return self.observation_spec.zero().set(keys.INSTRUCTION, "wait")
+
+    def _step(self, tensordict):
+        over = {"reward": torch.zeros(1), "done": torch.zeros(1, dtype=torch.bool)}
+        return self._reset().update(TensorDict(over))
+
+    def _set_seed(self, seed):
+        pass
+
+
+def test_the_smoke_recipe_steps_and_draws_every_suite(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("transformers")
+    folder = Path(__file__).parents[2] / "recipes"
+    spec = importlib.util.spec_from_file_location("libero_smoke", folder / "libero_smoke.py")
+    recipe = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(recipe)
+    asked = []
+
+    def make(suite, task_id, image_size):
+        asked.append((suite, task_id))
+        return TransformedEnv(StillScene(image_size), InitTracker())
+
+    monkeypatch.setattr(recipe, "make_libero_env", make)
+    with hydra.initialize_config_dir(str(folder), version_base=None):
+        config = hydra.compose(
+            "libero_smoke", ["steps=10", "task_id=3", "n_action_steps=4", f"out={tmp_path}"]
+        )
+    recipe.main.__wrapped__(config)
+    assert asked == [(suite, 3) for suite in SUITES]
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == len(SUITES)
+    for suite, line in zip(SUITES, printed, strict=True):
+        assert line.startswith(f"{suite}, 'wait': 10 steps, 3 queries")
+        assert iio.imread(tmp_path / f"{suite}.png").std() > 1
