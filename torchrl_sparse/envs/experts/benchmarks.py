@@ -1,4 +1,4 @@
-"""Experts of the benchmarks outside robosuite: functions of what a policy observes, and of a preference drawn at the start."""
+"""Experts of the benchmarks outside robosuite: they see what a policy observes; what they draw or plan is hidden from it."""
 
 from __future__ import annotations
 

@@ -22,14 +22,10 @@ _SPACING = 12.0  # pixels between places of the outline that are tried
 _ANGLES = np.radians([-30.0, 0.0, 30.0])  # of a push to the outline's normal
 _LENGTHS = np.array([2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 90.0])  # pixels that the agent moves the outline
 _SPEED = 1.5  # pixels the agent moves in a step of 0.01 s of the copy
-_PUSH_LEAD, _WALK_LEAD = (
-    35.0,
-    90.0,
-)  # pixels of the target before the agent: five times that is its speed per second
-_AT, _NEAR = (
-    2.0,
-    15.0,
-)  # pixels at which a point counts as reached: where pushes begin and end, and on the way there
+# Pixels of the target before the agent: five times that is its speed per second.
+_PUSH_LEAD, _WALK_LEAD = 35.0, 90.0
+# Pixels at which a point counts as reached: where pushes begin and end, and on the way there.
+_AT, _NEAR = 2.0, 15.0
 _OVERHEAD = 6.0  # steps that a push costs besides its length
 
 
