@@ -100,9 +100,8 @@ def seeds(config: DictConfig) -> range:
 
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
-    from torchrl_sparse.evaluation.vla_methods import (
-        instructed_env,
-    )  # queries of demonstrations need no simulator
+    # Here, since queries of demonstrations need no simulator.
+    from torchrl_sparse.evaluation.vla_methods import instructed_env
 
     return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 
