@@ -1,10 +1,14 @@
 """A handful of rendered steps; skipped only where the system has no GL library."""
 
+from unittest import mock
+
+import numpy as np
 import pytest
 import torch
 from torchrl.envs import check_env_specs
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 
 
@@ -42,6 +46,44 @@ def test_image_is_upright_and_follows_the_scene(env):
     sim.data.set_joint_qpos(env.sim_env.cube.joints[0], pose)
     sim.forward()
     assert (env.render("frontview", 64, 64) != before).any()
+
+
+@pytest.mark.parametrize("camera", ["agentview", "robot0_eye_in_hand", "frontview", "birdview"])
+def test_what_is_out_of_view_is_not_drawn_and_not_missed(env, camera):
+    env.reset()
+    for _ in range(3):
+        env.step(env.rand_action())
+        renderer = CameraRenderer(env.sim_env.sim, 48, 72)  # wider than tall
+        fewer = renderer.image(camera)
+        with mock.patch.object(renderer, "_out_of_view", lambda camera: np.zeros(renderer._model.ngeom, bool)):
+            assert np.array_equal(renderer.image(camera), fewer)
+        hidden = renderer._out_of_view(renderer._model.camera(camera).id).sum()
+        renderer.close()
+        assert hidden > 30 or camera != "robot0_eye_in_hand"  # the hand's camera does not see the arm
+
+
+def test_a_renderer_goes_on_with_the_next_episodes_model(env):
+    env.reset()
+    env.render("frontview", 40, 40)
+    (renderer,) = (r for size, r in env._renderers.items() if size == (40, 40))
+    env.reset(initial_state=env.get_initial_state())
+    env.reset()
+    image = env.render("frontview", 40, 40)
+    assert env._renderers[40, 40] is renderer
+    fresh = CameraRenderer(env.sim_env.sim, 40, 40)
+    assert np.array_equal(fresh.image("frontview"), image)
+    fresh.close()
+
+
+def test_a_renderer_does_not_follow_into_another_scene(env):
+    env.reset()
+    renderer = CameraRenderer(env.sim_env.sim, 40, 40)
+    other = RobosuiteEnv("PickPlaceCan", seeds=[0])
+    other.reset()
+    assert not renderer.follow(other.sim_env.sim)
+    assert renderer.follow(env.sim_env.sim)
+    renderer.close()
+    other.close()
 
 
 def test_unknown_camera_is_named(env):

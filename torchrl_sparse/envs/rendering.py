@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,14 +16,23 @@ GL_HINT = (
 )
 
 
+_HIDDEN_GROUP = 5  # of geoms; MuJoCo draws groups 0 to 2 unless told otherwise
+_CORNERS = np.array([*product((-1.0, 1.0), repeat=3)])
+
+
+# Beginnings of the names of what a GL context copies from a model.
+_UPLOADED = ("mesh_", "tex_", "hfield_", "skin_", "mat_")
+
+
 class CameraRenderer:
-    """Renders the cameras of one MuJoCo model; a hard reset makes a new model and needs a new renderer.
+    """Renders the cameras of one MuJoCo model; `follow` takes it on to the next, which a hard reset makes.
 
     Args:
         sim: robosuite's ``MjSim``.
         height, width: pixels.
         fast: no multisampling, shadows or reflections. Software rendering is about four times faster so; it changes how images
-            look, so train and evaluate with the same setting.
+            look, so train and evaluate with the same setting. What no camera can see then needs no drawing, which makes it up
+            to three times faster again and changes nothing.
 
     Raises:
         RuntimeError: if no GL library is installed; the message says which package brings one.
@@ -31,7 +42,8 @@ class CameraRenderer:
         import mujoco
 
         self._mujoco = mujoco
-        self._model, self._data = sim.model._model, sim.data._data
+        self._watch(sim)
+        self._cull = fast  # shadows and reflections fall into the picture from outside
         self._model.vis.global_.offheight, self._model.vis.global_.offwidth = height, width
         if fast:
             self._model.vis.quality.offsamples = 0
@@ -41,13 +53,26 @@ class CameraRenderer:
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._viewport = mujoco.MjrRect(0, 0, width, height)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=10000)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=10000)  # used as a size, whichever model comes next
         if fast:
             for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
                 self._scene.flags[flag] = 0
         self._options = mujoco.MjvOption()
         self._options.geomgroup[0] = 0  # collision shapes
         atexit.register(self.close)  # a context that outlives EGL itself complains at exit
+
+    def follow(self, sim: Any) -> bool:
+        """Renders another simulator from now on; False, and nothing changes, if its meshes or textures are others.
+
+        To make a renderer takes as long as dozens of images: everything is copied into a new GL context.
+        """
+        if sim.model._model is not self._model and not _same_uploads(self._model, sim.model._model):
+            return False
+        self._watch(sim)
+        return True
+
+    def _watch(self, sim: Any) -> None:
+        self._model, self._data = sim.model._model, sim.data._data
 
     def image(self, camera: str) -> np.ndarray:
         """u8 [height, width, 3], top row first.
@@ -64,11 +89,29 @@ class CameraRenderer:
         view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
         self._gl.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
+        groups = self._model.geom_group.copy()
+        if self._cull:
+            self._model.geom_group[self._out_of_view(camera_id)] = _HIDDEN_GROUP
         mujoco.mjv_updateScene(self._model, self._data, self._options, None, view, everything, self._scene)
+        self._model.geom_group[:] = groups
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
+
+    def _out_of_view(self, camera: int) -> np.ndarray:
+        """bool [geoms], those whose bounding box lies beyond one side of what the camera sees, or behind it."""
+        model, data = self._model, self._data
+        centre, half = model.geom_aabb[:, None, :3], model.geom_aabb[:, None, 3:]
+        axes = data.geom_xmat.reshape(-1, 3, 3)
+        corners = (centre + half * _CORNERS) @ axes.transpose(0, 2, 1) + data.geom_xpos[:, None]
+        x, y, z = np.moveaxis((corners - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3), -1, 0)
+        tall = math.tan(math.radians(model.cam_fovy[camera]) / 2)
+        wide = tall * self._viewport.width / self._viewport.height
+        ahead = -z  # a camera looks along its negative z axis
+        beyond = (x > wide * ahead, x < -wide * ahead, y > tall * ahead, y < -tall * ahead, ahead < 0)
+        bounded = model.geom_rbound > 0  # planes are not
+        return bounded & np.any([side.all(1) for side in beyond], axis=0)
 
     def close(self) -> None:
         """Frees the GL context. Call once."""
@@ -76,6 +119,18 @@ class CameraRenderer:
         self._gl.make_current()
         self._context.free()
         self._gl.free()
+
+
+def _same_uploads(one: Any, other: Any) -> bool:
+    """Whether a GL context made for one model shows the other as well."""
+    names = [name for name in dir(one) if name.startswith(_UPLOADED)]
+    if not all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names):
+        return False
+    return np.array_equal(_plane_sizes(one), _plane_sizes(other))  # planes are tessellated at their size
+
+
+def _plane_sizes(model: Any) -> np.ndarray:
+    return model.geom_size[model.geom_type == 0]
 
 
 def _make_gl_context(height: int, width: int) -> Any:

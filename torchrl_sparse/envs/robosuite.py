@@ -128,7 +128,6 @@ class RobosuiteEnv(SeededEnv):
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
     ) -> TensorDictBase:
-        self._close_renderers()
         if initial_state is None:
             return super()._reset(tensordict, **kwargs)
         self._start_from_state(initial_state)
@@ -221,10 +220,14 @@ class RobosuiteEnv(SeededEnv):
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
         """u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
-        size = (height, width)
-        if size not in self._renderers:
-            self._renderers[size] = CameraRenderer(self.sim_env.sim, height, width, fast=self._fast_render)
-        return self._renderers[size].image(camera)
+        size, sim = (height, width), self.sim_env.sim
+        renderer = self._renderers.get(size)
+        if renderer is not None and not renderer.follow(sim):
+            self._renderers.pop(size).close()
+            renderer = None
+        if renderer is None:
+            renderer = self._renderers[size] = CameraRenderer(sim, height, width, fast=self._fast_render)
+        return renderer.image(camera)
 
     # -- clean-up ------------------------------------------------------------------------------------------------------
 
