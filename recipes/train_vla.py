@@ -17,6 +17,7 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
+from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
@@ -53,7 +54,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         cameras=chosen_cameras(config.cameras),
         image_folder=Path(config.out) / "images",
     )
-    demos = InstructedDemonstrations(episodes, read_instructions(config.demos))
+    demos = InstructedDemonstrations(episodes, read_instructions(config.demos), read_grounding(config))
     state, action = episodes.data[keys.STATE], episodes.data[keys.ACTION]
     grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
     words = sorted({word for text in demos.instructions for word in text.lower().split()})
@@ -63,13 +64,22 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         QuantileNormalizer.fit(state, action, gripper=grippers),
         WordTokenizer(words),
     ).to(config.device)
-    trainer = VLATrainer(policy, demos, TrainConfig(**config.train))
+    trainer = VLATrainer(policy, demos, TrainConfig(**config.train), config.grounding.weight)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(state)} steps, {len(trainer.train_rows)} training windows; "
         f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
     )
     return trainer
+
+
+def read_grounding(config: DictConfig) -> Tensor | None:
+    """Where the named object is in each step [N, G], about zero and of unit size; None if its loss has no weight."""
+    if not config.grounding.weight:
+        return None
+    episodes = read_demos(config.demos, [config.grounding.key])
+    position = episodes.data[keys.STATE][:, : config.grounding.size]
+    return (position - position.mean(0)) / position.std(0).max()
 
 
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:

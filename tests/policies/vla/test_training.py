@@ -1,5 +1,7 @@
 """The loss, what windows hold, resuming to the last bit, and that the instruction can be learned."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -41,7 +43,7 @@ def demos():
 def make_trainer(demos):
     config = VLAConfig.tiny(llm=TransformerSize(32, 2, 2, 64))
 
-    def make(**changes):
+    def make(demos=demos, **changes):
         torch.manual_seed(0)
         tokenizer = WordTokenizer(["lift", "lower", "cube"])
         policy = VLAPolicy(VLANetwork(config), QuantileNormalizer.identity(8, 7), tokenizer)
@@ -68,6 +70,19 @@ def test_loss_is_l1_of_what_the_policy_answers(policy, query):
     target = torch.cat([2 * (chunk[..., :6] - low) / (high - low) - 1, (1 - chunk[..., 6:]) / 2], -1)
     expected = (actions - target).abs().mean(-1)[~is_pad].mean()
     torch.testing.assert_close(loss, expected)
+
+
+def test_the_grounding_is_told_by_what_the_actions_are_read_from(policy, query):
+    loss = VLALoss(policy, grounding_dim=3, grounding_weight=0.5)
+    torch.nn.init.zeros_(loss.grounding.weight)
+    torch.nn.init.constant_(loss.grounding.bias, 2.0)
+    td = query(3).set(keys.CHUNK, torch.zeros(3, 2, 7))
+    with pytest.raises(KeyError, match="grounding"):
+        loss(td)
+    td[keys.GROUNDING] = torch.zeros(3, 3)
+    with torch.no_grad():
+        added = loss(td)["loss"] - VLALoss(policy)(td)["loss"]
+    torch.testing.assert_close(added, torch.tensor(0.5 * 2.0))
 
 
 def test_a_chunk_of_another_length_is_named(policy, query):
@@ -99,6 +114,18 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
     assert begun + run(second, 6) == losses
     for ours, theirs in ((second.trained, unbroken.trained), (second.averaged(), unbroken.averaged())):
         assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
+
+
+def test_the_grounding_is_trained_and_left_out_of_the_policy(make_trainer, demos, tmp_path):
+    position = torch.tensor([[1.0, 0.0], [-1.0, 0.5]] * 3)
+    rows = position.repeat_interleave(demos.episodes.starts.diff(), 0)
+    trainer = make_trainer(replace(demos, grounding=rows), max_steps=80, val_ratio=0.0, lr=3e-3)
+    losses = run(trainer, 80)
+    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
+    assert all("grounding" not in name for name, _ in trainer.averaged().named_parameters())
+    trainer.save(tmp_path / "checkpoint.pt")
+    with pytest.raises(ValueError, match=r"checkpoint.pt: made with another"):
+        make_trainer(max_steps=80, val_ratio=0.0, lr=3e-3).load(tmp_path / "checkpoint.pt")
 
 
 def test_a_checkpoint_of_another_training_is_refused(make_trainer, tmp_path):

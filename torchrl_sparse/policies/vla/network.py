@@ -72,7 +72,7 @@ class VLANetwork(nn.Module):
         td = TensorDict({}, [len(images)], device=images.device) if td is None else td
         sequence = self._sequence(self.visual_tokens(images), state, prompts, keep_mask, td)
         decoded = self.decoder(sequence, TokenPruner() if pruner is None else pruner)
-        return self.head(self._readout(decoded)).float(), decoded
+        return self.head(self.readout(decoded)).float(), decoded
 
     def visual_tokens(self, images: Tensor) -> Tensor:
         """[B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
@@ -112,8 +112,8 @@ class VLANetwork(nn.Module):
         kinds, repeats = (torch.tensor(column, device=device) for column in zip(*counts, strict=True))
         return kinds.repeat_interleave(repeats)
 
-    def _readout(self, decoded: Decoded) -> Tensor:
-        """[B, H * A, d]: a row ends with last prompt token, slots, stop; all of these but the last two are read."""
+    def readout(self, decoded: Decoded) -> Tensor:
+        """What the actions are read from, [B, H * A, d]: a row ends with last prompt token, slots, stop; all of these but the last two are read."""
         slots = self.config.num_slots
         first = decoded.lengths[:, None] - slots - 2
         index = first + torch.arange(slots, device=first.device)
