@@ -55,7 +55,8 @@ def test_what_is_out_of_view_is_not_drawn_and_not_missed(env, camera):
         env.step(env.rand_action())
         renderer = CameraRenderer(env.sim_env.sim, 48, 72)  # wider than tall
         fewer = renderer.image(camera)
-        with mock.patch.object(renderer, "_out_of_view", lambda camera: np.zeros(renderer._model.ngeom, bool)):
+        nothing = np.zeros(renderer._model.ngeom, bool)
+        with mock.patch.object(renderer, "_out_of_view", return_value=nothing):
             assert np.array_equal(renderer.image(camera), fewer)
         hidden = renderer._out_of_view(renderer._model.camera(camera).id).sum()
         renderer.close()

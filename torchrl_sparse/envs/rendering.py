@@ -53,7 +53,9 @@ class CameraRenderer:
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._viewport = mujoco.MjrRect(0, 0, width, height)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=10000)  # used as a size, whichever model comes next
+        self._scene = mujoco.MjvScene(
+            self._model, maxgeom=10000
+        )  # used as a size, whichever model comes next
         if fast:
             for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
                 self._scene.flags[flag] = 0

@@ -113,7 +113,10 @@ class VLANetwork(nn.Module):
         return kinds.repeat_interleave(repeats)
 
     def readout(self, decoded: Decoded) -> Tensor:
-        """What the actions are read from, [B, H * A, d]: a row ends with last prompt token, slots, stop; all of these but the last two are read."""
+        """What the actions are read from, [B, H * A, d].
+
+        A row ends with last prompt token, slots, stop; all of these but the last two are read.
+        """
         slots = self.config.num_slots
         first = decoded.lengths[:, None] - slots - 2
         index = first + torch.arange(slots, device=first.device)
