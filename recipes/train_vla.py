@@ -1,8 +1,8 @@
 """Trains a vision-language-action policy. Stop it at any moment; the same command goes on, equal to the last bit.
 
-    python recipes/collect_demos.py task=lift_named episodes=500 out=data/lift_named_proficient.h5
-    python recipes/render_demos.py task=lift_named image_size=112
-    python recipes/train_vla.py task=lift_named max_steps=20000 batch_size=64 device=cuda precision=bf16
+    python recipes/collect_demos.py task=lift_named episodes=600 out=data/lift_named_proficient.h5
+    python recipes/render_demos.py task=lift_named
+    python recipes/train_vla.py task=lift_named precision=bf16
 
 ``out/policy``, renewed at each checkpoint, is the policy with averaged weights for `VLAPolicy.from_pretrained`.
 """
