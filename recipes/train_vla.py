@@ -17,7 +17,6 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
-from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
@@ -28,6 +27,7 @@ from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.policies.trainer import TrainConfig
 from torchrl_sparse.policies.training_loop import train
 from torchrl_sparse.policies.vla.config import VLAConfig
+from torchrl_sparse.policies.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -54,7 +54,9 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         cameras=chosen_cameras(config.cameras),
         image_folder=Path(config.out) / "images",
     )
-    demos = InstructedDemonstrations(episodes, read_instructions(config.demos), read_grounding(config))
+    lessons = GroundingConfig(**config.grounding)
+    objects = None if lessons == GroundingConfig() else read_objects(config)
+    demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
     state, action = episodes.data[keys.STATE], episodes.data[keys.ACTION]
     grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
     words = sorted({word for text in demos.instructions for word in text.lower().split()})
@@ -64,7 +66,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         QuantileNormalizer.fit(state, action, gripper=grippers),
         WordTokenizer(words),
     ).to(config.device)
-    trainer = VLATrainer(policy, demos, TrainConfig(**config.train), config.grounding.weight)
+    trainer = VLATrainer(policy, demos, TrainConfig(**config.train), lessons)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(state)} steps, {len(trainer.train_rows)} training windows; "
@@ -73,13 +75,10 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     return trainer
 
 
-def read_grounding(config: DictConfig) -> Tensor | None:
-    """Where the named object is in each step [N, G], about zero and of unit size; None if its loss has no weight."""
-    if not config.grounding.weight:
-        return None
-    episodes = read_demos(config.demos, [config.grounding.key])
-    position = episodes.data[keys.STATE][:, : config.grounding.size]
-    return (position - position.mean(0)) / position.std(0).max()
+def read_objects(config: DictConfig) -> ObjectPositions:
+    """Where the objects are that the task's instructions name, in the order of these."""
+    positions = read_demos(config.demos, ["object_positions"]).data[keys.STATE]
+    return ObjectPositions(positions.unflatten(1, (-1, 3)), get_task(config.task).instructions).standardised()
 
 
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:

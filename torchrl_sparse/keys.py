@@ -32,7 +32,6 @@ constant                          shape, dtype           meaning
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
-``GROUNDING``                     f32 [*B, G]            where what the instruction names is, as an auxiliary loss asks for it
 ``ACTION``                        f32 [*B, A]            the action of this step
 ``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
@@ -79,7 +78,6 @@ TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")
 IS_PAD = "action_is_pad"
-GROUNDING = "grounding"
 ACTION = "action"
 
 REPLAN = ("control", "replan")

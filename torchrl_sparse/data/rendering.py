@@ -19,7 +19,10 @@ __all__ = ["render_demos"]
 
 
 def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, image_size: int = 84) -> None:
-    """Copies a demonstration file and adds ``obs/<camera>_image``, u8 [T, h, w, 3], to every demonstration.
+    """Copies a demonstration file and adds what can be seen to every demonstration.
+
+    ``obs/<camera>_image``, u8 [T, h, w, 3]; and ``obs/object_positions``, f32 [T, 3 n] in m, where the scene's n objects are:
+    no policy reads it, but vision can be trained to tell it.
 
     Images are rendered from the simulator states that were recorded, so experts run once and cameras can be
     chosen later. Pictures of a running episode are one physics step, 2 ms, behind its states; these are not.
@@ -46,18 +49,17 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
         for name in tqdm(demo_names(path, source), unit="demo"):
             env.reset(initial_state=read_initial_state(path, int(name[5:])))
             demo = file["data"][name]
-            for camera, images in _render(env, demo["states"][:], cameras, image_size).items():
-                demo.create_dataset(f"obs/{camera}_image", data=images, compression="lzf")
+            for key, values in _look(env, demo["states"][:], cameras, image_size).items():
+                demo.create_dataset(f"obs/{key}", data=values, compression="lzf")
         env.close()
 
 
-def _render(
-    env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int
-) -> dict[str, np.ndarray]:
-    images: dict[str, list[np.ndarray]] = {camera: [] for camera in cameras}
+def _look(env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int) -> dict[str, np.ndarray]:
+    """What there is to see in each state, by the names of observations."""
+    seen = []
     for state in states:
         env.sim_env.sim.set_state_from_flattened(state)
         env.sim_env.sim.forward()
-        for camera in cameras:
-            images[camera].append(env.render(camera, size, size))
-    return {camera: np.stack(frames) for camera, frames in images.items()}
+        images = {f"{camera}_image": env.render(camera, size, size) for camera in cameras}
+        seen.append(images | {"object_positions": env.object_positions().astype(np.float32)})
+    return {key: np.stack([step[key] for step in seen]) for key in seen[0]}

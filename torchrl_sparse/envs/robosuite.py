@@ -211,6 +211,12 @@ class RobosuiteEnv(SeededEnv):
             out[keys.INSTRUCTION] = self.instruction
         return out
 
+    def object_positions(self) -> np.ndarray:
+        """f64 [3 n], m: where the n objects of the scene are, in the world frame."""
+        sim, objects = self.sim_env.sim, self.sim_env.model.mujoco_objects
+        bodies = [sim.model.body_name2id(thing.root_body) for thing in objects]
+        return sim.data.body_xpos[bodies].reshape(-1)
+
     def _eef_velocity(self) -> np.ndarray:
         """Velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
         data = self.sim_env.sim.data

@@ -5,7 +5,7 @@ import json
 import h5py
 import numpy as np
 
-STATE = {"object": 10, "robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
+STATE = {"object_positions": 9, "robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
 COLOURS = ("red", "green", "blue")
 
 

@@ -10,6 +10,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.trainer import TrainConfig
 from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.policies.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.policies.vla.loss import VLALoss
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
@@ -43,12 +44,12 @@ def demos():
 def make_trainer(demos):
     config = VLAConfig.tiny(llm=TransformerSize(32, 2, 2, 64))
 
-    def make(demos=demos, **changes):
+    def make(demos=demos, grounding=None, **changes):
         torch.manual_seed(0)
         tokenizer = WordTokenizer(["lift", "lower", "cube"])
         policy = VLAPolicy(VLANetwork(config), QuantileNormalizer.identity(8, 7), tokenizer)
         options = {"max_steps": 6, "batch_size": 4, "lr": 1e-3, "lr_warmup_steps": 2, "val_ratio": 0.3}
-        return VLATrainer(policy, demos, TrainConfig(**{**options, **changes}))
+        return VLATrainer(policy, demos, TrainConfig(**{**options, **changes}), grounding)
 
     return make
 
@@ -70,19 +71,6 @@ def test_loss_is_l1_of_what_the_policy_answers(policy, query):
     target = torch.cat([2 * (chunk[..., :6] - low) / (high - low) - 1, (1 - chunk[..., 6:]) / 2], -1)
     expected = (actions - target).abs().mean(-1)[~is_pad].mean()
     torch.testing.assert_close(loss, expected)
-
-
-def test_the_grounding_is_told_by_what_the_actions_are_read_from(policy, query):
-    loss = VLALoss(policy, grounding_dim=3, grounding_weight=0.5)
-    torch.nn.init.zeros_(loss.grounding.weight)
-    torch.nn.init.constant_(loss.grounding.bias, 2.0)
-    td = query(3).set(keys.CHUNK, torch.zeros(3, 2, 7))
-    with pytest.raises(KeyError, match="grounding"):
-        loss(td)
-    td[keys.GROUNDING] = torch.zeros(3, 3)
-    with torch.no_grad():
-        added = loss(td)["loss"] - VLALoss(policy)(td)["loss"]
-    torch.testing.assert_close(added, torch.tensor(0.5 * 2.0))
 
 
 def test_a_chunk_of_another_length_is_named(policy, query):
@@ -116,16 +104,57 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
         assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
 
 
-def test_the_grounding_is_trained_and_left_out_of_the_policy(make_trainer, demos, tmp_path):
-    position = torch.tensor([[1.0, 0.0], [-1.0, 0.5]] * 3)
-    rows = position.repeat_interleave(demos.episodes.starts.diff(), 0)
-    trainer = make_trainer(replace(demos, grounding=rows), max_steps=80, val_ratio=0.0, lr=3e-3)
-    losses = run(trainer, 80)
-    assert sum(losses[-5:]) < 0.5 * sum(losses[:5])
-    assert all("grounding" not in name for name, _ in trainer.averaged().named_parameters())
-    trainer.save(tmp_path / "checkpoint.pt")
-    with pytest.raises(ValueError, match=r"checkpoint.pt: made with another"):
-        make_trainer(max_steps=80, val_ratio=0.0, lr=3e-3).load(tmp_path / "checkpoint.pt")
+@pytest.fixture
+def things(demos):
+    """Two objects, whose places can be seen in the frames; their order tells which instruction names which."""
+    frame = torch.cat([torch.arange(length) for length in demos.episodes.starts.diff().tolist()])
+    place = torch.stack([frame % 2, frame % 3, 0 * frame], 1).float()
+    return ObjectPositions(torch.stack([place, 1 - place], 1), ["lift the cube", "lower the cube"])
+
+
+def test_lessons_come_before_the_actions_and_leave_the_policy_as_it_was_built(make_trainer, demos, things):
+    options = {"max_steps": 200, "batch_size": 8, "val_ratio": 0.0, "lr": 3e-3}
+    trainer = make_trainer(replace(demos, objects=things), GroundingConfig(100, 99), **options)
+    network = trainer.policy.network
+
+    def learn(steps):
+        before = {name: value.clone() for name, value in network.named_parameters()}
+        losses = run(trainer, trainer.step + steps)
+        changed = {
+            name.split(".")[0] for name, value in network.named_parameters() if (value != before[name]).any()
+        }
+        return changed, sum(losses[-5:]) / sum(losses[:5])
+
+    changed, left = learn(100)
+    assert changed == {"vision", "projector"}
+    assert left < 0.5
+    changed, left = learn(99)
+    assert {"vision", "decoder"} <= changed
+    assert "head" not in changed
+    assert left < 0.8
+    assert "head" in learn(1)[0]
+    assert trainer.averaged().state_dict().keys() == network.state_dict().keys()
+
+
+def test_a_training_with_lessons_goes_on_to_the_last_bit(make_trainer, demos, things, tmp_path):
+    settings = (replace(demos, objects=things), GroundingConfig(2, 2))
+    unbroken, first, second = (make_trainer(*settings) for _ in range(3))
+    losses = run(unbroken, 6)
+    begun = run(first, 3)
+    first.save(tmp_path / "checkpoint.pt")
+    second.load(tmp_path / "checkpoint.pt")
+    assert begun + run(second, 6) == losses
+    with pytest.raises(ValueError, match=r"checkpoint.pt: made with another config: look_steps is"):
+        make_trainer(settings[0], GroundingConfig(1, 3)).load(tmp_path / "checkpoint.pt")
+
+
+def test_lessons_without_positions_are_refused(make_trainer):
+    with pytest.raises(ValueError, match="grounding: expected the objects' positions"):
+        make_trainer(grounding=GroundingConfig(look_steps=5))
+    with pytest.raises(ValueError, match="look_steps >= 0"):
+        GroundingConfig(look_steps=-1)
+    with pytest.raises(ValueError, match=r"positions: expected \[N, 2, 3\]"):
+        ObjectPositions(torch.zeros(5, 3, 3), ["lift", "lower"])
 
 
 def test_a_checkpoint_of_another_training_is_refused(make_trainer, tmp_path):

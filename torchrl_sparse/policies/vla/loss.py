@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_sparse import keys
@@ -30,14 +30,8 @@ class VLALoss(LossModule):
     Reads what the policy reads, the recorded chunk ``("vla_action", "chunk")`` f32 [B, H, A] in environment units, and, where
     it is there, ``"action_is_pad"`` bool [B, H] (as TorchRL's ``ActionChunkTransform`` writes both); writes ``"loss"``.
 
-    Towers that nobody trained before learn slowly where things are from actions alone. With ``grounding_dim`` the mean of what
-    the actions are read from must also tell ``"grounding"`` f32 [B, G], for instance the position of what is named, by a
-    linear layer that belongs to the loss and not to the policy.
-
     Args:
         policy: the policy to train; its parameters are the loss module's.
-        grounding_dim: G; 0 for the actions' loss alone.
-        grounding_weight: of the L1 loss of ``"grounding"``, which is added.
 
     Examples:
         >>> import torch
@@ -53,13 +47,10 @@ class VLALoss(LossModule):
 
     out_keys = ["loss"]
 
-    def __init__(self, policy: VLAPolicy, grounding_dim: int = 0, grounding_weight: float = 1.0):
+    def __init__(self, policy: VLAPolicy):
         super().__init__()
         self.policy = policy
-        self.grounding_weight = grounding_weight
-        self.grounding = nn.Linear(policy.network.config.llm.dim, grounding_dim) if grounding_dim else None
-        grounding = [keys.GROUNDING] if grounding_dim else []
-        self.in_keys = [*policy.in_keys, keys.CHUNK, keys.IS_PAD, *grounding]
+        self.in_keys = [*policy.in_keys, keys.CHUNK, keys.IS_PAD]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """``{"loss": scalar}`` of a batch [B].
@@ -73,11 +64,6 @@ class VLALoss(LossModule):
             raise ValueError(
                 f"{keys.CHUNK}: expected [B, {expected[0]}, {expected[1]}], got {list(chunk.shape)}"
             )
-        predicted, decoded = self.policy.predict(tensordict.select(*self.policy.in_keys, strict=False))
+        predicted, _ = self.policy.predict(tensordict.select(*self.policy.in_keys, strict=False))
         target = self.policy.normalizer.normalize_action(chunk)
-        loss = chunk_l1(predicted, target, tensordict.get(keys.IS_PAD, None))
-        if self.grounding is not None:
-            told = self.grounding(self.policy.network.readout(decoded).mean(1)).float()
-            distance = (told - keys.read(tensordict, keys.GROUNDING)).abs().mean()
-            loss = loss + self.grounding_weight * distance
-        return TensorDict({"loss": loss}, [])
+        return TensorDict({"loss": chunk_l1(predicted, target, tensordict.get(keys.IS_PAD, None))}, [])

@@ -113,7 +113,7 @@ class VLANetwork(nn.Module):
         return kinds.repeat_interleave(repeats)
 
     def readout(self, decoded: Decoded) -> Tensor:
-        """What the actions are read from, [B, H * A, d].
+        """What actions are read from, [B, H * A, d].
 
         A row ends with last prompt token, slots, stop; all of these but the last two are read.
         """

@@ -133,7 +133,7 @@ class VLAPolicy(VLAWrapperBase):
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Normalised actions f32 [B, H, A] of a query [B], and what the decoder did; the pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
-        images = self._look(query)
+        images = self.look(query)
         state = read_state(query, names.state, config.state_dim)
         prompts = self.tokenizer.encode(read_instructions(query, names.instruction))
         if self.pruner is not None:
@@ -150,7 +150,7 @@ class VLAPolicy(VLAWrapperBase):
             self.pruner.end(query)
         return actions, decoded
 
-    def _look(self, query: TensorDictBase) -> Tensor:
+    def look(self, query: TensorDictBase) -> Tensor:
         """The images, u8 [B, cameras, 3, h, w], cropped; in ``query`` too, where a pruner compares their patches."""
         config, names = self.network.config, self.tensor_keys
         cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]

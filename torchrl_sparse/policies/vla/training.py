@@ -15,6 +15,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.trainer import TrainConfig, Trainer, split_windows
+from torchrl_sparse.policies.vla.grounding import Grounding, GroundingConfig, ObjectPositions
 from torchrl_sparse.policies.vla.loss import VLALoss
 from torchrl_sparse.policies.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -29,7 +30,7 @@ class InstructedDemonstrations:
     Attributes:
         episodes: with the policy's cameras, u8 [N, 3, h, w], the state f32 [N, Ds] and the action f32 [N, A] of each step.
         instructions: one for each episode.
-        grounding: f32 [N, G], what `VLALoss` is to ground the network in; None for nothing.
+        objects: where things are in each step, for `Grounding`; None if that is not known.
 
     Raises:
         ValueError: if there are not as many instructions as episodes.
@@ -37,7 +38,7 @@ class InstructedDemonstrations:
 
     episodes: Demonstrations
     instructions: Sequence[str]
-    grounding: Tensor | None = None
+    objects: ObjectPositions | None = None
 
     def __post_init__(self) -> None:
         if len(self.instructions) != len(self.episodes):
@@ -53,8 +54,7 @@ class InstructedDemonstrations:
             observed: keys to take from the present step.
 
         Returns:
-            ``observed``, the instruction, ``("vla_action", "chunk")`` [B, H, A], ``"action_is_pad"`` [B, H] and, where there is
-            one, ``"grounding"`` [B, G].
+            ``observed``, the instruction, ``("vla_action", "chunk")`` [B, H, A] and ``"action_is_pad"`` [B, H].
         """
         present, data = rows[:, 0].contiguous(), self.episodes.data
         sample = data.select(*observed)[present]
@@ -62,8 +62,6 @@ class InstructedDemonstrations:
         sample[keys.IS_PAD] = torch.cat(
             [torch.zeros(len(rows), 1).bool(), rows[:, 1:] == rows[:, :-1]], dim=1
         )
-        if self.grounding is not None:
-            sample[keys.GROUNDING] = self.grounding[present]
         episode = torch.searchsorted(self.episodes.starts, present, right=True) - 1
         sample[keys.INSTRUCTION] = NonTensorStack(*[self.instructions[i] for i in episode.tolist()])
         return sample
@@ -76,10 +74,10 @@ class VLATrainer(Trainer):
         policy: the policy, trained in place; its normaliser and tokenizer stay as they are.
         demos: demonstrations with images and instructions.
         config: how to train; ``n_action_steps`` is not read: windows may begin at every step of an episode.
-        grounding_weight: of the auxiliary loss, where ``demos`` have a grounding; see `VLALoss`.
+        grounding: lessons that come before the actions; none by default.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on.
+        ValueError: if ``val_ratio`` leaves no episode to train on, or there are lessons but no ``demos.objects``.
     """
 
     def __init__(
@@ -87,14 +85,21 @@ class VLATrainer(Trainer):
         policy: VLAPolicy,
         demos: InstructedDemonstrations,
         config: TrainConfig,
-        grounding_weight: float = 1.0,
+        grounding: GroundingConfig | None = None,
     ):
-        self.policy, self.demos, self.grounding_weight = policy, demos, grounding_weight
-        loss = VLALoss(policy, 0 if demos.grounding is None else demos.grounding.shape[1], grounding_weight)
-        loss.to(next(policy.network.parameters()).device)
+        self.policy, self.demos = policy, demos
+        self.lessons = GroundingConfig() if grounding is None else grounding
+        self.loss = VLALoss(policy)
+        parts = {"network": policy.network}
+        if self.lessons != GroundingConfig():
+            if demos.objects is None:
+                raise ValueError("grounding: expected the objects' positions in the demonstrations, got none")
+            device = next(policy.network.parameters()).device
+            parts["grounding"] = Grounding(policy, len(demos.objects.instructions)).to(device)
+        trained = nn.ModuleDict(parts)
         sizes = (policy.chunk_size, 1, policy.chunk_size)
         rows = split_windows(demos.episodes, sizes, config.val_ratio)
-        super().__init__(loss, config, decay_groups(loss, config.weight_decay), *rows)
+        super().__init__(trained, config, decay_groups(trained, config.weight_decay), *rows)
 
     def batch_loss(self, rows: Tensor) -> Tensor:
         observed = [*self.policy.network.config.cameras, keys.STATE]
@@ -102,20 +107,29 @@ class VLATrainer(Trainer):
         batch = self.demos.windows(rows, observed).to(device)
         bf16 = torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
         with bf16, _training_attention(device):
-            return self.trained(batch).get("loss")
+            if self.step >= self.lessons.look_steps + self.lessons.answer_steps:
+                return self.loss(batch).get("loss")
+            return self._lesson(batch, rows[:, 0])
+
+    def _lesson(self, batch: TensorDict, present: Tensor) -> Tensor:
+        objects, grounding = self.demos.objects, self.trained["grounding"]
+        positions = objects.positions[present].to(batch[keys.STATE].device)
+        if self.step < self.lessons.look_steps:
+            return grounding.look(self.policy, batch, positions)
+        return grounding.answer(self.policy, batch, positions, objects.instructions)
 
     def averaged(self) -> VLANetwork:
         """A copy of the network with the averaged weights, in evaluation mode."""
-        return super().averaged().policy.network
+        return super().averaged()["network"]
 
     def header(self) -> dict[str, dict]:
-        data, network = self.demos.episodes.data, self.policy.network.config
+        data, network, objects = self.demos.episodes.data, self.policy.network.config, self.demos.objects
         numbers = {"/".join(key): int(data[key].sum(dtype=torch.int64)) for key in network.cameras}
         numbers |= {name: float(data[name].double().sum()) for name in (keys.ACTION,)}
-        grounding = self.demos.grounding
-        numbers["grounding"] = 0.0 if grounding is None else float(grounding.double().abs().sum())
+        if self.lessons != GroundingConfig():
+            numbers["objects"] = float(objects.positions.double().abs().sum())
         return {
-            "config": asdict(self.config) | {"grounding_weight": self.grounding_weight},
+            "config": asdict(self.config) | asdict(self.lessons),
             "network_config": network.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
