@@ -70,6 +70,8 @@ def test_everything_else_is_copied_and_the_file_is_never_its_own_source(files):
         assert other["mask/train"][()].tolist() == [b"demo_0"]
         np.testing.assert_array_equal(one["data/demo_0/states"], other["data/demo_0/states"])
         assert other["data/demo_0/obs/agentview_image"].shape[1:] == (32, 32, 3)
+        cube = other["data/demo_0/obs/object_positions"][()]
+        np.testing.assert_allclose(cube, one["data/demo_0/obs/object"][:, :3], atol=2e-3)
     with pytest.raises(ValueError, match="out: expected another file"):
         render_demos(plain, plain, ["agentview"])
 

@@ -18,15 +18,8 @@ def demos(tmp_path_factory):
 def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     broken, unbroken = tmp_path / "broken", tmp_path / "unbroken"
     sizes = ["size=tiny", "network.chunk_size=3", "+network.llm.layers=2", "batch_size=2", "max_steps=160"]
-    settings = [
-        f"demos={demos}",
-        *sizes,
-        "checkpoint_every=40",
-        "lr_warmup_steps=2",
-        "threads=1",
-        "grounding.look_steps=30",
-        "grounding.answer_steps=30",
-    ]
+    lessons = ["grounding.look_steps=30", "grounding.answer_steps=30"]
+    settings = [f"demos={demos}", *sizes, *lessons, "checkpoint_every=40", "lr_warmup_steps=2", "threads=1"]
     step, first, second = stop_and_go_on("train_vla", broken, settings)
     assert "3 demonstrations of 3 instructions, 27 steps" in first
     assert "stopped by SIGTERM, run again to go on" in first
