@@ -38,6 +38,7 @@ class Decoded:
         tokens: i64 [B, L], tokens on which each layer ran; 0 where it was skipped.
         depth: i64 [B, N], layers that ran on each visual token.
         scored: i64 [B], query-key pairs of all scores, rows times tokens.
+        visual: [B, N, d], the visual tokens that the decoder was given; None where no network says so.
     """
 
     hidden: Tensor
@@ -45,6 +46,7 @@ class Decoded:
     tokens: Tensor
     depth: Tensor
     scored: Tensor
+    visual: Tensor | None = None
 
 
 class BidirectionalLlama(nn.Module):

@@ -22,6 +22,8 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 __all__ = ["Grounding", "GroundingConfig", "ObjectPositions"]
 
+_REMEMBERED = 0.3  # weight of the first lesson's loss in the second
+
 
 @dataclass(frozen=True)
 class GroundingConfig:
@@ -89,21 +91,28 @@ class Grounding(nn.Module):
     def __init__(self, policy: VLAPolicy, objects: int):
         super().__init__()
         config = policy.network.config
-        self.seen = nn.Linear(len(config.cameras) * config.llm.dim, objects * 3)
+        self.cameras = len(config.cameras)
+        self.seen = nn.Linear(self.cameras * config.llm.dim, objects * 3)
         self.told = nn.Linear(config.llm.dim, 3)
 
     def look(self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor) -> Tensor:
         """L1 loss, a scalar: ``positions`` f32 [B, n, 3] from the mean of each camera's visual tokens."""
-        visual = policy.network.visual_tokens(policy.look(batch))
-        views = visual.unflatten(1, (len(policy.network.config.cameras), -1)).mean(2)
-        return (self.seen(views.flatten(1)).float() - positions.flatten(1)).abs().mean()
+        return self._seen_loss(policy.network.visual_tokens(policy.look(batch)), positions)
 
     def answer(
         self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor, instructions: Sequence[str]
     ) -> Tensor:
-        """L1 loss, a scalar: from what actions are read from, the position of an object drawn for each sample."""
+        """L1 loss, a scalar: from what actions are read from, the position of an object drawn for each sample.
+
+        A part of `look`'s is added, so that vision does not forget it before the decoder has learnt to use it.
+        """
         asked = torch.randint(len(instructions), (len(positions),))
         words = NonTensorStack(*[instructions[index] for index in asked.tolist()])
         _, decoded = policy.predict(batch.copy().set(keys.INSTRUCTION, words))
         told = self.told(policy.network.readout(decoded).mean(1)).float()
-        return (told - positions[torch.arange(len(positions)), asked]).abs().mean()
+        told_loss = (told - positions[torch.arange(len(positions)), asked]).abs().mean()
+        return told_loss + _REMEMBERED * self._seen_loss(decoded.visual, positions)
+
+    def _seen_loss(self, visual: Tensor, positions: Tensor) -> Tensor:
+        views = visual.unflatten(1, (self.cameras, -1)).mean(2)
+        return (self.seen(views.flatten(1)).float() - positions.flatten(1)).abs().mean()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -70,8 +71,9 @@ class VLANetwork(nn.Module):
             td: the query that ``pruner`` sees, [B].
         """
         td = TensorDict({}, [len(images)], device=images.device) if td is None else td
-        sequence = self._sequence(self.visual_tokens(images), state, prompts, keep_mask, td)
-        decoded = self.decoder(sequence, TokenPruner() if pruner is None else pruner)
+        visual = self.visual_tokens(images)
+        sequence = self._sequence(visual, state, prompts, keep_mask, td)
+        decoded = replace(self.decoder(sequence, TokenPruner() if pruner is None else pruner), visual=visual)
         return self.head(self.readout(decoded)).float(), decoded
 
     def visual_tokens(self, images: Tensor) -> Tensor:

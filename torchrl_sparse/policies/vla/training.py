@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -11,6 +12,7 @@ import torch
 from tensordict import NonTensorStack, TensorDict
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.optim.lr_scheduler import LambdaLR
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
@@ -117,6 +119,20 @@ class VLATrainer(Trainer):
         if self.step < self.lessons.look_steps:
             return grounding.look(self.policy, batch, positions)
         return grounding.answer(self.policy, batch, positions, objects.instructions)
+
+    def _set_schedule(self) -> None:
+        """A cosine, with a warm-up wherever parts begin to learn that did not before."""
+        config, lessons = self.config, self.lessons
+        begins = (0, lessons.look_steps, lessons.look_steps + lessons.answer_steps)
+
+        def factor(step: int) -> float:
+            since = step - max(begin for begin in begins if begin <= step)
+            warm = min(1.0, since / max(1, config.lr_warmup_steps))
+            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.max_steps)))
+
+        for group in self._optimizer.param_groups:
+            group["initial_lr"] = config.lr
+        self._schedule = LambdaLR(self._optimizer, factor, last_epoch=self.step - 1)
 
     def averaged(self) -> VLANetwork:
         """A copy of the network with the averaged weights, in evaluation mode."""
