@@ -31,7 +31,7 @@ from torchrl_sparse.blocks.sag import check_rates, rate_threshold
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.trainer import batch_indices, step_seed
+from torchrl_sparse.policies.trainer import batch_indices, checksum, step_seed
 
 __all__ = ["Gates", "PrunerConfig", "PrunerTrainer", "imitate", "sparsity_loss"]
 
@@ -368,9 +368,7 @@ class PrunerTrainer:
             "policy": {"fingerprint": self.policy.fingerprint, **self.policy.schedule.config},
             "reference": {
                 "size": len(self.train_set) + len(self.held_out),
-                "checksum": float(
-                    self.train_set["target"].double().sum() + self.train_set[keys.COND].double().sum()
-                ),
+                "checksum": checksum(self.train_set["target"]) + checksum(self.train_set[keys.COND]),
             },
         }
 

@@ -23,7 +23,7 @@ from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.policies.checkpoints.training import read_checkpoint
 
-__all__ = ["TrainConfig", "Trainer", "batch_indices", "split_windows", "step_seed"]
+__all__ = ["TrainConfig", "Trainer", "batch_indices", "checksum", "split_windows", "step_seed"]
 
 
 @dataclass(frozen=True)
@@ -223,6 +223,15 @@ def split_windows(
     split = len(demos) - num_val
     held_out = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
     return demos.window_rows(*sizes, range(split)), held_out
+
+
+def checksum(values: Tensor) -> float:
+    """The exact sum, rounded once: the same on every machine and for any number of threads.
+
+    >>> checksum(torch.tensor([1e16, 1.0, -1e16], dtype=torch.float64))
+    1.0
+    """
+    return math.fsum(values.flatten().tolist())
 
 
 def step_seed(seed: int, step: int) -> int:

@@ -14,7 +14,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion, optimizer_groups
 from torchrl_sparse.policies.diffusion.vision import VisionEncoder
-from torchrl_sparse.policies.trainer import TrainConfig, Trainer, split_windows
+from torchrl_sparse.policies.trainer import TrainConfig, Trainer, checksum, split_windows
 
 __all__ = ["PolicyTrainer"]
 
@@ -82,4 +82,4 @@ class PolicyTrainer(Trainer):
 
 def _checksum(value: Tensor) -> float:
     """Sum of all entries; images are summed without a copy of them in another type."""
-    return float(value.double().sum() if value.is_floating_point() else value.sum(dtype=torch.int64))
+    return checksum(value) if value.is_floating_point() else float(value.sum(dtype=torch.int64))

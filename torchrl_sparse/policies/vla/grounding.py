@@ -76,8 +76,9 @@ class ObjectPositions:
 
     def standardised(self) -> ObjectPositions:
         """About zero, and of unit size along the axis on which they vary most."""
-        centred = self.positions - self.positions.mean((0, 1))
-        return ObjectPositions(centred / centred.std((0, 1)).max(), self.instructions)
+        positions = self.positions.double()  # or the last bit would depend on the number of threads
+        centred = positions - positions.mean((0, 1))
+        return ObjectPositions((centred / centred.std((0, 1)).max()).float(), self.instructions)
 
 
 class Grounding(nn.Module):

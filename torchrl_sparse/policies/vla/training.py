@@ -16,7 +16,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
-from torchrl_sparse.policies.trainer import TrainConfig, Trainer, split_windows
+from torchrl_sparse.policies.trainer import TrainConfig, Trainer, checksum, split_windows
 from torchrl_sparse.policies.vla.grounding import Grounding, GroundingConfig, ObjectPositions
 from torchrl_sparse.policies.vla.loss import VLALoss
 from torchrl_sparse.policies.vla.network import VLANetwork
@@ -141,9 +141,9 @@ class VLATrainer(Trainer):
     def header(self) -> dict[str, dict]:
         data, network, objects = self.demos.episodes.data, self.policy.network.config, self.demos.objects
         numbers = {"/".join(key): int(data[key].sum(dtype=torch.int64)) for key in network.cameras}
-        numbers |= {name: float(data[name].double().sum()) for name in (keys.ACTION,)}
+        numbers |= {name: checksum(data[name]) for name in (keys.ACTION,)}
         if self.lessons != GroundingConfig():
-            numbers["objects"] = float(objects.positions.double().abs().sum())
+            numbers["objects"] = checksum(objects.positions)
         return {
             "config": asdict(self.config) | asdict(self.lessons),
             "network_config": network.to_dict(),
