@@ -143,7 +143,7 @@ class VLATrainer(Trainer):
         numbers = {"/".join(key): int(data[key].sum(dtype=torch.int64)) for key in network.cameras}
         numbers |= {name: checksum(data[name]) for name in (keys.ACTION,)}
         if self.lessons != GroundingConfig():
-            numbers["objects"] = checksum(objects.positions)
+            numbers["objects"] = checksum(objects.positions.abs())
         return {
             "config": asdict(self.config) | asdict(self.lessons),
             "network_config": network.to_dict(),
