@@ -107,8 +107,7 @@ class VLATrainer(Trainer):
         observed = [*self.policy.network.config.cameras, keys.STATE]
         device = next(self.trained.parameters()).device
         batch = self.demos.windows(rows, observed).to(device)
-        bf16 = torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
-        with bf16, _training_attention(device):
+        with _precision(device, self.config.precision == "bf16"):
             if self.step >= self.lessons.look_steps + self.lessons.answer_steps:
                 return self.loss(batch).get("loss")
             return self._lesson(batch, rows[:, 0])
@@ -156,9 +155,10 @@ class VLATrainer(Trainer):
 
 
 @contextmanager
-def _training_attention(device: torch.device) -> Iterator[None]:
-    """On a CPU the plain products: PyTorch's fused kernel is the slower one there as soon as gradients are wanted."""
-    with sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" else nullcontext():
+def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
+    """Autocast to bf16 if asked for. There the gradient of the fused attention is slower than plain products on a CPU."""
+    plain = sdpa_kernel(SDPBackend.MATH) if bf16 and device.type == "cpu" else nullcontext()
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16), plain:
         yield
 
 
