@@ -153,3 +153,9 @@ def test_a_reference_that_is_not_run_is_refused(policy_folder, tmp_path):
     done = run(policy_folder, tmp_path, "methods=[fastv@specprune]")
     assert "fastv@specprune: expected one of dense after @, got 'specprune'" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_processes_are_refused(policy_folder, tmp_path):
+    done = run(policy_folder, tmp_path, "methods=[dense]", "workers=2")
+    assert "workers: expected 1, or backend=ray, for episodes with words, got 2" in done.stderr
+    assert not list(tmp_path.iterdir())
