@@ -34,7 +34,7 @@ def env(policy):
 def lifted(env, policy, state, colour):
     """The cubes that are up in the air after an episode in which this one is asked for."""
     td = env.reset(initial_state=replace(state, instruction=f"lift the {colour} cube"))
-    env.rollout(STEPS, ChunkExecutor(policy), auto_reset=False, tensordict=td)
+    env.rollout(STEPS, ChunkExecutor(policy, n_action_steps=4), auto_reset=False, tensordict=td)
     sim_env = env.base_env.sim_env
     heights = {
         name: sim_env.sim.data.body_xpos[sim_env.sim.model.body_name2id(cube.root_body)][2]
