@@ -31,8 +31,8 @@ class CameraRenderer:
         sim: robosuite's ``MjSim``.
         height, width: pixels.
         fast: no multisampling, shadows or reflections. Software rendering is about four times faster so; it changes how images
-            look, so train and evaluate with the same setting. What no camera can see then needs no drawing, which makes it up
-            to three times faster again and changes nothing.
+            look, so train and evaluate with the same setting. What the camera cannot see is not drawn then, which spares about
+            half of the time and changes nothing.
 
     Raises:
         RuntimeError: if no GL library is installed; the message says which package brings one.

@@ -72,8 +72,8 @@ class VisionTowers(nn.Module):
             )
         )
         self.siglip.post_layernorm = nn.Identity()
-        # The constants of both libraries are made for wide towers: in a narrow one a patch's place is a fiftieth of its token,
-        # and learning where things are takes ten times as long.
+        # The constants of both libraries are made for weights that are loaded: beside what a patch shows, its place would be a
+        # fiftieth of a token, too little to learn from where things are.
         nn.init.normal_(self.dino.embeddings.position_embeddings)
         nn.init.normal_(self.siglip.embeddings.position_embedding.weight)
         self._prefix = 1 + config.registers
