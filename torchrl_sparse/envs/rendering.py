@@ -18,8 +18,6 @@ GL_HINT = (
 
 _HIDDEN_GROUP = 5  # of geoms; MuJoCo draws groups 0 to 2 unless told otherwise
 _CORNERS = np.array([*product((-1.0, 1.0), repeat=3)])
-
-
 # Beginnings of the names of what a GL context copies from a model.
 _UPLOADED = ("mesh_", "tex_", "hfield_", "skin_", "mat_")
 
@@ -53,9 +51,8 @@ class CameraRenderer:
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._viewport = mujoco.MjrRect(0, 0, width, height)
-        self._scene = mujoco.MjvScene(
-            self._model, maxgeom=10000
-        )  # used as a size, whichever model comes next
+        # Only its size matters, whichever model comes next.
+        self._scene = mujoco.MjvScene(self._model, maxgeom=10000)
         if fast:
             for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
                 self._scene.flags[flag] = 0

@@ -1,8 +1,8 @@
 """Lessons for towers and a decoder that start from nothing: where things are, and which of them words name.
 
-Published models begin with towers and a language model that were trained on the internet's pictures and texts. From actions
-alone a small network without such a past hardly learns to look: the arm's own pose tells most of what comes next. Two
-lessons before the actions make up for it, of which nothing remains but the weights:
+Published models begin with towers and a language model that were trained on the internet's pictures and texts. A small
+network without such a past is tempted not to look: the arm's own pose tells most of what comes next. Two lessons before the
+actions make up for it, of which nothing remains but the weights:
 
 1. `Grounding.look`: the visual tokens tell where all objects are.
 2. `Grounding.answer`: told to handle one of them, whichever, the network tells where that one is.
