@@ -64,7 +64,6 @@ def main(config: DictConfig) -> None:
     out = Path(config.out)
     methods = {text: TokenMethod.parse(text) for text in dict.fromkeys(["dense", *config.methods])}
     check_references(methods)
-    check_workers(config)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
     environment = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     seeds = range(EVALUATION_SEED + config.seed, EVALUATION_SEED + config.seed + config.episodes)
@@ -113,14 +112,6 @@ def main(config: DictConfig) -> None:
     if config.pairs:
         print(f"\n{format_pairs(episodes, config.pairs, config.margin)}")
     print(f"\n{config.episodes} paired episodes per method; files are in {out}")
-
-
-def check_workers(config: DictConfig) -> None:
-    """Raises ValueError for processes: instructions, which are no tensors, do not get through TorchRL's shared memory."""
-    if config.workers > 1 and config.backend == "process":
-        raise ValueError(
-            f"workers: expected 1, or backend=ray, for episodes with words, got {config.workers}"
-        )
 
 
 def check_references(methods: dict[str, TokenMethod]) -> None:

@@ -47,7 +47,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_trainer(config: DictConfig) -> VLATrainer:
-    """Reads the demonstrations and builds an untrained policy that fits them."""
+    """Reads the demonstrations and builds a policy that fits them, or takes the one to start from."""
     episodes = read_demos(
         config.demos,
         get_task(config.task).proprioception_keys,
@@ -57,22 +57,30 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     lessons = GroundingConfig(**config.grounding)
     objects = None if lessons == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
-    state, action = episodes.data[keys.STATE], episodes.data[keys.ACTION]
-    grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
-    words = sorted({word for text in demos.instructions for word in text.lower().split()})
-    torch.manual_seed(config.seed)
-    policy = VLAPolicy(
-        VLANetwork(make_config(config, episodes.data)),
-        QuantileNormalizer.fit(state, action, gripper=grippers),
-        WordTokenizer(words),
-    ).to(config.device)
-    trainer = VLATrainer(policy, demos, TrainConfig(**config.train), lessons)
+    policy = (
+        untrained_policy(demos, config) if config.init is None else VLAPolicy.from_pretrained(config.init)
+    )
+    trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), lessons)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
-        f"{len(state)} steps, {len(trainer.train_rows)} training windows; "
+        f"{len(episodes.data)} steps, {len(trainer.train_rows)} training windows; "
         f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
     )
     return trainer
+
+
+def untrained_policy(demos: InstructedDemonstrations, config: DictConfig) -> VLAPolicy:
+    """A network that fits the demonstrations, with random weights."""
+    data = demos.episodes.data
+    action = data[keys.ACTION]
+    grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
+    words = sorted({word for text in demos.instructions for word in text.lower().split()})
+    torch.manual_seed(config.seed)
+    return VLAPolicy(
+        VLANetwork(make_config(config, data)),
+        QuantileNormalizer.fit(data[keys.STATE], action, gripper=grippers),
+        WordTokenizer(words),
+    )
 
 
 def read_objects(config: DictConfig) -> ObjectPositions:

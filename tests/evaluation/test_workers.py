@@ -9,8 +9,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
+from torchrl.data import NonTensor
 
 from tests.evaluation.fakes import FakeActor, FakeEnv
+from torchrl_sparse import keys
 from torchrl_sparse.evaluation import paired
 from torchrl_sparse.evaluation.paired import rollout_episodes
 
@@ -39,6 +42,37 @@ def run(make_env, **kwargs):
 @pytest.mark.parametrize(("workers", "num_envs"), [(1, 3), (2, 2)])
 def test_workers_find_what_this_process_finds(backend, workers, num_envs):
     assert run(FakeEnv, workers=workers, num_envs=num_envs, backend=backend) == run(FakeEnv)
+
+
+class SpeakingEnv(FakeEnv):
+    """Says which seed it is at."""
+
+    def __init__(self, seeds):
+        super().__init__(seeds)
+        self.observation_spec[keys.INSTRUCTION] = NonTensor((), example_data="go to 0")
+
+    def _observe(self):
+        return super()._observe().set(keys.INSTRUCTION, f"go to {self.seed}")
+
+
+class ListeningActor(FakeActor):
+    """Pays as many FLOPs as the words say."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys.append(keys.INSTRUCTION)
+
+    def forward(self, tensordict):
+        told = [float(words.split()[-1]) for words in tensordict[keys.INSTRUCTION]]
+        return super().forward(tensordict).set(keys.FLOPS, torch.tensor(told)[:, None])
+
+
+def test_words_reach_the_actor_in_every_worker(backend):
+    episodes = rollout_episodes(ListeningActor(), SpeakingEnv, SEEDS, workers=2, num_envs=2, backend=backend)
+    assert [episode.flops_total for episode in episodes] == [
+        episode.queries * episode.seed for episode in episodes
+    ]
+    assert episodes == rollout_episodes(ListeningActor(), SpeakingEnv, SEEDS)
 
 
 def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, backend):

@@ -33,7 +33,8 @@ def start_collector(
 ) -> BaseCollector:
     """A collector without end whose environments have the seeds dealt among them; see `rollout_episodes`.
 
-    Its batches are [environments, steps], of all workers together or, on Ray, of the one that was ready first.
+    Its batches are [workers, environments, steps] of several processes, else [environments, steps]: of this process or, on
+    Ray, of the worker that was ready first.
     """
     workers = min(workers, len(seeds))
     count = min(num_envs, len(seeds) // workers)  # as many in each worker, and none without a seed
@@ -55,7 +56,10 @@ def start_collector(
     if workers == 1:
         return Collector(make[0](), actor, frames_per_batch=count, **options)
     frames = workers * count * _STEPS_PER_BATCH
-    return MultiSyncCollector(make, actor, frames_per_batch=frames, cat_results=0, num_threads=1, **options)
+    # Without buffers, since words cannot lie in shared memory (tensordict makes arrays of them that no queue takes).
+    return MultiSyncCollector(
+        make, actor, frames_per_batch=frames, cat_results="stack", use_buffers=False, num_threads=1, **options
+    )
 
 
 def _start_ray(make, actor, frames_per_batch: int, transforms: dict, options: dict) -> BaseCollector:

@@ -147,9 +147,9 @@ def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeRe
     """Each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
     running: dict[int, _OpenEpisode] = {}
     for batch in collector:
-        for step in batch.unbind(1):
+        for step in batch.unbind(-1):
             _check_keys(step)
-            for row in step.unbind(0):
+            for row in step.reshape(-1).unbind(0):
                 seed = int(row[keys.EPISODE_SEED])
                 if seed not in pending:
                     continue

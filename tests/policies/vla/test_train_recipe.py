@@ -32,6 +32,13 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     assert models[0] == models[1]
     check_policy(VLAPolicy.from_pretrained(broken / "policy"))
 
+    # from there once more: the first step of a warm-up moves nothing, and sizes are those of the policy
+    again = tmp_path / "again"
+    no_lessons = ["grounding.look_steps=0", "grounding.answer_steps=0"]
+    still = [f"demos={demos}", f"init={broken}/policy", "size=small", "max_steps=1", "batch_size=2"]
+    train_unbroken("train_vla", again, still + no_lessons)
+    assert (again / "policy/model.safetensors").read_bytes() == models[0]
+
 
 def check_policy(policy):
     """It knows the instructions' words, and grippers as such."""
