@@ -12,11 +12,16 @@ import pytest
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.engine_cases import EngineCase, make_network
-from torchrl_sparse.evaluation.engine_report import format_engine_table, measure_bandwidth, shape_results
+from torchrl_sparse.evaluation.engine_report import (
+    format_engine_table,
+    measure_bandwidth,
+    measure_multiply_adds,
+    shape_results,
+)
 from torchrl_sparse.evaluation.latency import measure_latency
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "benchmark_engine.py"
-ROW = {"p50_s", "p10_s", "p90_s", "n", "x_eager", "x_dense", "max_err", "limit_s"}
+ROW = {"p50_s", "p10_s", "p90_s", "n", "x_eager", "x_dense", "max_err", "limit_s", "f32_limit_s"}
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +62,22 @@ def test_results_compare_with_eager_and_own_dense(case):
     dense, pruned = shape["rows"]["torch dense"], shape["rows"]["torch random91"]
     assert pruned["x_dense"] == pytest.approx(dense["p50_s"] / pruned["p50_s"])
     assert pruned["limit_s"] < dense["limit_s"]
+    # Two rows, of each of which all steps but the first are pruned by 91 % of all.
+    assert pruned["f32_limit_s"] / dense["f32_limit_s"] == pytest.approx(products(case) / (20 * 2), rel=1e-6)
+    native = shape["rows"].get("native-bf16 dense")
+    assert native is None or native["f32_limit_s"] is None
     assert "| torch random91 |" in format_engine_table("toy", shape)
 
 
-def test_bandwidth_is_a_rate_that_a_machine_can_have(case):
+def products(case):
+    """Dense steps of one row that have as many products as the random masks of all rows leave: one FFN is two of SA."""
+    computed = (~case.queries["random91"].mask).sum(dim=(0, 1)).view(-1, 3).sum(dim=0)
+    return (computed[0] + 2 * computed[2]).item() / (3 * case.network.n_layer)
+
+
+def test_limits_are_rates_that_a_machine_can_have(case):
     assert 1e8 < measure_bandwidth(case.network) < 1e12
+    assert 1e8 < measure_multiply_adds(size=256) < 1e13
 
 
 def test_an_unknown_shape_is_refused():

@@ -66,6 +66,12 @@ class Query:
         """How often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
         return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0)
 
+    def row_evaluations(self, batch: int) -> int | Tensor:
+        """How often each block is computed, counting every row by itself, i64 [3L]; one number if all are as often."""
+        if self.mask is None:
+            return batch * self.schedule.num_inference_steps
+        return (~self.mask).sum(dim=(0, 1))
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -76,12 +82,14 @@ class Variant:
         kind: of the query.
         dense: name of the variant that runs ``"dense"`` in the same runner.
         weight_bytes: size of a weight as the runner reads it.
+        in_f32: whether the runner multiplies and adds in f32.
     """
 
     call: Callable[[], Tensor]
     kind: str
     dense: str
     weight_bytes: int = 4
+    in_f32: bool = True
 
 
 class EngineCase:
@@ -131,7 +139,8 @@ class EngineCase:
                     engines[query.schedule] = make(self.network, query.schedule)
                 call = partial(self._denoise, engines[query.schedule], query)
                 weight_bytes = 2 if runner in _HALF_RUNNERS else 4
-                variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes)
+                in_f32 = _HALF_RUNNERS.get(runner) != "bfloat16"
+                variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
         return variants
 
     def _denoise(self, engine, query: Query) -> Tensor:

@@ -6,16 +6,17 @@ Schema version 1 (seconds; ``null`` where there is nothing to compare)::
      "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
      "shapes": {NAME: {
         "threads": int, "batch": int,
-        "bandwidth_gb_per_s": float,
+        "bandwidth_gb_per_s": float, "f32_gflops_per_s": float,
         "rows": {VARIANT: {"p50_s": float, "p10_s": float, "p90_s": float, "n": int,
-                           "x_eager": float, "x_dense": float, "max_err": float, "limit_s": float}},
+                           "x_eager": float, "x_dense": float, "max_err": float, "limit_s": float, "f32_limit_s": float}},
         "program_build_s": float,
         "all_pruned_step_s": {RUNNER: float}}}}
 
 ``x_eager`` and ``x_dense`` are ratios of medians, to the eager baseline and to the dense query of the same runner;
 ``max_err`` is the largest difference of a normalised action to the reference's, on the same noise and mask. ``limit_s`` is what
 reading the weights of all computed blocks takes, once per evaluation, at ``bandwidth_gb_per_s``: the rate at which one thread
-reads an array as large as those weights, again and again.
+reads an array as large as those weights, again and again. ``f32_limit_s`` is what multiplying with these weights takes, for
+every row that computes them, at ``f32_gflops_per_s``: the rate of torch's product of two large matrices; ``null`` for bf16.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import os
 import statistics
 import time
 from collections.abc import Mapping
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,7 @@ from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusio
 __all__ = [
     "format_engine_table",
     "measure_bandwidth",
+    "measure_multiply_adds",
     "plot_engine_times",
     "program_seconds",
     "save_engine_results",
@@ -67,6 +70,16 @@ def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> fl
     return 4 * size / best
 
 
+def measure_multiply_adds(size: int = 1536, repeats: int = 5) -> float:
+    """FLOPs (2 * MAC) per second of a large product of f32 matrices in PyTorch, the best of ``repeats``."""
+    matrix, best = torch.ones(size, size), float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        matrix @ matrix
+        best = min(best, time.perf_counter() - start)
+    return 2 * size**3 / best
+
+
 def program_seconds(case: EngineCase, repeats: int = 50) -> float:
     """Median seconds that the program of a new random mask takes to build."""
     mask = case.queries["random91"].mask[0].numpy()
@@ -89,7 +102,7 @@ def shape_results(
         latency: of each of them, measured interleaved.
         threads: that were used.
     """
-    bandwidth = measure_bandwidth(case.network)
+    bandwidth, multiply_adds = measure_bandwidth(case.network), measure_multiply_adds()
     expected = {kind: case.reference(kind) for kind in case.queries}
     rows = {}
     for name, variant in variants.items():
@@ -103,11 +116,13 @@ def shape_results(
             "x_dense": latency[variant.dense].p50 / latency[name].p50,
             "max_err": (variant.call() - expected[variant.kind]).abs().max().item(),
             "limit_s": _bytes_read(case, variant) / bandwidth,
+            "f32_limit_s": _product_flops(case, variant) / multiply_adds if variant.in_f32 else None,
         }
     return {
         "threads": threads,
         "batch": case.batch,
         "bandwidth_gb_per_s": bandwidth / 1e9,
+        "f32_gflops_per_s": multiply_adds / 1e9,
         "rows": rows,
         "program_build_s": program_seconds(case),
         "all_pruned_step_s": _all_pruned_steps(case, rows),
@@ -115,11 +130,19 @@ def shape_results(
 
 
 def _bytes_read(case: EngineCase, variant: Variant) -> int:
-    query, network = case.queries[variant.kind], case.network
-    weights = torch.tensor(block_weights(network)).repeat(network.n_layer)
+    query = case.queries[variant.kind]
     evaluations = query.evaluations()
     count = query.schedule.num_inference_steps if evaluations is None else evaluations
-    return variant.weight_bytes * int((weights * count).sum())
+    return variant.weight_bytes * int((_all_weights(case) * count).sum())
+
+
+def _product_flops(case: EngineCase, variant: Variant) -> int:
+    count = case.queries[variant.kind].row_evaluations(case.batch)
+    return 2 * case.network.horizon * int((_all_weights(case) * count).sum())
+
+
+def _all_weights(case: EngineCase) -> torch.Tensor:
+    return torch.tensor(block_weights(case.network)).repeat(case.network.n_layer)
 
 
 def _all_pruned_steps(case: EngineCase, rows: Mapping[str, Any]) -> dict[str, float]:
@@ -142,8 +165,10 @@ def save_engine_results(results: Mapping[str, Any], path: str | os.PathLike) -> 
 def format_engine_table(name: str, shape: Mapping[str, Any]) -> str:
     """The rows of one shape as a table in Markdown."""
     lines = [
-        f"{name}: batch {shape['batch']}, threads {shape['threads']}, weights read at "
-        f"{shape['bandwidth_gb_per_s']:.1f} GB/s, program built in {1e3 * shape['program_build_s']:.2f} ms",
+        f"{name}: batch {shape['batch']}, threads {shape['threads']}, "
+        f"weights read at {shape['bandwidth_gb_per_s']:.1f} GB/s, "
+        f"products of {shape['f32_gflops_per_s']:.0f} GFLOP/s, "
+        f"program built in {1e3 * shape['program_build_s']:.2f} ms",
         "",
         "| variant | p50 (ms) | p10 – p90 | × eager | × own dense | max error |",
         "|---|---|---|---|---|---|",
@@ -160,7 +185,7 @@ def format_engine_table(name: str, shape: Mapping[str, Any]) -> str:
 def plot_engine_times(
     name: str, shape: Mapping[str, Any], machine: Mapping[str, Any], path: str | os.PathLike
 ) -> Path:
-    """Median time of every variant as a bar (log axis), and what reading its weights alone would take as a tick.
+    """Median time of every variant as a bar (log axis), and what reading its weights or multiplying with them would take.
 
     Args:
         name: of the shape, for the title.
@@ -171,31 +196,33 @@ def plot_engine_times(
     rows = shape["rows"]
     names = sorted(rows, key=lambda variant: -rows[variant]["p50_s"])
     times = [1e3 * rows[variant]["p50_s"] for variant in names]
-    limits = [1e3 * rows[variant]["limit_s"] for variant in names]
+    limits = {
+        "memory-bandwidth limit": ("#D55E00", [1e3 * rows[variant]["limit_s"] for variant in names]),
+        "f32 multiply-add limit": (
+            "#009E73",
+            [1e3 * (rows[variant]["f32_limit_s"] or nan) for variant in names],
+        ),
+    }
     figure, axes = make_figure(9, 1.6 + 0.24 * len(names))
     places = range(len(names))
     axes.barh(
         places, times, color=[_COLORS[variant.split()[0].split("-")[0]] for variant in names], height=0.7
     )
-    axes.plot(
-        limits,
-        places,
-        "|",
-        color="#D55E00",
-        markersize=11,
-        markeredgewidth=2.5,
-        label="memory-bandwidth limit",
-    )
+    for label, (color, values) in limits.items():
+        axes.plot(values, places, "|", color=color, markersize=11, markeredgewidth=2.5, label=label)
     for place, milliseconds in zip(places, times, strict=True):
         label = f" {milliseconds:.0f}" if milliseconds >= 100 else f" {milliseconds:.3g}"
         axes.annotate(label, (milliseconds, place), va="center", fontsize=9)
     axes.set_xscale("log")
-    axes.set_xlim(min([*times, *limits]) / 2, 2.5 * max(times))
+    axes.set_xlim(
+        min(times + [least for _, values in limits.values() for least in values if least > 0]) / 2,
+        2.5 * max(times),
+    )
     axes.set_yticks(places, names, fontsize=9)
     axes.set_ylim(-0.6, len(names) - 0.4)
     axes.grid(False, axis="y")
     axes.set_xlabel("time per query, median (ms, log scale)")
     threads = f"{shape['threads']} thread{'' if shape['threads'] == 1 else 's'}"
     axes.set_title(f"{name}, batch {shape['batch']}; {machine['cpu']}, {threads}", loc="left")
-    figure.legend(loc="outside lower center", frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     return save_figure(figure, path)
