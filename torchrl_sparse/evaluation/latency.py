@@ -150,7 +150,7 @@ def describe_machine(device: torch.device | str = "cpu", threads: int | None = N
     device = torch.device(device)
     name = f"{device.type} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
     return {
-        "cpu": f"{_cpu_model()}, {_usable_cores()} cores usable",
+        "cpu": f"{_cpu_model()}, {(cores := _usable_cores())} core{'s' * (cores != 1)} usable",
         "threads": torch.get_num_threads() if threads is None else int(threads),
         "device": name,
         "torch": torch.__version__,

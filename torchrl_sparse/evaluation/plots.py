@@ -36,7 +36,10 @@ _METHOD_COLORS = {
     "bac_blockwise": "#D55E00",
     "bac": "#0072B2",
 }
-_OTHER_COLORS = ("#009E73", "#8C6BB1", "#A6761D", "#B2182B", "#4D4D4D", "#66A61E")
+_OTHER_COLORS = (
+    *("#009E73", "#8C6BB1", "#A6761D", "#B2182B", "#4D4D4D", "#66A61E"),
+    *("#E7298A", "#1B7F79", "#BCBD22", "#3F2A8C"),
+)
 _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
 

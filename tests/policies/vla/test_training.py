@@ -136,6 +136,11 @@ def test_lessons_come_before_the_actions_and_leave_the_policy_as_it_was_built(ma
     assert trainer.averaged().state_dict().keys() == network.state_dict().keys()
 
 
+@pytest.mark.parametrize(("warmup", "first"), [(0, 1.0), (2, 0.0)])
+def test_warm_up_begins_at_nothing_unless_there_is_none(make_trainer, warmup, first):
+    assert make_trainer(lr_warmup_steps=warmup).lr == 1e-3 * first
+
+
 def test_a_training_with_lessons_goes_on_to_the_last_bit(make_trainer, demos, things, tmp_path):
     settings = (replace(demos, objects=things), GroundingConfig(2, 2))
     unbroken, first, second = (make_trainer(*settings) for _ in range(3))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -126,7 +127,7 @@ class VLATrainer(Trainer):
 
         def factor(step: int) -> float:
             since = step - max(begin for begin in begins if begin <= step)
-            warm = min(1.0, since / max(1, config.lr_warmup_steps))
+            warm = since / config.lr_warmup_steps if since < config.lr_warmup_steps else 1.0
             return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.max_steps)))
 
         for group in self._optimizer.param_groups:
@@ -138,20 +139,27 @@ class VLATrainer(Trainer):
         return super().averaged()["network"]
 
     def header(self) -> dict[str, dict]:
-        data, network, objects = self.demos.episodes.data, self.policy.network.config, self.demos.objects
-        numbers = {"/".join(key): int(data[key].sum(dtype=torch.int64)) for key in network.cameras}
-        numbers |= {name: checksum(data[name]) for name in (keys.ACTION,)}
-        if self.lessons != GroundingConfig():
-            numbers["objects"] = checksum(objects.positions.abs())
         return {
             "config": asdict(self.config) | asdict(self.lessons),
-            "network_config": network.to_dict(),
+            "network_config": self.policy.network.config.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
                 "instructions": list(self.demos.instructions),
-                **numbers,
+                **self._data_sums,
             },
         }
+
+    @cached_property
+    def _data_sums(self) -> dict[str, float]:
+        """Tell one set of demonstrations from another. All pictures are read once, not at every checkpoint."""
+        data, objects = self.demos.episodes.data, self.demos.objects
+        sums = {
+            "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.policy.network.config.cameras
+        }
+        sums[keys.ACTION] = checksum(data[keys.ACTION])
+        if self.lessons != GroundingConfig():
+            sums["objects"] = checksum(objects.positions.abs())
+        return sums
 
 
 @contextmanager
