@@ -71,15 +71,15 @@ def main(config: DictConfig) -> None:
     recorded = recorded_queries(dense, actor, environment, seeds[: config.probe_episodes])
     recorded = [*tqdm(recorded, total=len(seeds[: config.probe_episodes]), unit="episode", desc="recording")]
 
-    policies, episodes = {}, {}
+    policies, episodes, options = {}, {}, OmegaConf.to_container(config.specprune)
     with backend_runtime(config.backend, config.workers):  # one Ray for all methods
         for text, method in sorted(methods.items(), key=lambda item: item[1].like is not None):
             number = method.number
             if method.like is not None:
                 kept = token_totals(episodes[method.like]).mean
                 number = matching_share(method.pruner, dense, recorded, kept)
-            policies[text] = with_pruner(dense, method.pruner(number))
-            identity = method_identity(text, number, dense)
+            policies[text] = with_pruner(dense, method.pruner(number, options))
+            identity = method_identity(text, number, dense, options)
             episodes[text] = evaluate(text, policies[text], environment, seeds, identity, config)
     policies = {text: policies[text] for text in methods}  # in the order asked for
 

@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -51,7 +51,9 @@ def main(config: DictConfig) -> None:
     for point in points:
         print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
     alpha = smallest_alpha(points, config.tolerance)
-    budget = TokenBudget(config.preset, alpha, config.measure, config.tolerance, points)
+    budget = TokenBudget(
+        config.preset, alpha, config.measure, config.tolerance, points, OmegaConf.to_container(config.options)
+    )
     out = Path(config.out)
     budget.save(out)
     plot_token_budget(budget, out.with_suffix(".png"))
@@ -80,7 +82,7 @@ def lost_episodes(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
 
 
 def pruners(config: DictConfig) -> list[SpecPrune]:
-    return [SpecPrune(config.preset, alpha=alpha) for alpha in config.alphas]
+    return [SpecPrune(config.preset, alpha=alpha, **config.options) for alpha in config.alphas]
 
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:

@@ -44,6 +44,10 @@ def test_names_make_pruners():
     assert TokenMethod.parse("dense").pruner() is None
     assert TokenMethod.parse("specprune@0.4").pruner().options.alpha == 0.4
     assert not TokenMethod.parse("specprune_static").pruner().options.dynamic
+    gentle = (
+        TokenMethod.parse("specprune_static@0.4").pruner(options={"keep_share": 0.9, "dynamic": True}).options
+    )
+    assert (gentle.keep_share, gentle.dynamic, gentle.alpha) == (0.9, False, 0.4)
     assert TokenMethod.parse("random@0.25").pruner().share == 0.25
     assert TokenMethod.parse("fastv@specprune").pruner(0.125).share == 0.125
     gates = [
@@ -128,6 +132,7 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
         methods,
         "pairs=[[specprune@0.2,fastv@specprune@0.2]]",
         "videos=[specprune@0.2]",
+        "specprune={keep_share: 0.9}",
     )
     if GL_HINT in done.stderr:
         pytest.skip(GL_HINT)

@@ -97,11 +97,11 @@ def test_a_tolerance_that_none_keeps_is_refused():
 
 
 def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
-    budget = TokenBudget("release", 0.5, "action_error", 0.03, POINTS)
+    budget = TokenBudget("release", 0.5, "action_error", 0.03, POINTS, {"keep_share": 0.95})
     budget.save(tmp_path / "budget.json")
     again = TokenBudget.load(tmp_path / "budget.json")
     assert again == budget
-    assert again.pruner().options == SpecPrune("release", alpha=0.5).options
+    assert again.pruner().options == SpecPrune("release", alpha=0.5, keep_share=0.95).options
 
 
 @pytest.mark.parametrize(

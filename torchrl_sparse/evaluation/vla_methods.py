@@ -93,14 +93,21 @@ class TokenMethod:
             f"methods: expected {name}@NUMBER{f' or {name}@METHOD' if name in _MATCHED else ''}, got {text!r}"
         )
 
-    def pruner(self, number: float | None = None) -> TokenPruner | None:
-        """What prunes; ``number`` takes the place of `number`, for methods that match another."""
+    def pruner(
+        self, number: float | None = None, options: Mapping[str, Any] | None = None
+    ) -> TokenPruner | None:
+        """What prunes.
+
+        Args:
+            number: takes the place of `number`, for methods that match another.
+            options: of SpecPrune, see `SpecPruneOptions`; other methods do not read them.
+        """
         number = self.number if number is None else number
         if self.name == DENSE:
             return None
         if self.name in _SPECPRUNE:
             alpha = {} if number is None else {"alpha": number}
-            return SpecPrune(**_SPECPRUNE[self.name], **alpha)
+            return SpecPrune(**{**(options or {}), **_SPECPRUNE[self.name], **alpha})
         return _BASELINES[self.name](*([] if number is None else [number]))
 
     def executor(self, policy: VLAPolicy, n_action_steps: int) -> ChunkExecutor:
@@ -109,9 +116,12 @@ class TokenMethod:
         return ChunkExecutor(policy, n_action_steps, gate)
 
 
-def method_identity(text: str, number: float | None, policy: VLAPolicy) -> dict[str, Any]:
+def method_identity(
+    text: str, number: float | None, policy: VLAPolicy, options: Mapping[str, Any]
+) -> dict[str, Any]:
     """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
-    return {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
+    fixed = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
+    return fixed | ({"options": dict(options)} if TokenMethod.parse(text).name in _SPECPRUNE else {})
 
 
 def instructed_env(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,7 @@ class TokenBudget:
         measure: what the losses are, ``"action_error"`` or ``"success"``.
         tolerance: the largest loss that was accepted.
         points: all that was tried.
+        options: of `SpecPrune`, that differ from the preset's.
 
     Examples:
         >>> points = (BudgetPoint(0.5, 90.0, 0.03), BudgetPoint(1.0, 150.0, 0.01))
@@ -80,10 +81,11 @@ class TokenBudget:
     measure: str
     tolerance: float
     points: tuple[BudgetPoint, ...]
+    options: dict[str, Any] = field(default_factory=dict)
 
     def pruner(self) -> SpecPrune:
         """`SpecPrune` at this alpha."""
-        return SpecPrune(self.preset, alpha=self.alpha)
+        return SpecPrune(self.preset, alpha=self.alpha, **self.options)
 
     def save(self, path: str | Path) -> None:
         """Writes a JSON file that `load` reads."""
