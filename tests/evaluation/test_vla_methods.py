@@ -132,7 +132,7 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
         methods,
         "pairs=[[specprune@0.2,fastv@specprune@0.2]]",
         "videos=[specprune@0.2]",
-        "specprune={keep_share: 0.9}",
+        "+specprune.keep_share=0.9",
     )
     if GL_HINT in done.stderr:
         pytest.skip(GL_HINT)
