@@ -159,7 +159,7 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
 
     first, *_, last = log.read_text().splitlines(keepends=True)
     log.write_text(first + last)
-    again = run(policy_folder, tmp_path, methods, "pairs=[]", "videos=[]")
+    again = run(policy_folder, tmp_path, methods, "pairs=[]", "videos=[]", "+specprune.keep_share=0.9")
     assert again.returncode == 0, again.stderr[-3000:]
     assert read_episodes(log) == found
     assert sorted(found) == [100000, 100001]
