@@ -214,10 +214,7 @@ def plot_engine_times(
         label = f" {milliseconds:.0f}" if milliseconds >= 100 else f" {milliseconds:.3g}"
         axes.annotate(label, (milliseconds, place), va="center", fontsize=9)
     axes.set_xscale("log")
-    axes.set_xlim(
-        min(times + [least for _, values in limits.values() for least in values if least > 0]) / 2,
-        2.5 * max(times),
-    )
+    axes.set_xlim(np.nanmin([times, *(values for _, values in limits.values())]) / 2, 2.5 * max(times))
     axes.set_yticks(places, names, fontsize=9)
     axes.set_ylim(-0.6, len(names) - 0.4)
     axes.grid(False, axis="y")

@@ -149,8 +149,9 @@ def describe_machine(device: torch.device | str = "cpu", threads: int | None = N
     """
     device = torch.device(device)
     name = f"{device.type} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
+    cores = _usable_cores()
     return {
-        "cpu": f"{_cpu_model()}, {(cores := _usable_cores())} core{'s' * (cores != 1)} usable",
+        "cpu": f"{_cpu_model()}, {cores} {'core' if cores == 1 else 'cores'} usable",
         "threads": torch.get_num_threads() if threads is None else int(threads),
         "device": name,
         "torch": torch.__version__,
