@@ -50,8 +50,8 @@ def main(config: DictConfig) -> None:
     if (out / "checkpoint.pt").exists():
         trainer.load(out / "checkpoint.pt")
         print(f"{out / 'checkpoint.pt'}: going on from update {trainer.step}")
-    elif config.init is not None:
-        learn_schedule(trainer, Path(config.init))
+    elif schedules := initial_schedules(config):
+        learn_schedules(trainer, schedules)
     stop = StopSignal()
     train(trainer, config, stop)
     if config.logger == "csv" and trainer.step >= config.log_every:
@@ -121,16 +121,17 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
     return PrunerTrainer(gates, policy, reference, options)
 
 
-def learn_schedule(trainer: PrunerTrainer, path: Path) -> None:
-    with progress("update", f"learning {path.name}") as show:
-        imitate(
-            trainer.gates,
-            Schedule.load(path).mask(),
-            trainer.train_set,
-            seed=trainer.config.seed,
-            on_progress=show,
-        )
-    print(f"{path}: learned, {trainer.validate()}")
+def initial_schedules(config: DictConfig) -> list[str]:
+    if config.init is None or isinstance(config.init, str):
+        return [config.init] if config.init else []
+    return list(config.init)
+
+
+def learn_schedules(trainer: PrunerTrainer, paths: list[str]) -> None:
+    masks = [Schedule.load(path).mask() for path in paths]
+    with progress("update", "learning the schedules") as show:
+        imitate(trainer.gates, masks, trainer.train_set, seed=trainer.config.seed, on_progress=show)
+    print(f"{', '.join(paths)}: learned, {trainer.validate()}")
 
 
 def train(trainer: PrunerTrainer, config: DictConfig, stop: StopSignal) -> None:
@@ -156,7 +157,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
     trainer.save(out / "checkpoint.pt")
     settings = {
         **asdict(trainer.config),
-        "init": config.init,
+        "init": initial_schedules(config),
         "reference": dict(config.reference),
         "updates": trainer.step,
     }

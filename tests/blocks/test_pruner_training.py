@@ -16,7 +16,7 @@ from torchrl_sparse.blocks.pruner_training import (
     imitate,
     sparsity_loss,
 )
-from torchrl_sparse.blocks.sag import PrunerNetwork
+from torchrl_sparse.blocks.sag import PrunerNetwork, rate_threshold
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -122,14 +122,31 @@ def test_gates_learn_a_mask_to_begin_from(policy, reference, rate_input):
     mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.5
     mask[0] = False
     gates = sag_gates(policy, rate_input=rate_input)
-    imitate(gates, mask, reference, updates=1200)
+    imitate(gates, [mask], reference, updates=1200)
     cond = reference[keys.COND][:5]
     rate = torch.full((5, 1), prune_rate(mask).item()) if rate_input else None
     logits = gates.prune_logits(cond, rate)[:, 1:]
     assert ((logits > 0) == mask[1:]).float().mean() > 0.98
     assert logits.abs().max() < 4  # or gradients would not reach them
     with pytest.raises(ValueError, match=r"mask: expected \[K, 3L\] = \[\d+, \d+\] as the gates have, got"):
-        imitate(gates, mask[1:], reference)
+        imitate(gates, [mask[1:]], reference)
+
+
+def test_gates_learn_a_mask_for_each_of_several_rates(policy, reference):
+    generator = torch.Generator().manual_seed(1)
+    masks = [torch.rand(NUM_STEPS, NUM_BLOCKS, generator=generator) < rate for rate in (0.3, 0.7)]
+    for mask in masks:
+        mask[0] = False
+    gates = sag_gates(policy, rate_input=True)
+    imitate(gates, masks, reference, updates=1200)
+    cond = reference[keys.COND][:5]
+    for mask in masks:
+        rate = torch.full((5, 1), prune_rate(mask).item())
+        logits = gates.prune_logits(cond, rate)
+        pruned = logits[:, 1:] > rate_threshold(logits, rate)
+        assert (pruned == mask[1:]).float().mean() > 0.95
+    with pytest.raises(ValueError, match="masks: expected one for gates that do not read the rate, got 2"):
+        imitate(sag_gates(policy), masks, reference)
 
 
 @pytest.mark.parametrize(

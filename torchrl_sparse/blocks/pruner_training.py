@@ -12,7 +12,7 @@ update s follows from ``(seed, s)``, so that a training that was stopped goes on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
@@ -124,7 +124,7 @@ class PrunerConfig:
 
 def imitate(
     gates: Gates,
-    mask: Tensor,
+    masks: Sequence[Tensor],
     reference: TensorDict,
     *,
     updates: int = 600,
@@ -134,23 +134,31 @@ def imitate(
 ) -> None:
     """Teach untrained gates a mask, the same for all observations, for their training to begin from.
 
+    Gates that read the rate can be taught several, each at its own prune rate: one alone says nothing about the
+    others, and what a training then learns from rates far from it undoes what works.
+
     From a random mask of a long chain a training first has to find back to any that works, and each update of
     a mask that prunes little costs most. The cross-entropy is taken against probabilities of 1/4 and 3/4,
     since logits far from zero would get next to no gradient through the straight-through estimator.
 
     Args:
         gates: what will be trained, in place.
-        mask: bool [K, 3L], True = pruned.
+        masks: bool [K, 3L] each, True = pruned.
         reference: see :mod:`torchrl_sparse.blocks.pruner_reference`; its observations are what the mask is learned on.
-        updates, lr, seed: of the imitation.
+        updates: for each mask.
+        lr, seed: of the imitation.
         on_progress: called with (updates made, all).
 
     Raises:
-        ValueError: if the mask is not of the shape of the gates.
+        ValueError: if a mask is not of the shape of the gates, or if gates that do not read the rate get several.
     """
+    if len(masks) != 1 and not gates.rate_input:
+        raise ValueError(f"masks: expected one for gates that do not read the rate, got {len(masks)}")
     torch.manual_seed(seed)
     optimizer = torch.optim.Adam(gates.parameters(), lr)
-    for update in range(updates):
+    total = updates * len(masks)
+    for update in range(total):
+        mask = masks[update % len(masks)]
         cond = reference[keys.COND][torch.randint(len(reference), (_IMITATION_BATCH,))]
         rate = torch.full((len(cond), 1), prune_rate(mask).item()) if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
@@ -163,7 +171,7 @@ def imitate(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        on_progress(update + 1, updates)
+        on_progress(update + 1, total)
 
 
 def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool = False) -> Tensor:
