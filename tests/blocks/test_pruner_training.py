@@ -138,13 +138,13 @@ def test_gates_learn_a_mask_for_each_of_several_rates(policy, reference):
     for mask in masks:
         mask[0] = False
     gates = sag_gates(policy, rate_input=True)
-    imitate(gates, masks, reference, updates=1200)
+    imitate(gates, masks, reference, updates=600)
     cond = reference[keys.COND][:5]
     for mask in masks:
         rate = torch.full((5, 1), prune_rate(mask).item())
         logits = gates.prune_logits(cond, rate)
         pruned = logits[:, 1:] > rate_threshold(logits, rate)
-        assert (pruned == mask[1:]).float().mean() > 0.95
+        assert (pruned == mask[1:]).float().mean() > 0.9
     with pytest.raises(ValueError, match="masks: expected one for gates that do not read the rate, got 2"):
         imitate(sag_gates(policy), masks, reference)
 
