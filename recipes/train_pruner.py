@@ -13,6 +13,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import hydra
@@ -20,22 +21,25 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
 from safetensors.torch import save_file
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
-from torchrl_sparse.blocks.pruner_reference import make_reference
+from torchrl_sparse.blocks.pruner_reference import make_reference, with_queries
 from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
-from torchrl_sparse.blocks.static import Schedule
+from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
 from torchrl_sparse.files import atomic_path
 from torchrl_sparse.interrupt import StopSignal
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.published import published_shape
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.training_loop import make_logger
+
+ROLLOUT_SEED = 2_000_000  # of the first episode; no demonstration, calibration or evaluation has it
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -68,6 +72,7 @@ def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
         **policy.schedule.config,
         "demos": config.demos,
         **config.reference,
+        "rollouts": [config.rollouts, *initial_schedules(config)[:1]] if config.rollouts else [],
     }
     if path.exists():
         return read_reference(path, made_for)
@@ -75,9 +80,35 @@ def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
     with progress("window", "dense answers") as show:
         reference = make_reference(policy, demos, **config.reference, on_progress=show)
+    if config.rollouts:
+        queries = closed_loop_queries(policy, config)
+        with progress("query", "dense answers") as show:
+            reference = with_queries(policy, reference, queries, seed=config.reference.seed, on_progress=show)
     with atomic_path(path) as temporary:
         save_file(dict(reference.flatten_keys("/").items()), temporary, {"made_for": json.dumps(made_for)})
     return reference
+
+
+def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDictBase:
+    """What is asked in episodes under the first of the schedules in ``init``, or under the dense policy."""
+    if config.reference.target != "teacher":
+        raise ValueError(
+            f"rollouts: no demonstration says what to do in them; expected reference.target=teacher, "
+            f"got {config.reference.target}"
+        )
+    from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.envs.transforms import make_env
+    from torchrl_sparse.evaluation.methods import env_options, record_queries
+
+    task = find_task(config.task)
+    played = DiffusionPolicy(
+        policy.network, policy.normalizer, vision=policy.vision, schedule=policy.schedule, engine="auto"
+    )
+    for path in initial_schedules(config)[:1]:
+        played.plan = StaticSchedule(path)
+    environment = partial(make_env, task.name, **env_options(policy))
+    actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
+    return record_queries(actor, environment, range(ROLLOUT_SEED, ROLLOUT_SEED + config.rollouts))
 
 
 @contextmanager
@@ -159,6 +190,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         **asdict(trainer.config),
         "init": initial_schedules(config),
         "reference": dict(config.reference),
+        "rollouts": config.rollouts,
         "updates": trainer.step,
     }
     fixed = Schedule.from_mask(

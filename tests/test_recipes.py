@@ -10,6 +10,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
+from safetensors.torch import load_file
 
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse import DiffusionPolicy
@@ -227,8 +228,11 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         *training,
         f"out={work}/l2c",
         f"init={work}/sag/fixed.json",
+        "rollouts=1",
     )
     assert "fixed.json: learned" in output
+    windows, joined = (load_file(work / out / "reference.safetensors")["target"] for out in ("sag", "l2c"))
+    assert len(joined) > len(windows)
     plans = shutil.copytree(schedules, work / "plans")
     shutil.copytree(work / "sag" / "pruner", plans / "sag")
     for path in (work / "l2c" / "l2c.json", work / "sag" / "fixed.json"):

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.mask import prune_rate
-from torchrl_sparse.blocks.pruner_reference import make_reference
+from torchrl_sparse.blocks.pruner_reference import make_reference, with_queries
 from torchrl_sparse.blocks.pruner_training import (
     PrunerConfig,
     PrunerTrainer,
@@ -78,6 +78,20 @@ def test_the_reference_set_of_data_holds_what_was_demonstrated(policy, demos):
     assert torch.equal(
         reference["target"].sum((1, 2)).sort().values, windows[keys.ACTION].sum((1, 2)).sort().values
     )
+
+
+def test_queries_join_a_reference_set_with_the_dense_answers(policy, reference):
+    queries = TensorDict(
+        {keys.COND: torch.randn(5, OBS_STEPS, COND_DIM), keys.SEED: torch.arange(5)[:, None]}, [5]
+    )
+    joined = with_queries(policy, reference, queries)
+    assert len(joined) == len(reference) + 5
+    dense = policy.denoise(policy.sample_noise(torch.arange(5)), queries[keys.COND])
+    for expected, row in zip(dense, range(5), strict=True):
+        (found,) = (joined[keys.SEED] == row).squeeze(-1).nonzero().flatten()
+        assert torch.allclose(joined["target"][found], expected, atol=1e-5)
+    kept = torch.isin(joined["target"].sum((1, 2)), reference["target"].sum((1, 2)))
+    assert kept.sum() == len(reference)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 1.5])

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import Literal
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["ANSWER_BATCH", "make_reference"]
+__all__ = ["ANSWER_BATCH", "make_reference", "with_queries"]
 
 ANSWER_BATCH = 16  # queries that the policy answers at a time
 
@@ -71,8 +71,37 @@ def make_reference(
     return reference
 
 
+def with_queries(
+    policy: DiffusionPolicy,
+    reference: TensorDict,
+    queries: TensorDictBase,
+    *,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TensorDict:
+    """A reference set together with what was asked in closed loop, in random order.
+
+    A pruned policy comes to states that demonstrations do not hold; as in DAgger (arXiv:1011.0686), the dense policy
+    says what it would have done there.
+
+    Args:
+        policy: the dense policy with the sampler that will be pruned.
+        reference: see :func:`make_reference`.
+        queries: [n], with ``("diffusion", "cond")`` f32 [n, To, D] and ``("diffusion", "seed")`` i64 [n, 1].
+        seed: of the order.
+        on_progress: called with (queries answered, all).
+
+    Returns:
+        [N + n], with the keys of ``reference``.
+    """
+    asked = queries.select(keys.COND, keys.SEED)
+    asked["target"] = _dense_answers(policy, asked, on_progress)
+    together = torch.cat([reference, asked])
+    return together[torch.randperm(len(together), generator=torch.Generator().manual_seed(seed))]
+
+
 def _dense_answers(
-    policy: DiffusionPolicy, reference: TensorDict, on_progress: Callable[[int, int], None]
+    policy: DiffusionPolicy, reference: TensorDictBase, on_progress: Callable[[int, int], None]
 ) -> Tensor:
     answers: list[Tensor] = []
     for part in reference.split(ANSWER_BATCH):
