@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchrl_sparse.evaluation.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.plots import method_colors
 
 if TYPE_CHECKING:
     from torchrl_sparse.tokens.calibration import TokenBudget
@@ -145,13 +146,16 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
         shapes = {name: list(np.shape(values)) for name, values in depth.items()}
         raise ValueError(f"depth: expected [queries, N] for at least one method, got {shapes}")
     figure, axes = make_figure(9, 3.8)
-    for name, values in depth.items():
+    colors = method_colors(depth)
+    for place, (name, values) in enumerate(depth.items()):
         per_layer = [(np.asarray(values) > layer).sum(1).mean() for layer in range(num_layers)]
-        axes.step(range(num_layers), per_layer, where="mid", linewidth=1.8, label=name)
+        # Methods that keep the same lie on top of each other, so each line is thinner than those below it.
+        width = 1.5 + 4.5 * (len(depth) - 1 - place) / len(depth)
+        axes.step(range(num_layers), per_layer, where="mid", linewidth=width, color=colors[name], label=name)
     axes.set_xlabel("decoder layer")
     axes.set_ylabel("visual tokens, mean")
     axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, ncols=min(4, len(depth)))
+    figure.legend(frameon=False, loc="outside right center")
     return save_figure(figure, path)
 
 
