@@ -189,6 +189,15 @@ def test_a_resumed_training_is_equal_to_the_last_bit(policy, reference, tmp_path
         assert torch.equal(value, second.gates.state_dict()[name])
 
 
+def test_without_updates_gates_stay_as_they_are(policy, reference, tmp_path):
+    trainer = trainer_of(policy, reference, max_updates=0)
+    assert trainer.total == 0
+    before = {name: value.clone() for name, value in trainer.gates.state_dict().items()}
+    trainer.save(tmp_path / "checkpoint.pt")
+    trainer.load(tmp_path / "checkpoint.pt")
+    assert all(torch.equal(before[name], value) for name, value in trainer.gates.state_dict().items())
+
+
 def test_the_policy_is_not_trained(policy, reference):
     before = policy.fingerprint
     trainer_of(policy, reference).train_step()

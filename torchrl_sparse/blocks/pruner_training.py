@@ -59,7 +59,8 @@ class PrunerConfig:
             in that range, and the gates must take it as an input. They then keep it exactly, and the sparsity loss
             is 0; ``cost`` has to be ``"blocks"``.
         epochs: passes over the reference set.
-        max_updates: optimiser steps, if they shall be fewer than the epochs make.
+        max_updates: optimiser steps, if they shall be fewer than the epochs make; with 0, gates stay as they are taught
+            by :func:`imitate`.
         batch_size: observations in an update.
         lr: peak learning rate, reached after 5 % of the updates; a cosine leads down to zero.
         beta: weight of the sparsity loss.
