@@ -135,8 +135,7 @@ def imitate(
 ) -> None:
     """Teach untrained gates a mask, the same for all observations, for their training to begin from.
 
-    Gates that read the rate can be taught several, each at its own prune rate: one alone says nothing about the
-    others, and what a training then learns from rates far from it undoes what works.
+    Gates that read the rate can be taught several, each at its own prune rate; one alone says nothing about the others.
 
     From a random mask of a long chain a training first has to find back to any that works, and each update of
     a mask that prunes little costs most. The cross-entropy is taken against probabilities of 1/4 and 3/4,
