@@ -100,12 +100,15 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     from torchrl_sparse.envs.transforms import make_env
     from torchrl_sparse.evaluation.methods import env_options, record_queries
 
-    task = find_task(config.task)
+    task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
-        policy.network, policy.normalizer, vision=policy.vision, schedule=policy.schedule, engine="auto"
+        policy.network,
+        policy.normalizer,
+        vision=policy.vision,
+        schedule=policy.schedule,
+        plan=StaticSchedule(schedules[0]) if schedules else None,
+        engine=policy.engine,
     )
-    for path in initial_schedules(config)[:1]:
-        played.plan = StaticSchedule(path)
     environment = partial(make_env, task.name, **env_options(policy))
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
     return record_queries(actor, environment, range(ROLLOUT_SEED, ROLLOUT_SEED + config.rollouts))
@@ -153,9 +156,7 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
 
 
 def initial_schedules(config: DictConfig) -> list[str]:
-    if config.init is None or isinstance(config.init, str):
-        return [config.init] if config.init else []
-    return list(config.init)
+    return [config.init] if isinstance(config.init, str) else list(config.init or [])
 
 
 def learn_schedules(trainer: PrunerTrainer, paths: list[str]) -> None:

@@ -10,10 +10,13 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
+import torch
 from safetensors.torch import load_file
 
 from tests.evaluation.synthetic import make_results
-from torchrl_sparse import DiffusionPolicy
+from torchrl_sparse import DiffusionPolicy, SAGPruner
+from torchrl_sparse.blocks.mask import prune_rate
+from torchrl_sparse.blocks.static import Schedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.evaluation import load_results, save_results
@@ -233,6 +236,17 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
     assert "fixed.json: learned" in output
     windows, joined = (load_file(work / out / "reference.safetensors")["target"] for out in ("sag", "l2c"))
     assert len(joined) > len(windows)
+    taught = [Schedule.load(work / name).mask() for name in ("sag/fixed.json", "l2c/l2c.json")]
+    output = run(
+        "train_pruner", *training, f"out={work}/taught", "train.rate_range=[0.1,0.7]", "train.max_updates=0",
+        f"init=[{work}/sag/fixed.json,{work}/l2c/l2c.json]",
+    )  # fmt: skip
+    assert "update 0 of 0, finished" in output
+    pruner = SAGPruner.from_pretrained(work / "taught" / "pruner")
+    cond = torch.zeros(1, *pruner.network.cond_shape)
+    for mask in taught:
+        learned = pruner.masks(cond, prune_rate(mask).view(1, 1))[0]
+        assert (learned == mask).float().mean() > 0.9
     plans = shutil.copytree(schedules, work / "plans")
     shutil.copytree(work / "sag" / "pruner", plans / "sag")
     for path in (work / "l2c" / "l2c.json", work / "sag" / "fixed.json"):

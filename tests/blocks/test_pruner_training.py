@@ -161,6 +161,8 @@ def test_gates_learn_a_mask_for_each_of_several_rates(policy, reference):
         assert (pruned == mask[1:]).float().mean() > 0.9
     with pytest.raises(ValueError, match="masks: expected one for gates that do not read the rate, got 2"):
         imitate(sag_gates(policy), masks, reference)
+    with pytest.raises(ValueError, match="masks: expected at least one, got 0"):
+        imitate(gates, [], reference)
 
 
 @pytest.mark.parametrize(
@@ -187,15 +189,6 @@ def test_a_resumed_training_is_equal_to_the_last_bit(policy, reference, tmp_path
     assert [second.train_step() for _ in range(2)] == expected
     for name, value in whole.gates.state_dict().items():
         assert torch.equal(value, second.gates.state_dict()[name])
-
-
-def test_without_updates_gates_stay_as_they_are(policy, reference, tmp_path):
-    trainer = trainer_of(policy, reference, max_updates=0)
-    assert trainer.total == 0
-    before = {name: value.clone() for name, value in trainer.gates.state_dict().items()}
-    trainer.save(tmp_path / "checkpoint.pt")
-    trainer.load(tmp_path / "checkpoint.pt")
-    assert all(torch.equal(before[name], value) for name, value in trainer.gates.state_dict().items())
 
 
 def test_the_policy_is_not_trained(policy, reference):

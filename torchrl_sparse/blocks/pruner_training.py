@@ -150,10 +150,12 @@ def imitate(
         on_progress: called with (updates made, all).
 
     Raises:
-        ValueError: if a mask is not of the shape of the gates, or if gates that do not read the rate get several.
+        ValueError: if a mask is not of the shape of the gates, if there is none, or if gates that do not read the rate
+            get several.
     """
-    if len(masks) != 1 and not gates.rate_input:
-        raise ValueError(f"masks: expected one for gates that do not read the rate, got {len(masks)}")
+    if not masks or (len(masks) > 1 and not gates.rate_input):
+        expected = "at least one" if gates.rate_input else "one for gates that do not read the rate"
+        raise ValueError(f"masks: expected {expected}, got {len(masks)}")
     torch.manual_seed(seed)
     optimizer = torch.optim.Adam(gates.parameters(), lr)
     total = updates * len(masks)
