@@ -45,6 +45,7 @@ def start(env, seed):
         *((task, "proficient") for task in EXPERTS if task != "TwoArmTransport"),
         ("Lift", "mixed"),
         ("PickPlaceCan", "mixed"),
+        ("NutAssemblySquare", "recovering"),
         pytest.param("TwoArmTransport", "mixed", marks=pytest.mark.slow),
     ],
 )
@@ -208,6 +209,20 @@ def test_slip_opens_the_fingers_once():
     opened = np.flatnonzero(disturbed(replace(STILL, slip=1.0))[:, 6] < 0)
     assert len(opened) == 4
     assert opened[-1] - opened[0] == 3
+
+
+def test_miss_closes_the_fingers_once_before_a_grasp_and_lifts_them_empty():
+    approach = np.array([*CLEAN[:6], -1.0])
+    disturb = Disturbance(replace(STILL, miss=1.0), 1, np.random.default_rng(0))
+    distances = [0.1] * 5 + [0.02] * 40
+    executed = np.stack([disturb(approach, approach[None, :3] - [[d, 0.0, 0.0]]) for d in distances])
+    closed = np.flatnonzero(executed[:, 6] > 0)
+    assert closed[0] == 5
+    assert 6 <= len(closed) == closed[-1] - closed[0] + 1 < 18
+    np.testing.assert_allclose(executed[closed[4:], 2], approach[2] + 0.04, atol=1e-9)
+    np.testing.assert_allclose(
+        np.delete(executed, closed, 0), np.tile(approach, (45 - len(closed), 1)), atol=1e-9
+    )
 
 
 def test_hesitation_stops_the_hand():

@@ -46,7 +46,7 @@ class Collection:
     Attributes:
         task: name or alias of a task that has an expert.
         episodes: demonstrations to keep; with ``keep_failures``, episodes to attempt.
-        quality: "proficient" or "mixed", see `torchrl_sparse.envs.experts.operators`.
+        quality: "proficient", "recovering" or "mixed", see `torchrl_sparse.envs.experts.operators`.
         seed: the first episode's; the others follow in order.
         keep_failures: keep failed episodes too.
     """
@@ -80,7 +80,7 @@ def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Ep
     Args:
         env: an environment of absolute actions.
         seed: fixes the initial state, the operator, their style and every disturbance.
-        quality: "proficient" or "mixed".
+        quality: "proficient", "recovering" or "mixed".
 
     Raises:
         ValueError: if the task has no expert or the quality is unknown.

@@ -1,4 +1,4 @@
-"""What the operator's hand does besides what was meant: noise, pauses, bumps and slips when executing."""
+"""What the operator's hand does besides what was meant: noise, pauses, bumps, slips and missed grasps when executing."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ _BUMP_STEPS = 4
 _BUMP_SIZE = (0.03, 0.06)  # m
 _SLIP_STEPS = 4
 _PAUSE_STEPS = (3, 9)
+_MISS_STEPS = (6, 18)
+_MISS_NEAR = 0.03  # m of commanded step below which an open hand is about to grasp
+_CLOSING_STEPS = 4  # in which the fingers close where they are, before the hand goes on without the object
+_MISS_RISE = 0.04  # m, how far ahead of the hand it then goes
 
 
 class Disturbance:
@@ -24,7 +28,7 @@ class Disturbance:
     (arXiv:1703.09327); noise shrinks with the commanded step, so grasps and insertions stay possible.
 
     Args:
-        operator: its ``noise``, ``bump``, ``slip`` and ``hesitation``.
+        operator: its ``noise``, ``bump``, ``slip``, ``miss`` and ``hesitation``.
         arms: number of arms; each has its own noise.
         rng: generator of this episode.
     """
@@ -39,6 +43,11 @@ class Disturbance:
         self._pause_left = 0
         self._bump_start = rng.integers(3, 40) if rng.random() < operator.bump else None
         self._slip_start = rng.integers(3, 6) if rng.random() < operator.slip else None
+        self._missed_steps = 0
+        # Operators that never miss draw nothing, so that their demonstrations stay what they were.
+        misses = operator.miss and rng.random() < operator.miss
+        self._miss_steps = int(rng.integers(*_MISS_STEPS)) if misses else 0
+        self._miss_drift = rng.uniform(-1.0, 1.0, 2) if misses else np.zeros(2)
 
     def __call__(self, clean: np.ndarray, present: np.ndarray) -> np.ndarray:
         """The command to execute.
@@ -64,6 +73,8 @@ class Disturbance:
         )
         arms[:, 3:6] = turned.as_rotvec()
         arms[0, 6] = self._slipped(arms[0, 6])
+        if self._missing(clean[:POSE_DIM], present[0]):
+            self._miss(arms[0], present[0])
         self._steps += 1
         return arms.reshape(-1)
 
@@ -90,3 +101,15 @@ class Disturbance:
         if self._closed_steps == self._slip_start + _SLIP_STEPS - 1:
             self._slip_start = None
         return -1.0
+
+    def _missing(self, clean: np.ndarray, present: np.ndarray) -> bool:
+        """Whether the fingers are being closed on nothing: once begun, it goes on for the steps drawn."""
+        near = clean[6] < 0 and np.linalg.norm(clean[:3] - present) < _MISS_NEAR
+        return self._missed_steps < self._miss_steps and bool(self._missed_steps or near)
+
+    def _miss(self, command: np.ndarray, present: np.ndarray) -> None:
+        """Closes the fingers, then takes the hand away as if they held something."""
+        command[6] = 1.0
+        if self._missed_steps >= _CLOSING_STEPS:
+            command[:3] = present + _MISS_RISE * np.array([*self._miss_drift, 1.0])
+        self._missed_steps += 1

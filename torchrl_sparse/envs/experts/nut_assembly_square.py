@@ -32,7 +32,7 @@ class NutAssemblySquareExpert(Expert):
         hand = self.hand()
         nut, rotation = self.body(self._nut.root_body)
         handle = nut + rotation @ _HANDLE
-        if np.linalg.norm(hand.position - handle) < 0.025 and hand.opening < _HANDLE_WIDTH + 0.004:
+        if np.linalg.norm(hand.position - handle) < 0.025 and abs(hand.opening - _HANDLE_WIDTH) < 0.004:
             return [self._carry(hand, nut, rotation)]
         yaw = grasp_yaw(_yaw(rotation), hand.yaw)
         grasp = handle + self.style.offset * rotation[:, 0]

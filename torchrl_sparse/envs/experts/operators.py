@@ -1,13 +1,14 @@
 """Who demonstrates: the skill of a scripted operator, and how one episode of it is drawn.
 
 ``proficient`` is one consistent skilled operator, ``mixed`` six of three skills: scripted counterparts of the
-proficient-human and multi-human data of robomimic (arXiv:2108.03298). No human took part in either.
+proficient-human and multi-human data of robomimic (arXiv:2108.03298). ``recovering`` is the first of them with mishaps in most
+episodes: policies that only saw grasps succeed are lost after one that did not. No human took part in any.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class Operator:
         bump: probability that the hand is pushed away once in an episode.
         slip: probability that the fingers are opened once after a grasp.
         hesitation: probability a step of starting to pause.
+        miss: probability that the fingers are closed once short of a grasp, and the hand goes on empty.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Operator:
     bump: float
     slip: float
     hesitation: float
+    miss: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> Style:
         """How this operator acts in one episode."""
@@ -87,8 +90,11 @@ def _operator(name: str, speed: float, sloppiness: float, hesitation: float) -> 
     )
 
 
+_PROFICIENT = _operator("proficient", 1.0, 1.0, 0.0)
+
 OPERATORS: Mapping[str, tuple[Operator, ...]] = {
-    "proficient": (_operator("proficient", 1.0, 1.0, 0.0),),
+    "proficient": (_PROFICIENT,),
+    "recovering": (replace(_PROFICIENT, name="recovering", bump=0.3, slip=0.3, miss=0.8),),
     "mixed": (
         _operator("better_1", 1.0, 1.0, 0.0),
         _operator("better_2", 0.85, 1.5, 0.005),
