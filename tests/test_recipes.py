@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -191,7 +192,11 @@ def test_a_sweep_of_eight_survives_a_kill_and_an_interrupt(work):
     assert [trial["finished"] for trial in trials()] == [True, True, False]
 
     command = [sys.executable, str(RECIPES / "sweep.py"), *options[1:]]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT) as again:
+    # A shell's background job ignores interrupts, and what it starts inherits that.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT, preexec_fn=heed
+    ) as again:
         assert again.stdout.readline().startswith("waiting for a trial that still runs")
         (work / "sweep" / "go").touch()
         again.stdout.read()

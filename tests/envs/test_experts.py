@@ -161,7 +161,7 @@ def test_nearest_equivalent_angle():
 def test_unknown_names_are_listed(envs):
     with pytest.raises(ValueError, match=r"PickPlaceCan.*'Door'"):
         make_expert("Door", envs["Lift"].sim_env, style())
-    with pytest.raises(ValueError, match=r"proficient, mixed.*'human'"):
+    with pytest.raises(ValueError, match=r"proficient, recovering, mixed.*'human'"):
         draw_operator("human", np.random.default_rng(0))
 
 
