@@ -150,8 +150,7 @@ def imitate(
         on_progress: called with (updates made, all).
 
     Raises:
-        ValueError: if a mask is not of the shape of the gates, if there is none, or if gates that do not read the rate
-            get several.
+        ValueError: if there is no mask, one is not of the gates' shape, or gates that do not read the rate get several.
     """
     if not masks or (len(masks) > 1 and not gates.rate_input):
         expected = "at least one" if gates.rate_input else "one for gates that do not read the rate"
@@ -164,9 +163,9 @@ def imitate(
         cond = reference[keys.COND][torch.randint(len(reference), (_IMITATION_BATCH,))]
         rate = torch.full((len(cond), 1), prune_rate(mask).item()) if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
-        if logits.shape[1:] != mask.shape:
+        if (shape := logits.shape[1:]) != mask.shape:
             raise ValueError(
-                f"mask: expected [K, 3L] = {list(logits.shape[1:])} as the gates have, got {list(mask.shape)}"
+                f"mask: expected [K, 3L] = {list(shape)} as the gates have, got {list(mask.shape)}"
             )
         target = (0.25 + 0.5 * mask.to(logits)).expand_as(logits)
         loss = binary_cross_entropy_with_logits(logits[:, 1:], target[:, 1:])  # step 0 is never pruned
