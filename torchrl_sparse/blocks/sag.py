@@ -98,7 +98,9 @@ class PrunerNetwork(nn.Module):
         # The first layer of the MLP on [obs ; z], as its two halves.
         self.fuse_obs = nn.Linear(obs_width, hidden)
         self.fuse_z = nn.Linear(width, hidden, bias=False)
-        self.mlp = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2))
+        self.mlp = nn.Sequential(
+            nn.ReLU(inplace=True), nn.Linear(hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 2)
+        )
         # Not persistent, since it follows from the weights; a buffer, since it has to move with them.
         self.register_buffer("_cells", None, persistent=False)
 
