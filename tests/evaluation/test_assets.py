@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from torchrl_sparse.evaluation.episodes import EpisodeLog
-from torchrl_sparse.evaluation.methods import make_method, method_identity
+from torchrl_sparse.evaluation.methods import EVALUATION_SEED, make_method, method_identity
 from torchrl_sparse.evaluation.report import load_results
 from torchrl_sparse.evaluation.stats import paired_difference
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -41,7 +41,8 @@ def test_tables_count_the_episodes(folder):
         results = load_results(path)
         for name in results["methods"].keys() & logs.keys():
             entry = results["methods"][name]
-            seeds = range(100_000 + results["seed"], 100_000 + results["seed"] + entry["success"]["n"])
+            first = EVALUATION_SEED + results["seed"]
+            seeds = range(first, first + entry["success"]["n"])
             ours, dense = ([logs[method][seed] for seed in seeds] for method in (name, "dense"))
             assert entry["success"]["k"] == sum(ours), (path, name)
             if name != "dense":

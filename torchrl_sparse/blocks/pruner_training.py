@@ -164,9 +164,7 @@ def imitate(
         rate = torch.full((len(cond), 1), prune_rate(mask).item()) if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
         if (shape := logits.shape[1:]) != mask.shape:
-            raise ValueError(
-                f"mask: expected [K, 3L] = {list(shape)} as the gates have, got {list(mask.shape)}"
-            )
+            raise ValueError(f"mask: expected [K, 3L] = {[*shape]} as the gates have, got {[*mask.shape]}")
         target = (0.25 + 0.5 * mask.to(logits)).expand_as(logits)
         loss = binary_cross_entropy_with_logits(logits[:, 1:], target[:, 1:])  # step 0 is never pruned
         optimizer.zero_grad()
