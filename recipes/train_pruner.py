@@ -198,7 +198,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         trainer.fixed_mask(),
         method="l2c" if config.method == "l2c" else "sag_fixed",
         policy=policy.fingerprint,
-        sampler=policy.schedule.kind,
+        sampler=policy.schedule.name,
         reuse=trainer.config.reuse,
         settings=settings,
     )
@@ -208,7 +208,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         return path
     info = PrunerInfo(
         policy=policy.fingerprint,
-        sampler=policy.schedule.kind,
+        sampler=policy.schedule.name,
         rate=trainer.config.rate,
         rate_range=trainer.config.rate_range,
         reuse=trainer.config.reuse,

@@ -30,7 +30,7 @@ class PlanSpec:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
-        sampler: kind of its denoising schedule, ``"ddpm"`` or ``"ddim"``.
+        sampler: name of its denoising schedule, see `NoiseSchedule.name`.
     """
 
     num_inference_steps: int

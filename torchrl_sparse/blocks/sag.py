@@ -177,7 +177,7 @@ class PrunerInfo:
 
     Attributes:
         policy: fingerprint of the policy.
-        sampler: kind of its denoising schedule, ``"ddpm"`` or ``"ddim"``.
+        sampler: name of its denoising schedule, see `NoiseSchedule.name`.
         rate: prune rate that it is asked for where the TensorDict says nothing, in (0, 1).
         rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
         reuse: what pruned blocks reuse.

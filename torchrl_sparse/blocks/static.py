@@ -45,6 +45,7 @@ from torchrl_sparse.blocks.mask import (
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
 from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.diffusion.schedule import split_sampler
 
 __all__ = ["Schedule", "StaticSchedule"]
 
@@ -73,7 +74,7 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
-        sampler: kind of the denoising schedule that it was made for, ``"ddpm"`` or ``"ddim"``.
+        sampler: name of the denoising schedule that it was made for, see `NoiseSchedule.name`.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
@@ -106,8 +107,7 @@ class Schedule:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
         if not isinstance(self.settings, dict):
             raise ValueError(f"settings: expected an object, got {type(self.settings).__name__}")
-        if self.sampler not in ("ddpm", "ddim"):
-            raise ValueError(f"sampler: expected 'ddpm' or 'ddim', got {self.sampler!r}")
+        split_sampler(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:

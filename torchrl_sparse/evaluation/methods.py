@@ -30,7 +30,8 @@ _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 # Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
 EVALUATION_SEED = 100_000
 CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
-METHODS = "dense, ddim<N>, uniform, " + ", ".join(SCHEDULES)
+_DDIM = re.compile(r"ddim(?:([1-9]\d*)|((?:_\d+)+))")
+METHODS = "dense, ddim<N>, ddim_<t>_<t>..., uniform, " + ", ".join(SCHEDULES)
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class MethodName:
     """A method as it is written: ``PLAN`` or ``PLAN@RATE`` or ``PLAN@COARSE-FINE``.
 
     Attributes:
-        plan: dense, ddim<N>, uniform, a BAC schedule, or the name of a planner's file or folder.
+        plan: dense, ddim<N> (at diffusers' timesteps), ddim_90_50_10 (at those), uniform, a BAC schedule, or the name of a
+            planner's file or folder.
         rates: prune rates for a pruner that takes them: none, one for every query, or two, the one of coarse and the one of
             fine motion, between which an `ActionAwareController` switches.
     """
@@ -70,7 +72,7 @@ class MethodName:
 def check_method(name: str, plans: Path) -> None:
     """Raises ValueError unless ``name`` is one of `METHODS` or there is a file or folder of that name in ``plans``."""
     plan = MethodName.parse(name).plan
-    known = plan in ("dense", "uniform", *SCHEDULES) or re.fullmatch(r"ddim[1-9]\d*", plan)
+    known = plan in ("dense", "uniform", *SCHEDULES) or _DDIM.fullmatch(plan)
     if not known and _planner_path(plans, plan) is None:
         raise ValueError(
             f"methods: expected {METHODS}, or a schedule or pruner in {plans} ({plan}.json or {plan}/), got {name!r}"
@@ -101,8 +103,8 @@ def make_method(
     check_method(name, schedules)
     method = MethodName.parse(name)
     schedule, plan = policy.schedule, Dense()
-    if re.fullmatch(r"ddim\d+", method.plan):
-        schedule = NoiseSchedule("ddim", int(method.plan[4:]), policy.schedule.num_train_timesteps)
+    if _DDIM.fullmatch(method.plan):
+        schedule = _fewer_steps(method.plan, policy.schedule.num_train_timesteps)
     elif method.plan == "uniform":
         plan = Uniform(interval=-(-policy.num_inference_steps // num_updates))
     elif method.plan in SCHEDULES:
@@ -121,6 +123,13 @@ def make_method(
     )
 
 
+def _fewer_steps(name: str, num_train_timesteps: int) -> NoiseSchedule:
+    num_steps, timesteps = _DDIM.fullmatch(name).groups()
+    if num_steps:
+        return NoiseSchedule("ddim", int(num_steps), num_train_timesteps)
+    return NoiseSchedule.from_name(name, timesteps.count("_"), num_train_timesteps)
+
+
 def _planner_path(plans: Path, name: str) -> Path | None:
     candidates = (plans / f"{name}.json", plans / name / "config.json")
     return next((path for path in candidates if path.is_file()), None)
@@ -134,7 +143,7 @@ def _saved_planner(path: Path, policy: DiffusionPolicy) -> tuple[Planner, NoiseS
     else:
         planner = StaticSchedule(path)
         sampler, num_steps = planner.schedule.sampler, planner.schedule.num_inference_steps
-    return planner, NoiseSchedule(sampler, num_steps, policy.schedule.num_train_timesteps)
+    return planner, NoiseSchedule.from_name(sampler, num_steps, policy.schedule.num_train_timesteps)
 
 
 def _set_rates(name: str, plan: Planner, rates: tuple[float, ...]) -> None:

@@ -77,9 +77,10 @@ def step_coefficients(schedule: NoiseSchedule) -> StepCoefficients:
     timesteps = schedule.timesteps.tolist()
     one = torch.tensor(1.0)
     # DDIM ends on diffusers' final_alpha_cumprod, which NoiseSchedule sets to one, as DDPM does.
-    previous = [t - schedule.num_train_timesteps // schedule.num_inference_steps for t in timesteps]
     alpha_prod = scheduler.alphas_cumprod[timesteps]
-    alpha_prod_prev = torch.stack([scheduler.alphas_cumprod[t] if t >= 0 else one for t in previous])
+    alpha_prod_prev = torch.stack(
+        [scheduler.alphas_cumprod[t] if t >= 0 else one for t in schedule.previous_timesteps]
+    )
     beta_prod, beta_prod_prev = 1 - alpha_prod, 1 - alpha_prod_prev
     zeros = torch.zeros(len(timesteps))
     if schedule.kind == "ddim":

@@ -38,6 +38,9 @@ class EagerBaseline:
         schedule: the sampler.
         compiled: put :func:`published_forward` through ``torch.compile``.
 
+    Raises:
+        ValueError: for chosen timesteps, which diffusers' DDIM does not have.
+
     Examples:
         >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
         >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -52,6 +55,10 @@ class EagerBaseline:
     def __init__(
         self, network: TransformerForDiffusion, schedule: NoiseSchedule, *, compiled: bool = False
     ) -> None:
+        if "timesteps" in schedule.config:
+            raise ValueError(
+                f"eager baseline: diffusers has no sampler {schedule.name!r}, only evenly spaced timesteps"
+            )
         self._network, self._scheduler = network, schedule.scheduler
         self._timesteps = schedule.timesteps
         self._forward = torch.compile(published_forward) if compiled else published_forward

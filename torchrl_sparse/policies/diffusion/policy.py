@@ -123,7 +123,7 @@ class DiffusionPolicy(TensorDictSequential):
     def _install(self, plan: Planner, schedule: NoiseSchedule) -> None:
         """Changes planner and sampler together, or, if the planner cannot serve that sampler, neither."""
         plan.bind(
-            PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint, schedule.kind)
+            PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint, schedule.name)
         )
         denoiser = self.module["denoise"]
         denoiser.schedule, denoiser.reuse = schedule, plan.reuse

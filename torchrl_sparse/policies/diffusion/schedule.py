@@ -2,17 +2,23 @@
 
 Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta
 schedule (arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0)
-samples the same network in any smaller number of steps.
+samples the same network in any smaller number of steps, by default at diffusers' ``"leading"`` timesteps, as Diffusion
+Policy does. Those lie evenly, end at 0 and, in few steps, begin far below the noise that the sample starts with (three of
+a hundred: 66, 33, 0); ``timesteps`` puts them elsewhere, and `torchrl_sparse.policies.diffusion.timesteps` finds where.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Literal
 
+import torch
 from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
-__all__ = ["NoiseSchedule"]
+__all__ = ["NoiseSchedule", "split_sampler"]
 
 
 class NoiseSchedule:
@@ -23,15 +29,18 @@ class NoiseSchedule:
 
     Args:
         kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
-        num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``.
+        num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
+            ``timesteps``, or without those for all training steps.
         num_train_timesteps: diffusion steps that the network was trained with.
+        timesteps: of DDIM's steps where they are not to be diffusers' own: K falling diffusion timesteps.
 
     Attributes:
         timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
+        previous_timesteps: the timestep that each of them leads to; -1, the clean sample, in the end.
         scheduler: the diffusers scheduler.
 
     Raises:
-        ValueError: on an unknown ``kind`` or a number of steps out of range.
+        ValueError: on an unknown ``kind``, a number of steps out of range, or ``timesteps`` that do not fall or are not DDIM's.
 
     Examples:
         >>> schedule = NoiseSchedule("ddim", num_inference_steps=10)
@@ -41,16 +50,22 @@ class NoiseSchedule:
         >>> sample = torch.zeros(1, 10, 7)
         >>> schedule.step(torch.zeros_like(sample), 0, sample).shape
         torch.Size([1, 10, 7])
+        >>> NoiseSchedule("ddim", timesteps=[90, 50, 10]).name
+        'ddim_90_50_10'
     """
 
     def __init__(
         self,
         kind: Literal["ddpm", "ddim"] = "ddpm",
-        num_inference_steps: int = 100,
+        num_inference_steps: int | None = None,
         num_train_timesteps: int = 100,
+        *,
+        timesteps: Sequence[int] | None = None,
     ) -> None:
         if kind not in ("ddpm", "ddim"):
             raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
+        if num_inference_steps is None:
+            num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
         if not 1 <= num_inference_steps <= num_train_timesteps:
             raise ValueError(
                 f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
@@ -70,16 +85,36 @@ class NoiseSchedule:
         else:
             self.scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
         self.scheduler.set_timesteps(num_inference_steps)
-        self.timesteps: Tensor = self.scheduler.timesteps.clone()
+        self._chosen = None if timesteps is None else self._checked(timesteps)
+        self.timesteps: Tensor = (
+            self.scheduler.timesteps.clone() if timesteps is None else torch.tensor(self._chosen)
+        )
+        self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
+
+    @classmethod
+    def from_name(cls, name: str, num_inference_steps: int, num_train_timesteps: int = 100) -> NoiseSchedule:
+        """The schedule of that `name`.
+
+        Raises:
+            ValueError: if no schedule is called that, or not with so many steps.
+        """
+        kind, timesteps = split_sampler(name)
+        return cls(kind, num_inference_steps, num_train_timesteps, timesteps=timesteps)
 
     @property
-    def config(self) -> dict:
+    def name(self) -> str:
+        """``"ddpm"``, ``"ddim"``, or with its timesteps, where they were chosen, ``"ddim_90_50_10"``."""
+        return "_".join([self.kind, *map(str, self._chosen or [])])
+
+    @property
+    def config(self) -> dict[str, Any]:
         """The constructor's arguments: ``NoiseSchedule(**schedule.config)`` is an equal schedule."""
-        return {
+        config = {
             "kind": self.kind,
             "num_inference_steps": self.num_inference_steps,
             "num_train_timesteps": self.num_train_timesteps,
         }
+        return config if self._chosen is None else config | {"timesteps": self._chosen}
 
     def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
         """The sample after denoising step ``k``.
@@ -99,7 +134,7 @@ class NoiseSchedule:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
         timestep = int(self.timesteps[k])
         if self.kind == "ddim":
-            return self.scheduler.step(eps, timestep, sample, eta=0.0).prev_sample
+            return _ddim_step(self.scheduler, eps, timestep, self.previous_timesteps[k], sample)
         if timestep == 0:
             # diffusers adds no noise at timestep 0, so the step is a pure function of its inputs.
             return self.scheduler.step(eps, timestep, sample).prev_sample
@@ -117,8 +152,47 @@ class NoiseSchedule:
         """
         return self.scheduler.add_noise(clean, noise, timestep)
 
+    def _checked(self, timesteps: Sequence[int]) -> list[int]:
+        timesteps = [int(timestep) for timestep in timesteps]
+        falls = all(a > b for a, b in pairwise([self.num_train_timesteps, *timesteps, -1]))
+        if self.kind != "ddim" or not falls or len(timesteps) != self.num_inference_steps:
+            raise ValueError(
+                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) that fall from at most "
+                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {timesteps} of kind "{self.kind}"'
+            )
+        return timesteps
+
     def __repr__(self) -> str:
         return f"NoiseSchedule({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def split_sampler(name: str) -> tuple[str, list[int] | None]:
+    """Kind and chosen timesteps of a `NoiseSchedule.name`.
+
+    Raises:
+        ValueError: if it is none.
+
+    Examples:
+        >>> split_sampler("ddim_90_50_10"), split_sampler("ddpm")
+        (('ddim', [90, 50, 10]), ('ddpm', None))
+    """
+    match = re.fullmatch(r"(ddpm|ddim)((?:_\d+)*)", name) if isinstance(name, str) else None
+    if match is None:
+        raise ValueError(f"sampler: expected 'ddpm', 'ddim' or 'ddim_<t>_<t>...', got {name!r}")
+    return match[1], [int(digits) for digits in match[2].split("_")[1:]] or None
+
+
+def _ddim_step(scheduler: DDIMScheduler, eps: Tensor, timestep: int, previous: int, sample: Tensor) -> Tensor:
+    """``DDIMScheduler.step`` (arXiv:2010.02502, Eq. 12, eta = 0) to any earlier timestep.
+
+    diffusers steps by a fixed stride; its expressions are repeated in their order, so that at that stride results are
+    equal to the last bit.
+    """
+    alpha_prod = scheduler.alphas_cumprod[timestep]
+    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.final_alpha_cumprod
+    clean = (sample - (1 - alpha_prod) ** (0.5) * eps) / alpha_prod ** (0.5)
+    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
+    return alpha_prod_prev ** (0.5) * clean + (1 - alpha_prod_prev) ** (0.5) * eps
 
 
 def _ddpm_step(scheduler: DDPMScheduler, eps: Tensor, timestep: int, sample: Tensor, noise: Tensor) -> Tensor:

@@ -1,0 +1,68 @@
+"""Finds the timesteps at which few DDIM steps of a trained policy come closest to its demonstrations.
+
+    python recipes/calibrate_timesteps.py task=square demos=data/square_recovering.h5 num_inference_steps=3
+
+The result is the name of a benchmark's method, e.g. ``ddim_90_50_10``; ``out`` also lists all that was tried.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from torchrl_sparse.blocks.pruner_reference import make_reference
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.files import atomic_path
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.published import published_shape
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.timesteps import demonstration_error, search_timesteps
+
+
+@hydra.main(version_base=None, config_path=".", config_name="calibrate_timesteps")
+def main(config: DictConfig) -> None:
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    policy = DiffusionPolicy.from_pretrained(config.policy)
+    task = find_task(config.task)
+    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
+    n_action_steps = published_shape(task.name).n_action_steps
+    reference = make_reference(
+        policy, demos, target="data", n_action_steps=n_action_steps, **config.reference
+    )
+    train_steps = policy.schedule.num_train_timesteps
+    start = NoiseSchedule("ddim", config.num_inference_steps, train_steps).timesteps.tolist()
+    with tqdm(desc="chains", unit="chain", mininterval=2) as bar:
+
+        def error(timesteps: tuple[int, ...]) -> float:
+            bar.update()
+            return demonstration_error(policy, reference, timesteps, n_action_steps=n_action_steps)
+
+        best, tried = search_timesteps(error, start, num_train_timesteps=train_steps, strides=config.strides)
+    chosen = NoiseSchedule("ddim", num_train_timesteps=train_steps, timesteps=best)
+    path = Path(config.out) / f"{chosen.name}.json"
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(report(policy, tried, config), indent=1) + "\n")
+    print(
+        f"{path}: {chosen.name}, error {tried[best]:.4f}; evenly spaced {start}, error {tried[tuple(start)]:.4f}"
+    )
+
+
+def report(policy: DiffusionPolicy, tried: dict[tuple[int, ...], float], config: DictConfig) -> dict:
+    """Everything that was tried, best first, and what it was tried with."""
+    ordered = sorted(tried.items(), key=lambda entry: entry[1])
+    return {
+        "policy": policy.fingerprint,
+        "settings": OmegaConf.to_container(config, resolve=True),
+        "tried": [{"timesteps": timesteps, "error": error} for timesteps, error in ordered],
+    }
+
+
+if __name__ == "__main__":
+    main()
