@@ -61,6 +61,29 @@ def schedules(work, policy):
     return work / "schedules"
 
 
+def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
+    options = (
+        f"policy={policy}",
+        f"demos={demos}",
+        "num_inference_steps=2",
+        "strides=[20]",
+        "reference.share=0.1",
+    )
+    output = run("calibrate_timesteps", *options, f"out={work}/timesteps")
+    (path,) = (work / "timesteps").iterdir()
+    tried = json.loads(path.read_text())["tried"]
+    assert path.stem == "ddim_" + "_".join(map(str, tried[0]["timesteps"]))
+    assert f"{path.stem}, error" in output
+    assert [50, 0] in [entry["timesteps"] for entry in tried]
+    run(
+        "benchmark", f"policy={policy}", f"methods=[dense,{path.stem}]", "episodes=1", "horizon=16", "latency_repeats=2",
+        "probe_episodes=1", f"out={work}/few",
+    )  # fmt: skip
+    assert (
+        load_results(work / "few" / "results.json")["methods"][path.stem]["flops"]["ratio_to_dense"] == 0.02
+    )
+
+
 def test_training_exports_a_policy(policy):
     assert DiffusionPolicy.from_pretrained(policy).num_inference_steps == 100
 
@@ -271,7 +294,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
     output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=1)
-    assert "methods: expected dense, ddim<N>, uniform" in output
+    assert "methods: expected dense, ddim<N>, ddim_<t>_<t>..., uniform" in output
     assert "got 'magic'" in output
     assert not (work / "none").exists()
     assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=1)

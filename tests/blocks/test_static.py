@@ -137,6 +137,7 @@ def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, f
         (PlanSpec(100, NUM_LAYERS, "8d1f"), "num_inference_steps 10, got 100"),
         (PlanSpec(NUM_STEPS, 8, "8d1f"), "num_layers 2, got 8"),
         (PlanSpec(NUM_STEPS, NUM_LAYERS, "8d1f", "ddim"), "sampler 'ddpm', got 'ddim'"),
+        (PlanSpec(NUM_STEPS, NUM_LAYERS, "8d1f", "ddim_9_5"), "sampler 'ddpm', got 'ddim_9_5'"),
     ],
 )
 def test_a_schedule_made_for_another_policy_is_refused_naming_both(schedule, spec, message):

@@ -85,6 +85,14 @@ def test_property_any_rate_and_rule(seed):
     assert (actual - expected).abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("timesteps", [[90, 50, 49, 10], [7], [99, 0]])
+def test_chosen_timesteps(timesteps):
+    network, schedule = make_network(), NoiseSchedule("ddim", timesteps=timesteps)
+    noise, cond, mask = make_query(network, schedule)
+    actual = NativeEngine(network, schedule).denoise(noise, cond, mask)
+    assert (actual - exact(network, schedule, noise, cond, mask)).abs().max() < 1e-5
+
+
 def test_published_sizes_over_the_whole_chain():
     network, schedule = make_network(n_layer=8, n_emb=256, std=0.03), NoiseSchedule("ddpm", 100)
     noise, cond, mask = make_query(network, schedule, batch=1, rate=0.91)

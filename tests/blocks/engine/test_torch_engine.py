@@ -150,14 +150,22 @@ def test_wrong_input_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("kind", "steps"), [("ddpm", 100), ("ddpm", 16), ("ddpm", 1), ("ddim", 100), ("ddim", 7)]
+    ("kind", "steps", "timesteps"),
+    [
+        ("ddpm", 100, None),
+        ("ddpm", 16, None),
+        ("ddpm", 1, None),
+        ("ddim", 100, None),
+        ("ddim", 7, None),
+        ("ddim", None, [90, 50, 49, 10]),
+    ],
 )
-def test_tabulated_scheduler_equals_diffusers_to_the_last_bit(kind, steps):
-    schedule = NoiseSchedule(kind, steps)
+def test_tabulated_scheduler_equals_the_schedule_to_the_last_bit(kind, steps, timesteps):
+    schedule = NoiseSchedule(kind, steps, timesteps=timesteps)
     coefficients = step_coefficients(schedule)
-    for step in range(steps):
+    for step in range(schedule.num_inference_steps):
         sample, eps, gaussian = 3 * torch.randn(3, 1, 6, 4)
-        gaussian = None if step == steps - 1 else gaussian
+        gaussian = None if step == schedule.num_inference_steps - 1 else gaussian
         expected = schedule.step(eps, step, sample, gaussian)
         assert torch.equal(coefficients.update(step, sample, eps, gaussian), expected)
 

@@ -44,13 +44,36 @@ def test_ddim_equals_diffusers_and_reads_no_noise(steps):
         assert torch.equal(ours, theirs)
 
 
+def test_chosen_timesteps_equal_diffusers_where_those_are_its_own():
+    ours, theirs = NoiseSchedule("ddim", timesteps=range(96, -1, -3)), NoiseSchedule("ddim", 33)
+    assert torch.equal(ours.timesteps, theirs.timesteps)
+    sample, eps = torch.randn(2, *SHAPE)
+    for k in range(33):
+        assert torch.equal(ours.step(eps, k, sample), theirs.step(eps, k, sample))
+
+
+def test_steps_of_constant_noise_may_be_left_out():
+    """A deterministic sampler that is told the same noise everywhere ends in the same place however it gets there."""
+    sample, eps = 0.1 * torch.randn(2, *SHAPE)
+    ends = []
+    for timesteps in ([60, 10], [60, 33, 32, 10]):
+        schedule, x = NoiseSchedule("ddim", timesteps=timesteps), sample
+        for k in range(len(timesteps)):
+            x = schedule.step(eps, k, x)
+        ends.append(x)
+    torch.testing.assert_close(*ends, atol=1e-5, rtol=0)
+
+
 def test_published_timesteps_run_from_99_to_0():
     assert NoiseSchedule().timesteps.tolist() == list(range(99, -1, -1))
 
 
-@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
-def test_the_true_noise_leads_back_to_the_clean_sample(kind):
-    schedule = NoiseSchedule(kind, 20)
+@pytest.mark.parametrize(
+    "schedule",
+    [NoiseSchedule("ddpm", 20), NoiseSchedule("ddim", 20), NoiseSchedule("ddim", timesteps=[80, 75, 20])],
+    ids=lambda schedule: schedule.name,
+)
+def test_the_true_noise_leads_back_to_the_clean_sample(schedule):
     clean = torch.rand(SHAPE) * 2 - 1
     sample = torch.randn(SHAPE)
     alphas = schedule.scheduler.alphas_cumprod
@@ -69,10 +92,11 @@ def test_add_noise_mixes_by_the_cumulative_alpha():
 
 
 def test_config_rebuilds_the_schedule():
-    schedule = NoiseSchedule("ddim", 7, 50)
-    again = NoiseSchedule(**schedule.config)
-    assert repr(again) == repr(schedule)
-    assert torch.equal(again.timesteps, schedule.timesteps)
+    for schedule in (NoiseSchedule("ddim", 7, 50), NoiseSchedule("ddim", None, 50, timesteps=[40, 9])):
+        by_name = NoiseSchedule.from_name(schedule.name, schedule.num_inference_steps, 50)
+        for again in (NoiseSchedule(**schedule.config), by_name):
+            assert repr(again) == repr(schedule)
+            assert torch.equal(again.timesteps, schedule.timesteps)
 
 
 def test_bad_arguments_are_named():
@@ -80,6 +104,21 @@ def test_bad_arguments_are_named():
         NoiseSchedule("flow")
     with pytest.raises(ValueError, match=r"in 1\.\.100 .*got 101"):
         NoiseSchedule("ddim", 101)
+    for kind, steps, timesteps in (
+        ("ddim", 2, [5, 5]),
+        ("ddim", 2, [1, 9]),
+        ("ddim", 1, [100]),
+        ("ddim", 1, [-1]),
+        ("ddim", 3, [9, 5]),
+        ("ddpm", 2, [9, 5]),
+    ):
+        with pytest.raises(ValueError, match=rf"timesteps: expected {steps} .*got \[.*of kind \"{kind}\""):
+            NoiseSchedule(kind, steps, timesteps=timesteps)
+    with pytest.raises(ValueError, match=r"num_inference_steps must be in 1\.\.100.* got 0"):
+        NoiseSchedule("ddim", timesteps=[])
+    for name in ("ddim_", "ddim_-3", "flow", "ddim_9_x", None):
+        with pytest.raises(ValueError, match=f"sampler: expected 'ddpm', 'ddim' .*got {name!r}"):
+            NoiseSchedule.from_name(name, 2)
     schedule, sample = NoiseSchedule(), torch.zeros(SHAPE)
     with pytest.raises(ValueError, match=r"k=3 .*needs noise_k"):
         schedule.step(sample, 3, sample)
