@@ -44,6 +44,17 @@ def test_masks_depend_on_the_observation_and_spare_the_first_step():
     assert masks.float().var(dim=0).sum() > 0
 
 
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("rate", [None, 0.5])
+def test_pruning_is_preferred_by_the_difference_of_the_logits(rate, training):
+    network = make_pruner((0.3, 0.8) if rate else None).network.train(training)
+    rate = None if rate is None else torch.full((16, 1), rate)
+    for grad in (True, False):
+        with torch.set_grad_enabled(grad):
+            keep, prune = network(observations(), rate).unbind(-1)
+            torch.testing.assert_close(network.prune_logits(observations(), rate), prune - keep)
+
+
 def test_a_row_equals_the_row_alone_whatever_the_batch_dimensions():
     pruner, cond = make_pruner(), observations()
     together = plan(pruner, cond.view(4, 4, OBS_STEPS, COND_DIM)).flatten(0, 1)

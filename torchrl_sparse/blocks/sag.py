@@ -28,6 +28,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.nn import functional
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
@@ -111,14 +112,19 @@ class PrunerNetwork(nn.Module):
             cond: encoded observations f32 [B, To, D].
             rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
         """
-        features = cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate], dim=-1)
-        fused = self.fuse_obs(self.obs(features))[:, None] + self.cells()
-        return self.mlp(fused).unflatten(1, (len(self.timesteps), self.num_blocks))
+        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, 2)
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """f32 [B, K, 3L]: by how much pruning is preferred to keeping."""
-        keep, prune = self(cond, rate).unbind(-1)
-        return prune - keep
+        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, at less cost than both logits."""
+        _, middle, _, last = self.mlp
+        hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
+        difference = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
+        return difference.view(len(cond), len(self.timesteps), self.num_blocks)
+
+    def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+        """The first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
+        features = cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate], dim=-1)
+        return (self.fuse_obs(self.obs(features))[:, None] + self.cells()).flatten(0, 1)
 
     def cells(self) -> Tensor:
         """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
