@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.policies.test_policy import request
-from torchrl_sparse import DiffusionPolicy, keys
+from torchrl_sparse import DiffusionPolicy, NoiseSchedule, keys
 
 
 @pytest.fixture
@@ -69,6 +69,10 @@ CONFIG_FAULTS = {
     "field": (lambda c: c.pop("schedule"), "expected the fields"),
     "unknown argument": (lambda c: c["network"].update(n_experts=3), "n_experts"),
     "size": (lambda c: c["network"].update(n_emb=30), "n_emb must be a multiple of n_head"),
+    "timesteps": (
+        lambda c: c["schedule"].update(kind="ddim", num_inference_steps=2, timesteps=[10, 90]),
+        r"config.json: schedule: timesteps: expected 2 .* got \[10, 90\]",
+    ),
     "depth": (lambda c: c["network"].update(n_layer=3), "missing"),
 }
 
@@ -79,6 +83,12 @@ def test_wrong_configs_are_named(folder, fault):
     change_config(folder, change)
     with pytest.raises(ValueError, match=message):
         DiffusionPolicy.from_pretrained(folder)
+
+
+def test_chosen_timesteps_are_kept(policy, tmp_path):
+    policy.schedule = NoiseSchedule("ddim", timesteps=[90, 10])
+    policy.save_pretrained(tmp_path)
+    assert DiffusionPolicy.from_pretrained(tmp_path).schedule.name == "ddim_90_10"
 
 
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors"])

@@ -11,6 +11,7 @@ from torchrl_sparse.blocks.engine.costs import engine_block_costs
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.factory import EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 
 from ..conftest import ACTION_DIM, HORIZON, NUM_STEPS, random_mask
 
@@ -88,3 +89,7 @@ class TestEagerBaseline:
         generator = torch.Generator().manual_seed(7)
         actions = eager.denoise(noise[:, 0], cond, mask if mask is None else mask[0], generator=generator)
         torch.testing.assert_close(actions, expected, atol=1e-4, rtol=0)
+
+    def test_timesteps_that_diffusers_does_not_have_are_refused(self, network):
+        with pytest.raises(ValueError, match="diffusers has no sampler 'ddim_90_50'"):
+            EagerBaseline(network, NoiseSchedule("ddim", timesteps=[90, 50]))

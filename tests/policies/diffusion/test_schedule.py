@@ -109,6 +109,8 @@ def test_bad_arguments_are_named():
         ("ddim", 2, [1, 9]),
         ("ddim", 1, [100]),
         ("ddim", 1, [-1]),
+        ("ddim", 1, [float("inf")]),
+        ("ddim", 2, ["9", "5"]),
         ("ddim", 3, [9, 5]),
         ("ddpm", 2, [9, 5]),
     ):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from itertools import pairwise
+from numbers import Integral
 from typing import Any, Literal
 
 import torch
@@ -153,14 +154,15 @@ class NoiseSchedule:
         return self.scheduler.add_noise(clean, noise, timestep)
 
     def _checked(self, timesteps: Sequence[int]) -> list[int]:
-        timesteps = [int(timestep) for timestep in timesteps]
-        falls = all(a > b for a, b in pairwise([self.num_train_timesteps, *timesteps, -1]))
-        if self.kind != "ddim" or not falls or len(timesteps) != self.num_inference_steps:
+        chosen = list(timesteps)
+        whole = all(isinstance(timestep, Integral) for timestep in chosen)
+        falls = whole and all(a > b for a, b in pairwise([self.num_train_timesteps, *chosen, -1]))
+        if self.kind != "ddim" or not falls or len(chosen) != self.num_inference_steps:
             raise ValueError(
-                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) that fall from at most "
-                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {timesteps} of kind "{self.kind}"'
+                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
+                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {chosen} of kind "{self.kind}"'
             )
-        return timesteps
+        return [int(timestep) for timestep in chosen]
 
     def __repr__(self) -> str:
         return f"NoiseSchedule({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
