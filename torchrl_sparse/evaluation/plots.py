@@ -38,7 +38,8 @@ _METHOD_COLORS = {
 }
 _OTHER_COLORS = (
     *("#009E73", "#8C6BB1", "#A6761D", "#B2182B", "#4D4D4D", "#66A61E"),
-    *("#E7298A", "#1B7F79", "#BCBD22", "#3F2A8C"),
+    *("#E7298A", "#1B7F79", "#BCBD22", "#3F2A8C", "#F46D43", "#74A9CF"),
+    *("#7A4B2A", "#9E9AC8", "#FB9A99", "#00441B"),
 )
 _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
