@@ -15,7 +15,7 @@ $(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native.
 
 demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
-		methods=[ddim10,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
+		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
 test: install
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
