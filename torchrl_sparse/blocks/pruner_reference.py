@@ -13,7 +13,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["ANSWER_BATCH", "make_reference", "with_queries"]
+__all__ = ["ANSWER_BATCH", "dense_answers", "make_reference", "with_queries"]
 
 ANSWER_BATCH = 16  # queries that the policy answers at a time
 
@@ -67,7 +67,7 @@ def make_reference(
         [size],
     )
     if target == "teacher":
-        reference["target"] = _dense_answers(policy, reference, on_progress)
+        reference["target"] = dense_answers(policy, reference, on_progress)
     return reference
 
 
@@ -95,14 +95,23 @@ def with_queries(
         [N + n], with the keys of ``reference``.
     """
     asked = queries.select(keys.COND, keys.SEED)
-    asked["target"] = _dense_answers(policy, asked, on_progress)
+    asked["target"] = dense_answers(policy, asked, on_progress)
     together = torch.cat([reference, asked])
     return together[torch.randperm(len(together), generator=torch.Generator().manual_seed(seed))]
 
 
-def _dense_answers(
-    policy: DiffusionPolicy, reference: TensorDictBase, on_progress: Callable[[int, int], None]
+def dense_answers(
+    policy: DiffusionPolicy,
+    reference: TensorDictBase,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Tensor:
+    """What the dense policy answers, normalised, f32 [N, H, A], whatever its planner.
+
+    Args:
+        policy: with the sampler that is asked for.
+        reference: [N], with ``("diffusion", "cond")`` f32 [N, To, D] and ``("diffusion", "seed")`` i64 [N, 1].
+        on_progress: called with (queries answered, all).
+    """
     answers: list[Tensor] = []
     for part in reference.split(ANSWER_BATCH):
         answers.append(policy.denoise(policy.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND]))

@@ -30,7 +30,7 @@ _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 # Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
 EVALUATION_SEED = 100_000
 CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
-_DDIM = re.compile(r"ddim(?:([1-9]\d*)|((?:_\d+)+))")
+_FEWER_STEPS = re.compile(r"ddim([1-9]\d*|(?:_\d+)+)")
 METHODS = "dense, ddim<N>, ddim_<t>_<t>..., uniform, " + ", ".join(SCHEDULES)
 
 
@@ -72,7 +72,7 @@ class MethodName:
 def check_method(name: str, plans: Path) -> None:
     """Raises ValueError unless ``name`` is one of `METHODS` or there is a file or folder of that name in ``plans``."""
     plan = MethodName.parse(name).plan
-    known = plan in ("dense", "uniform", *SCHEDULES) or _DDIM.fullmatch(plan)
+    known = plan in ("dense", "uniform", *SCHEDULES) or _FEWER_STEPS.fullmatch(plan)
     if not known and _planner_path(plans, plan) is None:
         raise ValueError(
             f"methods: expected {METHODS}, or a schedule or pruner in {plans} ({plan}.json or {plan}/), got {name!r}"
@@ -103,7 +103,7 @@ def make_method(
     check_method(name, schedules)
     method = MethodName.parse(name)
     schedule, plan = policy.schedule, Dense()
-    if _DDIM.fullmatch(method.plan):
+    if _FEWER_STEPS.fullmatch(method.plan):
         schedule = _fewer_steps(method.plan, policy.schedule.num_train_timesteps)
     elif method.plan == "uniform":
         plan = Uniform(interval=-(-policy.num_inference_steps // num_updates))
@@ -124,10 +124,9 @@ def make_method(
 
 
 def _fewer_steps(name: str, num_train_timesteps: int) -> NoiseSchedule:
-    num_steps, timesteps = _DDIM.fullmatch(name).groups()
-    if num_steps:
-        return NoiseSchedule("ddim", int(num_steps), num_train_timesteps)
-    return NoiseSchedule.from_name(name, timesteps.count("_"), num_train_timesteps)
+    if name.startswith("ddim_"):
+        return NoiseSchedule.from_name(name, num_train_timesteps=num_train_timesteps)
+    return NoiseSchedule("ddim", int(name.removeprefix("ddim")), num_train_timesteps)
 
 
 def _planner_path(plans: Path, name: str) -> Path | None:

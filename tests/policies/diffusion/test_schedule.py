@@ -31,7 +31,7 @@ def test_ddpm_equals_diffusers_with_its_variance_noise(steps):
         assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize("steps", [100, 33, 10, 1])
+@pytest.mark.parametrize("steps", [100, 33, 10, 7, 1])
 def test_ddim_equals_diffusers_and_reads_no_noise(steps):
     schedule = NoiseSchedule("ddim", steps)
     reference = DDIMScheduler(**PUBLISHED)

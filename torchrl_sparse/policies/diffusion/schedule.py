@@ -19,7 +19,7 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
-__all__ = ["NoiseSchedule", "split_sampler"]
+__all__ = ["NoiseSchedule", "split_sampler", "timesteps_fall"]
 
 
 class NoiseSchedule:
@@ -93,8 +93,10 @@ class NoiseSchedule:
         self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
 
     @classmethod
-    def from_name(cls, name: str, num_inference_steps: int, num_train_timesteps: int = 100) -> NoiseSchedule:
-        """The schedule of that `name`.
+    def from_name(
+        cls, name: str, num_inference_steps: int | None = None, num_train_timesteps: int = 100
+    ) -> NoiseSchedule:
+        """The schedule of that `name`; without ``num_inference_steps`` that of the constructor without it.
 
         Raises:
             ValueError: if no schedule is called that, or not with so many steps.
@@ -156,7 +158,7 @@ class NoiseSchedule:
     def _checked(self, timesteps: Sequence[int]) -> list[int]:
         chosen = list(timesteps)
         whole = all(isinstance(timestep, Integral) for timestep in chosen)
-        falls = whole and all(a > b for a, b in pairwise([self.num_train_timesteps, *chosen, -1]))
+        falls = whole and timesteps_fall(chosen, self.num_train_timesteps)
         if self.kind != "ddim" or not falls or len(chosen) != self.num_inference_steps:
             raise ValueError(
                 f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
@@ -166,6 +168,15 @@ class NoiseSchedule:
 
     def __repr__(self) -> str:
         return f"NoiseSchedule({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+    """Whether a sampler may take them in this order: each below the last, from under ``num_train_timesteps`` to at least 0.
+
+    >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
+    (True, False, False)
+    """
+    return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
 
 
 def split_sampler(name: str) -> tuple[str, list[int] | None]:

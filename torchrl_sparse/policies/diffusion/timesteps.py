@@ -12,18 +12,14 @@ chain, the more it averages. Episodes have the last word.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 
-import torch
 from tensordict import TensorDict
 
-from torchrl_sparse import keys
+from torchrl_sparse.blocks.pruner_reference import dense_answers
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
+from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule, timesteps_fall
 
 __all__ = ["demonstration_error", "search_timesteps"]
-
-_BATCH = 16  # queries that the policy answers at a time
 
 
 def search_timesteps(
@@ -53,14 +49,14 @@ def search_timesteps(
         (88, 12)
     """
     best = tuple(start)
-    if not _falls(best, num_train_timesteps):
+    if not timesteps_fall(best, num_train_timesteps):
         raise ValueError(
             f"start: expected timesteps that fall from below {num_train_timesteps} to at least 0, got {list(start)}"
         )
     tried = {best: error(best)}
     for stride in strides:
         while True:
-            moves = [move for move in _moves(best, stride) if _falls(move, num_train_timesteps)]
+            moves = [move for move in _moves(best, stride) if timesteps_fall(move, num_train_timesteps)]
             tried |= {move: error(move) for move in moves if move not in tried}
             winner = min([best, *moves], key=tried.__getitem__)
             if winner == best:
@@ -89,15 +85,9 @@ def demonstration_error(
         ),
         engine=policy.engine,
     )
-    actions = torch.cat(
-        [
-            chain.denoise(chain.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND])
-            for part in reference.split(_BATCH)
-        ]
-    )
     first = policy.n_obs_steps - 1
     executed = slice(first, first + n_action_steps)
-    return (actions - reference["target"])[:, executed].abs().mean().item()
+    return (dense_answers(chain, reference) - reference["target"])[:, executed].abs().mean().item()
 
 
 def _moves(timesteps: tuple[int, ...], stride: int) -> list[tuple[int, ...]]:
@@ -106,7 +96,3 @@ def _moves(timesteps: tuple[int, ...], stride: int) -> list[tuple[int, ...]]:
         for i, timestep in enumerate(timesteps)
         for move in (stride, -stride)
     ]
-
-
-def _falls(timesteps: tuple[int, ...], num_train_timesteps: int) -> bool:
-    return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
