@@ -145,6 +145,7 @@ def plot_schedule(
     axes.tick_params(axis="y", length=0)
     for layer in range(1, num_blocks // 3):
         axes.axhline(3 * layer - 0.5, color="white", linewidth=2)
+    axes.xaxis.get_major_locator().set_params(integer=True)  # there is no step 0.5 in a chain of two
     axes.set_xlabel("denoising step, in execution order (0 is the first call of the network)")
     cost = "" if flops_ratio is None else f", {100 * flops_ratio:.1f} % of dense FLOPs"
     axes.set_title(f"{name}: {100 * mask.mean():.1f} % pruned{cost}", loc="left")
