@@ -25,9 +25,10 @@ from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
+from torchrl_sparse.blocks.pruner_network import PrunerNetwork
 from torchrl_sparse.blocks.pruner_reference import make_reference, with_queries
 from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate
-from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
+from torchrl_sparse.blocks.sag import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.benchmarks import find_task

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.mask import prune_rate
+from torchrl_sparse.blocks.pruner_network import PrunerNetwork
 from torchrl_sparse.blocks.pruner_reference import make_reference, with_queries
 from torchrl_sparse.blocks.pruner_training import (
     PrunerConfig,
@@ -16,7 +17,7 @@ from torchrl_sparse.blocks.pruner_training import (
     imitate,
     sparsity_loss,
 )
-from torchrl_sparse.blocks.sag import PrunerNetwork, rate_threshold
+from torchrl_sparse.blocks.sag import rate_threshold
 from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy

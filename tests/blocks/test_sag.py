@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from torchrl_sparse.blocks.mask import NetworkSizes, query_flops
 from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner, rate_threshold
+from torchrl_sparse.blocks.pruner_network import PrunerNetwork
+from torchrl_sparse.blocks.sag import PrunerInfo, SAGPruner, rate_threshold
 from torchrl_sparse.keys import COND, PRUNE_MASK, PRUNE_RATE
 
 from .conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS

@@ -7,7 +7,6 @@ does not) and writes one method.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -122,7 +121,7 @@ class Planner(TensorDictModuleBase):
         spec = self.spec
         cond = read(tensordict, COND)
         batch = cond.shape[:-2]
-        rows = math.prod(batch)
+        rows = batch.numel()
         masks = self.masks(cond.reshape(rows, *cond.shape[-2:]), **self.options(tensordict, rows))
         try:
             validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))

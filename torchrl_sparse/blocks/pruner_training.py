@@ -200,7 +200,7 @@ class PrunerTrainer:
     """Trains gates through a frozen policy.
 
     Args:
-        gates: :class:`~torchrl_sparse.blocks.sag.PrunerNetwork` or :class:`~torchrl_sparse.blocks.l2c.StaticGates`.
+        gates: :class:`~torchrl_sparse.blocks.pruner_network.PrunerNetwork` or :class:`~torchrl_sparse.blocks.l2c.StaticGates`.
         policy: the policy, with the sampler that will be pruned; its weights get no gradient.
         reference: see :mod:`torchrl_sparse.blocks.pruner_reference`; the last tenth is held out.
         config: how to train.

@@ -20,142 +20,25 @@ with that one of them that leaves so many above it.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
+from torchrl_sparse.blocks.pruner_network import PrunerNetwork
 from torchrl_sparse.keys import COND, PRUNE_RATE
 from torchrl_sparse.policies.checkpoints.files import read_config, read_tensors, write_config, write_tensors
 from torchrl_sparse.policies.checkpoints.tensors import check_finite, check_shapes
-from torchrl_sparse.policies.diffusion.transformer import SinusoidalPosEmb
 
-__all__ = ["PrunerInfo", "PrunerNetwork", "SAGPruner", "check_rates", "rate_threshold"]
+__all__ = ["PrunerInfo", "SAGPruner", "check_rates", "rate_threshold"]
 
 FORMAT = "torchrl_sparse.sag/1"
 _FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
-
-
-class PrunerNetwork(nn.Module):
-    """Logits of every block of every denoising step from an encoded observation.
-
-    Args:
-        timesteps: diffusion timesteps of the sampler in execution order, K of them.
-        num_blocks: blocks 3L of a denoising step.
-        cond_shape: (To, D) of the encoded observations.
-        width: of a coordinate's token z, a multiple of ``n_head`` and at least 4.
-        obs_width: of the observation's embedding.
-        hidden: of the MLP.
-        n_layer, n_head: of the transformer encoder over the coordinates.
-        rate_input: whether the target prune rate is an input.
-
-    Examples:
-        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
-        >>> network(torch.zeros(7, 2, 5)).shape
-        torch.Size([7, 4, 6, 2])
-    """
-
-    def __init__(
-        self,
-        timesteps: Sequence[int],
-        num_blocks: int,
-        cond_shape: tuple[int, int],
-        *,
-        width: int = 64,
-        obs_width: int = 64,
-        hidden: int = 64,
-        n_layer: int = 1,
-        n_head: int = 4,
-        rate_input: bool = False,
-    ) -> None:
-        super().__init__()
-        self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input = rate_input
-        self.config: dict[str, Any] = {
-            "timesteps": self.timesteps,
-            "num_blocks": num_blocks,
-            "cond_shape": list(cond_shape),
-            "width": width,
-            "obs_width": obs_width,
-            "hidden": hidden,
-            "n_layer": n_layer,
-            "n_head": n_head,
-            "rate_input": rate_input,
-        }
-        self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
-        self.token = nn.Linear(2 * width, width)
-        layer = nn.TransformerEncoderLayer(
-            width, n_head, 2 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
-        )
-        self.encoder = nn.TransformerEncoder(layer, n_layer, enable_nested_tensor=False)
-        self.obs = nn.Linear(cond_shape[0] * cond_shape[1] + rate_input, obs_width)
-        # The first layer of the MLP on [obs ; z], as its two halves.
-        self.fuse_obs = nn.Linear(obs_width, hidden)
-        self.fuse_z = nn.Linear(width, hidden, bias=False)
-        self.mlp = nn.Sequential(
-            nn.ReLU(inplace=True), nn.Linear(hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 2)
-        )
-        # Not persistent, since it follows from the weights; a buffer, since it has to move with them.
-        self.register_buffer("_cells", None, persistent=False)
-
-    def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Logits (keep, prune) f32 [B, K, 3L, 2].
-
-        Args:
-            cond: encoded observations f32 [B, To, D].
-            rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
-        """
-        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, 2)
-
-    def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, at less cost than both logits."""
-        _, middle, _, last = self.mlp
-        hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
-        difference = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
-        return difference.view(len(cond), len(self.timesteps), self.num_blocks)
-
-    def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        """The first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
-        features = cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate], dim=-1)
-        return (self.fuse_obs(self.obs(features))[:, None] + self.cells()).flatten(0, 1)
-
-    def cells(self) -> Tensor:
-        """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
-        if self.training or torch.is_grad_enabled():
-            return self._encode()
-        if self._cells is None:
-            self._cells = self._encode()
-        return self._cells
-
-    def train(self, mode: bool = True) -> PrunerNetwork:
-        """Training changes the weights that the kept ``z`` was made with."""
-        self._cells = None
-        return super().train(mode)
-
-    @property
-    def macs_per_query(self) -> int:
-        """Multiply-accumulates of one query in evaluation mode, where ``z`` is there already."""
-        hidden, obs = self.fuse_obs.out_features, self.obs
-        return (
-            obs.in_features * obs.out_features
-            + obs.out_features * hidden
-            + len(self.coordinates) * (hidden * hidden + 2 * hidden)
-        )
-
-    def _encode(self) -> Tensor:
-        return self.fuse_z(self.encoder(self.token(self.coordinates)[None])[0])
-
-    def _coordinates(self, code: SinusoidalPosEmb) -> Tensor:
-        """[K * 3L, 2 * width]: step and block codes, concatenated as in the paper, not added."""
-        steps = code(torch.tensor(self.timesteps)).repeat_interleave(self.num_blocks, dim=0)
-        return torch.cat([steps, code(torch.arange(self.num_blocks)).repeat(len(self.timesteps), 1)], dim=-1)
 
 
 def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
@@ -231,6 +114,7 @@ class SAGPruner(Planner):
         rate: prune rate of the queries that do not bring their own. Assign another within ``info.rate_range``.
 
     Examples:
+        >>> from torchrl_sparse.blocks.pruner_network import PrunerNetwork
         >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
         >>> pruner = SAGPruner(network, PrunerInfo(policy="a policy", sampler="ddim", rate=0.7))
         >>> pruner.bind(PlanSpec(4, 2, "a policy", sampler="ddim"))
@@ -248,6 +132,10 @@ class SAGPruner(Planner):
         self.network, self.info, self.reuse = network.eval(), info, info.reuse
         self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
         self._rate = info.rate
+        # Added to what logits have to exceed: nothing exceeds it in the first step. [K, 1]
+        never_first = torch.zeros(len(network.timesteps), 1)
+        never_first[0] = torch.inf
+        self.register_buffer("_never_first", never_first, persistent=False)
 
     @property
     def rate(self) -> float:
@@ -295,7 +183,6 @@ class SAGPruner(Planner):
         self._check_rates(rate, PRUNE_RATE)
         return {"rate": rate.reshape(rows, 1)}
 
-    @torch.no_grad()
     def masks(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Masks bool [B, K, 3L].
 
@@ -311,10 +198,16 @@ class SAGPruner(Planner):
                 f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
                 f"got {list(cond.shape)}"
             )
+        if not torch.is_grad_enabled():  # as in every collector: entering no_grad is a tenth of the time
+            return self._decide(cond, rate)
+        with torch.no_grad():
+            return self._decide(cond, rate)
+
+    def _decide(self, cond: Tensor, rate: Tensor | None) -> Tensor:
         logits = self.network.prune_logits(cond, rate)
-        masks = logits > (0 if rate is None else rate_threshold(logits, rate))
-        masks[:, 0] = False
-        return masks
+        if rate is None:
+            return logits > self._never_first
+        return logits > rate_threshold(logits, rate) + self._never_first
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""

@@ -3,11 +3,11 @@
 import ctypes
 import os
 
-from torchrl_sparse.blocks.engine import native, packing
+from torchrl_sparse.blocks.engine import library, packing
 
 SANITIZED = os.environ.get("SANITIZED_NATIVE")
 if SANITIZED:
-    native._load = lambda _: native._declare(ctypes.CDLL(SANITIZED))
+    library._load = lambda _: library._declare(ctypes.CDLL(SANITIZED))
     # Every array in memory of its own, from malloc: the sanitizer then sees reads beyond each of them.
-    packing._Arena._BLOCK = 0
+    packing.Arena._BLOCK = 0
     packing._pages = bytearray

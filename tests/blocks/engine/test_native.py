@@ -6,13 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from torchrl_sparse.blocks.engine import denoise, native
-from torchrl_sparse.blocks.engine.native import (
-    INSTRUCTION_SETS,
-    NativeEngine,
-    native_available,
-    native_supports,
-)
+from torchrl_sparse.blocks.engine import denoise, library
+from torchrl_sparse.blocks.engine.library import INSTRUCTION_SETS, native_available
+from torchrl_sparse.blocks.engine.native import NativeEngine, native_supports
 from torchrl_sparse.blocks.engine.packing import pack_panels
 from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
 from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
@@ -208,7 +204,7 @@ def test_wrong_inputs_are_named():
     engine = NativeEngine(network, schedule)
     with pytest.raises(ValueError, match=r"noise: expected shape \[2, 6, 10, 7\], got \[2, 5, 10, 7\]"):
         engine.denoise(noise[:, :5], cond)
-    with pytest.raises(ValueError, match=r"cond: expected float32 on the CPU, got torch\.float64"):
+    with pytest.raises(ValueError, match=r"cond: expected torch\.float32 on the CPU, got torch\.float64"):
         engine.denoise(noise, cond.double())
     with pytest.raises(ValueError, match="prune mask: expected shape"):
         engine.denoise(noise, cond, mask[..., :3])
@@ -267,26 +263,26 @@ def test_panels_of_bfloat16_hold_pairs_of_inputs():
 
 
 def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monkeypatch):
-    assert "was not built" in native._load(tmp_path)
-    suffix = native.importlib.machinery.EXTENSION_SUFFIXES[0]
+    assert "was not built" in library._load(tmp_path)
+    suffix = library.importlib.machinery.EXTENSION_SUFFIXES[0]
     (tmp_path / f"_native{suffix}").write_bytes(b"no library")
-    assert "cannot be loaded" in native._load(tmp_path)
+    assert "cannot be loaded" in library._load(tmp_path)
 
-    monkeypatch.setattr(native, "_load", lambda _: "it was not built")
-    native._library.cache_clear()
+    monkeypatch.setattr(library, "_load", lambda _: "it was not built")
+    library.library.cache_clear()
     try:
         with pytest.warns(UserWarning, match="without its native engine: it was not built"):
             assert native_available() == (False, "it was not built")
         assert native_supports(make_network()) == (False, "it was not built")
     finally:
-        native._library.cache_clear()
+        library.library.cache_clear()
 
 
 def test_the_library_depends_on_nothing_but_the_c_runtime():
     """No PyTorch, no Python: any version of them can load it."""
-    library = native._library()
-    assert isinstance(library, ctypes.CDLL)
-    with open(library._name, "rb") as file:
+    found = library.library()
+    assert isinstance(found, ctypes.CDLL)
+    with open(found._name, "rb") as file:
         content = file.read()
     assert not any(name in content for name in (b"libtorch", b"libc10", b"libpython"))
     assert set(SETS) <= set(INSTRUCTION_SETS)

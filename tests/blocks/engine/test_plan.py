@@ -1,7 +1,5 @@
 """A program is only another way of writing a mask."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from torchrl_sparse.blocks.engine.plan import (
     COLLAPSE,
     COMPUTE,
     REUSE,
-    ProgramCache,
     build_program,
     slot_counts,
 )
@@ -69,39 +66,3 @@ def test_nothing_pruned_only_computes():
 def test_slot_counts_counts(first, size, slots):
     read = [block % slots for block in range(first, first + size)]
     assert slot_counts(first, first + size, slots) == tuple(read.count(slot) for slot in range(slots))
-
-
-def test_the_cache_keeps_the_latest_masks():
-    cache = ProgramCache(capacity=2)
-    first, second, third = (random_mask(0.5, seed=seed) for seed in range(3))
-    kept = cache.get(first)
-    cache.get(second)
-    assert cache.get(first.copy()) is kept
-    dropped = cache.get(second)
-    cache.get(first)
-    cache.get(third)
-    assert len(cache) == 2
-    assert cache.get(first) is kept
-    assert cache.get(second) is not dropped
-
-
-def test_masks_with_equal_bytes_and_different_shapes_are_different():
-    cache, mask = ProgramCache(), np.zeros((4, 6), bool)
-    assert cache.get(mask).num_steps == 4
-    assert cache.get(mask.reshape(8, 3)).num_steps == 8
-
-
-def test_a_cache_without_room_is_refused():
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        ProgramCache(0)
-
-
-def test_a_program_is_built_in_a_fraction_of_a_query():
-    """A pruned query takes about 12 ms in the fastest engine; 3 % of that are 0.36 ms."""
-    mask = random_mask(0.91, 100, 24)
-    seconds = []
-    for _ in range(50):
-        start = time.thread_time()
-        build_program(mask)
-        seconds.append(time.thread_time() - start)
-    assert min(seconds) < 0.36e-3

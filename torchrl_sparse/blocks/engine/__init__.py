@@ -3,7 +3,8 @@
 from torchrl_sparse.blocks.engine.base import Engine, ReferenceEngine
 from torchrl_sparse.blocks.engine.costs import BlockCost
 from torchrl_sparse.blocks.engine.factory import EngineName, make_engine
-from torchrl_sparse.blocks.engine.native import NativeEngine, native_available
+from torchrl_sparse.blocks.engine.library import native_available
+from torchrl_sparse.blocks.engine.native import NativeEngine
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.blocks.engine.torch_engine import TorchEngine
 

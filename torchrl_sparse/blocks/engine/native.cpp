@@ -51,19 +51,21 @@ struct Model {
     const float* valid;         // [padded width]: 1 for each column, 0 for the padding
 };
 
-// What one query computes, see plan.py.
-struct Program {
-    const int32_t* ops;     // [n][3]
-    const int32_t* starts;  // [steps + 1]
-    int32_t slots;          // latest outputs kept: one for each block, 3 (one for each type), or 1
+// The MLP of a pruner, see native_gates.py. A cell is a block of a denoising step.
+struct Gates {
+    Matrix obs, middle;  // observation -> what it adds to every cell; cell -> its second hidden layer
+    const float* cells;  // [count][padded width]: what a cell is without an observation
+    const float* last;   // [padded width]
+    float bias;          // of the last layer
+    int32_t count;       // of cells
 };
 }
 
 namespace {
 
-enum Op { COMPUTE, REUSE, COLLAPSE };
 enum Activation { GELU, MISH };
 constexpr int PANEL = 32, PART = 256;
+constexpr int MAX_HIDDEN = 256;   // of a pruner
 constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
 using half = uint16_t;
 struct Pair { uint16_t first, second; };  // of BF16
@@ -130,13 +132,17 @@ struct Buffers {
 #endif
 
 namespace {
-struct Level { decltype(&portable::denoise) denoise; decltype(&portable::run_blocks) run_blocks; };
+struct Level {
+    decltype(&portable::denoise) denoise;
+    decltype(&portable::run_blocks) run_blocks;
+    decltype(&portable::prune) prune;
+};
 const Level LEVELS[] = {
-    {portable::denoise, portable::run_blocks},
+    {portable::denoise, portable::run_blocks, portable::prune},
 #if defined(__x86_64__)
-    {avx2::denoise, avx2::run_blocks},
-    {avx512::denoise, avx512::run_blocks},
-    {avx512_bf16::denoise, avx512_bf16::run_blocks},
+    {avx2::denoise, avx2::run_blocks, avx2::prune},
+    {avx512::denoise, avx512::run_blocks, avx512::prune},
+    {avx512_bf16::denoise, avx512_bf16::run_blocks, avx512_bf16::prune},
 #endif
 };
 }  // namespace
@@ -157,15 +163,22 @@ int32_t sparse_levels() {
 // Floats that a call needs as scratch, which must start on a cache line (64 bytes).
 int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(*m, slots, nullptr).size; }
 
-// noise [steps][horizon][action_dim], cond [obs_steps][cond_dim] -> actions [horizon][action_dim].
-void sparse_denoise(int32_t level, const Model* m, const Program* program, const float* noise, const float* cond,
-                    float* actions, float* scratch) {
-    LEVELS[level].denoise(*m, *program, noise, cond, actions, scratch);
+// pruned [steps][3 * layers], noise [steps][horizon][action_dim], cond [obs_steps][cond_dim] -> actions [horizon][action_dim].
+// The latest outputs are kept in `slots` places: one for each block, 3 (one for each type), or 1.
+void sparse_denoise(int32_t level, const Model* m, const uint8_t* pruned, int32_t slots, const float* noise,
+                    const float* cond, float* actions, float* scratch) {
+    LEVELS[level].denoise(*m, pruned, slots, noise, cond, actions, scratch);
 }
 
 // To be timed by the caller: runs the blocks of `kind` (0 SA, 1 CA, 2 FFN) of all layers.
 void sparse_blocks(int32_t level, const Model* m, int32_t kind, float* scratch) {
     LEVELS[level].run_blocks(*m, kind, scratch);
+}
+
+// observations [n][obs.rows] -> logits [n][count].
+void sparse_prune(int32_t level, const Gates* gates, int32_t n, const float* observations, float* logits) {
+    for (ptrdiff_t i = 0; i < n; i++)
+        LEVELS[level].prune(*gates, observations + i * gates->obs.rows, logits + i * gates->count);
 }
 }
 
@@ -268,6 +281,8 @@ INLINE V gelu(V x) {
     p = p * s * exponential(-.5f * t * t);
     return x * (x < 0.f ? p : 1.f - p);
 }
+
+INLINE V relu(V x) { return x > 0.f ? x : V{}; }
 
 // x * tanh(ln(1 + e^x)), written with e^x alone.
 INLINE V mish(V x) {
@@ -532,33 +547,67 @@ struct Query {
             }
     }
 
-    void run(const Program& program, const float* noise, const float* cond, float* actions) const {
-        const int lda = stride(m.action_dim), size = m.horizon * m.action_dim;
+    void run(const uint8_t* pruned, const float* noise, const float* cond, float* actions) const {
+        const int lda = stride(m.action_dim), size = m.horizon * m.action_dim, blocks = 3 * m.layers;
         encode(cond);
-        Matrix collapsed = m.embed;
-        collapsed.bias = b.constant;
+        Matrix constant = m.embed;  // of a step without a computed block: what all of them add goes into the bias
+        constant.bias = b.constant;
+        bool known = false;  // whether b.constant is of the latest outputs
         for (int t = 0; t < m.horizon; t++) copy(noise + t * m.action_dim, m.action_dim, b.sample + t * lda);
-        for (int step = 0; step < m.steps; step++) {
-            const int32_t* op = program.ops + 3 * program.starts[step];
-            const int32_t* const end = program.ops + 3 * program.starts[step + 1];
-            if (op[0] == COLLAPSE && op[1]) reuse(m.embed.bias, b.width, b.constant, b.width, 0, 3 * m.layers);
-            product(b.sample, lda, m.horizon, op[0] == COLLAPSE ? collapsed : m.embed, b.x, b.ld);
-            for (; op < end; op += 3) {
-                if (op[0] == COMPUTE) compute(step, op[1]);
-                if (op[0] == REUSE) reuse(b.x, b.ld, b.x, b.ld, op[1], op[2]);
+        for (int step = 0; step < m.steps; step++, pruned += blocks) {
+            const bool empty = run_end(pruned, 0, blocks) == blocks;
+            if (empty && !known) reuse(m.embed.bias, b.width, b.constant, b.width, 0, blocks);
+            known = empty;
+            product(b.sample, lda, m.horizon, empty ? constant : m.embed, b.x, b.ld);
+            for (int block = empty ? blocks : 0, end; block < blocks; block = end + 1) {
+                end = run_end(pruned, block, blocks);
+                if (end > block) reuse(b.x, b.ld, b.x, b.ld, block, end);
+                if (end < blocks) compute(step, end);
             }
             advance(step, step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr);
         }
         for (int t = 0; t < m.horizon; t++) copy(b.sample + t * lda, m.action_dim, actions + t * m.action_dim);
     }
+
+    // The first computed block from `block` on: pruned ones before it add a sum of what is there already.
+    static int run_end(const uint8_t* pruned, int block, int blocks) {
+        while (block < blocks && pruned[block]) block++;
+        return block;
+    }
 };
 
-void denoise(const Model& m, const Program& p, const float* noise, const float* cond, float* actions, float* scratch) {
-    Query(m, p.slots, scratch).run(p, noise, cond, actions);
+void denoise(const Model& m, const uint8_t* pruned, int slots, const float* noise, const float* cond, float* actions,
+             float* scratch) {
+    Query(m, slots, scratch).run(pruned, noise, cond, actions);
 }
 
 void run_blocks(const Model& m, int kind, float* scratch) {
     for (int layer = 0; layer < m.layers; layer++) Query(m, 3, scratch).compute(0, 3 * layer + kind);
+}
+
+// One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
+void prune(const Gates& g, const float* observation, float* logits) {
+    // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
+    constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
+    constexpr int ld = stride(MAX_HIDDEN);
+    alignas(64) float added[ld], x[GROUP * ld], y[GROUP * ld];
+    const int width = g.middle.columns;
+    multiply<float>(observation, 0, 1, g.obs, added, 0);
+    for (int first = 0; first < g.count; first += GROUP) {
+        const int n = g.count - first < GROUP ? g.count - first : GROUP;
+        for (int c = 0; c < n; c++)
+            for (int j = 0; j < width; j += VECTOR) {
+                const float* const cell = g.cells + (size_t)(first + c) * width + j;
+                __builtin_prefetch(cell + 2 * GROUP * width);  // a policy's weights have driven the cells out of the cache
+                store(x + c * ld + j, relu(load(cell) + load(added + j)));
+            }
+        multiply<float>(x, ld, n, g.middle, y, ld);
+        for (int c = 0; c < n; c++) {
+            V total{};
+            for (int j = 0; j < width; j += VECTOR) total += relu(load(y + c * ld + j)) * load(g.last + j);
+            logits[first + c] = g.bias + sum(total);
+        }
+    }
 }
 
 #undef INLINE

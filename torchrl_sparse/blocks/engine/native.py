@@ -1,29 +1,27 @@
 """The native engine: one call of compiled code for each action chunk, on the CPU.
 
 ``native.cpp`` holds the loop, :mod:`~torchrl_sparse.blocks.engine.packing` prepares the weights and tables that
-it reads, :mod:`~torchrl_sparse.blocks.engine.plan` the program that it executes. It is built when the package is
-installed, as a plain shared library that knows nothing of Python or PyTorch, and is called through ctypes, which
-releases the interpreter's lock.
+it reads, and :mod:`~torchrl_sparse.blocks.engine.library` finds the compiled code. It reads the mask as it goes: unlike
+the PyTorch engine's, its program is the mask.
 """
 
 from __future__ import annotations
 
-import ctypes
-import importlib.machinery
 import time
-import warnings
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import POINTER, c_int32, c_int64, c_void_p
-from functools import lru_cache
-from pathlib import Path
+from ctypes import byref
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.packing import Model, PackedNetwork
-from torchrl_sparse.blocks.engine.plan import Program, ProgramCache
+from torchrl_sparse.blocks.engine.library import (
+    INSTRUCTION_SETS,
+    instruction_level,
+    library,
+    native_available,
+)
+from torchrl_sparse.blocks.engine.packing import PackedNetwork
 from torchrl_sparse.blocks.engine.reference import check_query
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
@@ -32,60 +30,10 @@ if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["INSTRUCTION_SETS", "NativeEngine", "native_available", "native_supports"]
+__all__ = ["NativeEngine", "native_supports"]
 
-INSTRUCTION_SETS = ("portable", "avx2", "avx512", "avx512_bf16")
 _WEIGHTS = ("float32", "float16", "bfloat16")
 _MAX_OBS_STEPS = 63
-
-
-class _Program(ctypes.Structure):
-    _fields_ = [("ops", c_void_p), ("starts", c_void_p), ("slots", c_int32)]
-
-
-@lru_cache(maxsize=1)
-def _library() -> ctypes.CDLL | str:
-    """The compiled library, or why there is none; then it also warns, once in a process."""
-    library = _load(Path(__file__).parent)
-    if isinstance(library, str):
-        warnings.warn(f"torchrl_sparse runs without its native engine: {library}", stacklevel=2)
-    return library
-
-
-def _load(folder: Path) -> ctypes.CDLL | str:
-    paths = [folder / f"_native{suffix}" for suffix in importlib.machinery.EXTENSION_SUFFIXES]
-    path = next((path for path in paths if path.exists()), None)
-    if path is None:
-        return f"{paths[0].name} was not built (install a C++17 compiler, g++ or clang++, then this package again)"
-    try:
-        return _declare(ctypes.CDLL(str(path)))
-    except (OSError, AttributeError) as error:
-        return f"{path.name} cannot be loaded ({error}); install the package again"
-
-
-def _declare(library: ctypes.CDLL) -> ctypes.CDLL:
-    library.sparse_levels.restype = c_int32
-    library.sparse_scratch.restype = c_int64
-    library.sparse_scratch.argtypes = [POINTER(Model), c_int32]
-    library.sparse_denoise.restype = None
-    library.sparse_denoise.argtypes = [c_int32, POINTER(Model), POINTER(_Program), *[c_void_p] * 4]
-    library.sparse_blocks.restype = None
-    library.sparse_blocks.argtypes = [c_int32, POINTER(Model), c_int32, c_void_p]
-    return library
-
-
-def native_available() -> tuple[bool, str]:
-    """Whether the native engine was built, and the instruction sets that it can use here or what is missing.
-
-    Examples:
-        >>> available, reason = native_available()
-        >>> isinstance(available, bool), isinstance(reason, str)
-        (True, True)
-    """
-    library = _library()
-    if isinstance(library, str):
-        return False, library
-    return True, ", ".join(INSTRUCTION_SETS[: library.sparse_levels()])
 
 
 def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
@@ -165,9 +113,8 @@ class NativeEngine:
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
         self.network, self.schedule, self.weights, self.threads = network, schedule, weights, threads
-        self._level = _level(instruction_set)
-        self._programs = ProgramCache()
-        self._dense = np.zeros((schedule.num_inference_steps, network.num_blocks), bool)
+        self._level = instruction_level(instruction_set)
+        self._dense = torch.zeros(schedule.num_inference_steps, network.num_blocks, dtype=torch.bool)
         self._watch = WeightWatch(network)
         self._packed = (None, None)
         self._current()
@@ -186,20 +133,19 @@ class NativeEngine:
             ValueError: also if the inputs are no float32 tensors on the CPU, or if the network is in training mode.
         """
         check_query(self.network, self.schedule, noise, cond, mask, reuse)
-        self._check(noise, cond)
-        noise, cond = noise.contiguous(), cond.contiguous()
+        if mask is None:
+            mask = self._dense.expand(len(cond), -1, -1)
+        self._check(noise, cond, mask)
+        noise, cond, mask = noise.contiguous(), cond.contiguous(), mask.contiguous()
         packed = self._current()
         slots = num_buffers(reuse, self.network.num_blocks)
-        masks = [self._dense] * len(cond) if mask is None else mask.numpy()
-        programs = [self._programs.get(rows) for rows in masks]
         actions = torch.empty(len(cond), self.network.horizon, self.network.input_dim)
-
         rows = iter(range(len(cond)))
 
         def work() -> None:
             scratch = self._scratch(packed, slots)
             for row in rows:  # each thread takes the next: one that is held up holds up nothing else
-                self._run(packed, programs[row], slots, noise[row], cond[row], actions[row], scratch)
+                self._run(packed, slots, mask[row], noise[row], cond[row], actions[row], scratch)
 
         helpers = min(self.threads or torch.get_num_threads(), len(cond)) - 1
         # It starts a thread for each task, and none for a single row.
@@ -225,18 +171,17 @@ class NativeEngine:
         best = float("inf")
         for _ in range(repeats):
             start = time.perf_counter()
-            _library().sparse_blocks(self._level, packed.model, kind, scratch.data_ptr())
+            library().sparse_blocks(self._level, byref(packed.model), kind, scratch.data_ptr())
             best = min(best, time.perf_counter() - start)
         return best / self.network.n_layer
 
-    def _run(self, packed, program: Program, slots: int, noise, cond, actions, scratch) -> None:
-        pointers = _Program(program.ops.ctypes.data, program.starts.ctypes.data, slots)
+    def _run(self, packed, slots: int, mask, noise, cond, actions, scratch) -> None:
         addresses = (tensor.data_ptr() for tensor in (noise, cond, actions, scratch))
-        _library().sparse_denoise(self._level, packed.model, pointers, *addresses)
+        library().sparse_denoise(self._level, byref(packed.model), mask.data_ptr(), slots, *addresses)
 
     def _scratch(self, packed: PackedNetwork, slots: int) -> Tensor:
         """Memory for one call at a time; PyTorch aligns it to cache lines."""
-        return torch.empty(_library().sparse_scratch(packed.model, slots))
+        return torch.empty(library().sparse_scratch(byref(packed.model), slots))
 
     def _current(self) -> PackedNetwork:
         """The packed weights, packed anew if the network has changed."""
@@ -247,22 +192,15 @@ class NativeEngine:
             self._packed = (version, packed)
         return packed
 
-    def _check(self, noise: Tensor, cond: Tensor) -> None:
+    def _check(self, noise: Tensor, cond: Tensor, mask: Tensor) -> None:
         if self.network.training:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
-        for name, tensor in (("noise", noise), ("cond", cond)):
-            if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+        for name, tensor, dtype in (
+            ("noise", noise, torch.float32),
+            ("cond", cond, torch.float32),
+            ("mask", mask, torch.bool),
+        ):
+            if tensor.dtype != dtype or not tensor.is_cpu:
                 raise ValueError(
-                    f"{name}: expected float32 on the CPU, got {tensor.dtype} on {tensor.device}"
+                    f"{name}: expected {dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
                 )
-
-
-def _level(instruction_set: str | None) -> int:
-    available = INSTRUCTION_SETS[: _library().sparse_levels()]
-    if instruction_set is None:
-        return len(available) - 1
-    if instruction_set not in available:
-        raise ValueError(
-            f"instruction_set: expected one of {list(available)} on this CPU, got {instruction_set!r}"
-        )
-    return available.index(instruction_set)

@@ -34,14 +34,16 @@ if TYPE_CHECKING:
     from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
     from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Model", "PackedNetwork", "pack_panels"]
+__all__ = ["Arena", "Matrix", "Model", "PackedNetwork", "pack_panels"]
 
 PANEL, PART = 32, 256
 _TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as native.cpp numbers them
 _CACHE_LINE = 64
 
 
-class _Matrix(ctypes.Structure):
+class Matrix(ctypes.Structure):
+    """``struct Matrix`` of native.cpp; :meth:`Arena.matrix` makes one."""
+
     _fields_ = [
         *((name, c_void_p) for name in ("weight", "bias")),
         *((name, c_int32) for name in ("rows", "columns", "bias_stride", "type")),
@@ -50,8 +52,8 @@ class _Matrix(ctypes.Structure):
 
 class _Layer(ctypes.Structure):
     _fields_ = [
-        *((name, _Matrix) for name in ("qkv", "out", "up", "down", "kv")),
-        ("fold", POINTER(_Matrix)),
+        *((name, Matrix) for name in ("qkv", "out", "up", "down", "kv")),
+        ("fold", POINTER(Matrix)),
         *((name, c_void_p) for name in ("query_bias", "cross_bias")),
     ]
 
@@ -64,7 +66,7 @@ class Model(ctypes.Structure):
         *((name, c_int32) for name in _SIZES),
         ("clip", c_float),
         ("layer", POINTER(_Layer)),
-        *((name, _Matrix) for name in ("embed", "head", "cond", "encode_up", "encode_down")),
+        *((name, Matrix) for name in ("embed", "head", "cond", "encode_up", "encode_down")),
         *((name, c_void_p) for name in ("time_key", "time_value", "time_bias", "coefficients", "valid")),
     ]
 
@@ -100,7 +102,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.cat([part.flatten() for part in panels.split(PART, dim=1)])
 
 
-class _Arena:
+class Arena:
     """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
 
     _BLOCK = 32 << 20
@@ -119,6 +121,23 @@ class _Arena:
         place = self._blocks[-1][self._used : self._used + tensor.numel()].copy_(tensor)
         self._used += -(-tensor.numel() // _CACHE_LINE) * _CACHE_LINE
         return place.data_ptr()
+
+    def floats(self, tensor: Tensor) -> int:
+        """Address of a copy of ``tensor`` as f32."""
+        return self.keep(tensor.float())
+
+    def matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype = torch.float32) -> Matrix:
+        """A layer's packed ``weight`` [columns, rows] and ``bias`` [columns], or [n, columns] for n rows of a product."""
+        columns, rows = weight.shape
+        bias = functional.pad(bias, (0, -columns % PANEL))
+        return Matrix(
+            weight=self.keep(pack_panels(weight, dtype)),
+            bias=self.floats(bias),
+            rows=-(-rows // 2) if dtype == torch.bfloat16 else rows,
+            columns=bias.shape[-1],
+            bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
+            type=_TYPES.index(dtype),
+        )
 
 
 def _pages(size: int) -> mmap.mmap:
@@ -148,7 +167,7 @@ class PackedNetwork:
         self, network: TransformerForDiffusion, schedule: NoiseSchedule, weights: torch.dtype
     ) -> None:
         self._weights = weights
-        self._arena = _Arena()
+        self._arena = Arena()
         self._arrays: list[ctypes.Array] = []  # structures only point to theirs
         self._heads = network.n_head
         self._head_size = network.n_emb // network.n_head
@@ -182,19 +201,19 @@ class PackedNetwork:
             causal=network.causal_attn,
             clip=coefficients.clip,
             layer=layer_array,
-            embed=self._matrix(network.input_emb.weight, network.input_emb.bias + positions, torch.float32),
-            head=self._matrix(*after_norm(norm, head.weight, head.bias), torch.float32),
-            cond=self._matrix(
-                network.cond_obs_emb.weight, network.cond_obs_emb.bias + cond_positions, torch.float32
-            ),
+            embed=self._arena.matrix(network.input_emb.weight, network.input_emb.bias + positions),
+            head=self._arena.matrix(*after_norm(norm, head.weight, head.bias)),
+            cond=self._arena.matrix(network.cond_obs_emb.weight, network.cond_obs_emb.bias + cond_positions),
             encode_up=self._matrix(network.encoder[0].weight, network.encoder[0].bias),
             encode_down=self._matrix(network.encoder[2].weight, network.encoder[2].bias),
-            coefficients=self._keep(torch.stack([getattr(coefficients, name) for name in columns], dim=1)),
-            valid=self._keep(valid),
-            **{name: self._keep(table) for name, table in tables.items()},
+            coefficients=self._arena.floats(
+                torch.stack([getattr(coefficients, name) for name in columns], dim=1)
+            ),
+            valid=self._arena.floats(valid),
+            **{name: self._arena.floats(table) for name, table in tables.items()},
         )
 
-    def _pack_loop(self, layer) -> dict[str, _Matrix]:
+    def _pack_loop(self, layer) -> dict[str, Matrix]:
         """The matrices of self-attention and of the feed-forward network."""
         attention = layer.self_attn
         qkv, bias = after_norm(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
@@ -215,13 +234,13 @@ class PackedNetwork:
         query, query_bias, out = _cross_matrices(layer)
         kv = self._matrix(*(self._padded_heads(tensor) for tensor in key_value))
         per_head = [head.T for side in (query, out.T) for head in self._per_head(side)]
-        fold = (_Matrix * len(per_head))(*(self._matrix(head, torch.zeros(len(head))) for head in per_head))
+        fold = (Matrix * len(per_head))(*(self._matrix(head, torch.zeros(len(head))) for head in per_head))
         self._arrays.append(fold)
         return {
             "kv": kv,
             "fold": fold,
-            "query_bias": self._keep(self._per_head(query_bias)),
-            "cross_bias": self._keep(self._padded_width(layer.multihead_attn.out_proj.bias)),
+            "query_bias": self._arena.floats(self._per_head(query_bias)),
+            "cross_bias": self._arena.floats(self._padded_width(layer.multihead_attn.out_proj.bias)),
         }
 
     def _time_tables(self, network, schedule) -> dict[str, Tensor]:
@@ -264,22 +283,8 @@ class PackedNetwork:
     def _padded_width(self, tensor: Tensor) -> Tensor:
         return functional.pad(tensor, (0, self._width - tensor.shape[-1]))
 
-    def _matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None) -> _Matrix:
-        dtype = dtype or self._weights
-        columns, rows = weight.shape
-        bias = functional.pad(bias, (0, -columns % PANEL))
-        return _Matrix(
-            weight=self._arena.keep(pack_panels(weight, dtype)),
-            bias=self._keep(bias),
-            rows=-(-rows // 2) if dtype == torch.bfloat16 else rows,
-            columns=bias.shape[-1],
-            bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
-            type=_TYPES.index(dtype),
-        )
-
-    def _keep(self, tensor: Tensor) -> int:
-        """Address of a copy of ``tensor`` as f32."""
-        return self._arena.keep(tensor.float())
+    def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
+        return self._arena.matrix(weight, bias, self._weights)
 
 
 def _in_proj(attention) -> tuple[Tensor, Tensor]:

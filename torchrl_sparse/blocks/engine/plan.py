@@ -17,14 +17,12 @@ run adds it as often as they occur in the run (:func:`slot_counts`).
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
 
-__all__ = ["COLLAPSE", "COMPUTE", "REUSE", "Program", "ProgramCache", "build_program", "slot_counts"]
+__all__ = ["COLLAPSE", "COMPUTE", "REUSE", "Program", "build_program", "slot_counts"]
 
 COMPUTE, REUSE, COLLAPSE = 0, 1, 2
 
@@ -54,7 +52,7 @@ class Program:
 def build_program(mask: Tensor | np.ndarray) -> Program:
     """The program of one mask.
 
-    The work is array arithmetic over the computed blocks, so that a new mask costs some ten microseconds.
+    The work is array arithmetic over the computed blocks, so that a new mask costs little next to its query.
 
     Args:
         mask: bool [K, 3L], True = pruned, row 0 all False (checked by the caller, see
@@ -107,41 +105,3 @@ def slot_counts(first: int, last: int, num_slots: int) -> tuple[int, ...]:
     return tuple(
         (last - 1 - slot) // num_slots - (first - 1 - slot) // num_slots for slot in range(num_slots)
     )
-
-
-class ProgramCache:
-    """The programs of the latest distinct masks; safe to share between threads.
-
-    Args:
-        capacity: programs to keep, >= 1; the least recently used goes first.
-
-    Examples:
-        >>> cache, mask = ProgramCache(), np.zeros((4, 6), bool)
-        >>> cache.get(mask) is cache.get(mask.copy())
-        True
-    """
-
-    def __init__(self, capacity: int = 256) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity: expected at least 1, got {capacity}")
-        self.capacity = capacity
-        self._programs: OrderedDict[tuple, Program] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, mask: np.ndarray) -> Program:
-        """The program of ``mask``, bool [K, 3L], built if it is new."""
-        key = (mask.shape, mask.tobytes())
-        with self._lock:
-            program = self._programs.get(key)
-            if program is not None:
-                self._programs.move_to_end(key)
-                return program
-        program = build_program(mask)
-        with self._lock:
-            self._programs[key] = program
-            if len(self._programs) > self.capacity:
-                self._programs.popitem(last=False)
-        return program
-
-    def __len__(self) -> int:
-        return len(self._programs)

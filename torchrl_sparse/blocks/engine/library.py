@@ -1,0 +1,83 @@
+"""The compiled library of ``native.cpp``: where it is, and which of its instruction sets this CPU has.
+
+It is built when the package is installed, as a plain shared library that knows nothing of Python or PyTorch, and is
+called through ctypes, which releases the interpreter's lock.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.machinery
+import warnings
+from ctypes import c_int32, c_int64, c_void_p
+from functools import lru_cache
+from pathlib import Path
+
+__all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
+
+INSTRUCTION_SETS = ("portable", "avx2", "avx512", "avx512_bf16")
+# Of each function what it returns and takes; c_void_p is any address, of a structure of packing.py or of numbers.
+_SIGNATURES = {
+    "sparse_levels": (c_int32, []),
+    "sparse_scratch": (c_int64, [c_void_p, c_int32]),
+    "sparse_denoise": (None, [c_int32, c_void_p, c_void_p, c_int32, *[c_void_p] * 4]),
+    "sparse_blocks": (None, [c_int32, c_void_p, c_int32, c_void_p]),
+    "sparse_prune": (None, [c_int32, c_void_p, c_int32, *[c_void_p] * 2]),
+}
+
+
+@lru_cache(maxsize=1)
+def library() -> ctypes.CDLL | str:
+    """The compiled library, or why there is none; then it also warns, once in a process."""
+    found = _load(Path(__file__).parent)
+    if isinstance(found, str):
+        warnings.warn(f"torchrl_sparse runs without its native engine: {found}", stacklevel=2)
+    return found
+
+
+def _load(folder: Path) -> ctypes.CDLL | str:
+    paths = [folder / f"_native{suffix}" for suffix in importlib.machinery.EXTENSION_SUFFIXES]
+    path = next((path for path in paths if path.exists()), None)
+    if path is None:
+        return f"{paths[0].name} was not built (install a C++17 compiler, g++ or clang++, then this package again)"
+    try:
+        return _declare(ctypes.CDLL(str(path)))
+    except (OSError, AttributeError) as error:
+        return f"{path.name} cannot be loaded ({error}); install the package again"
+
+
+def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(found, name)
+        function.restype, function.argtypes = result, arguments
+    return found
+
+
+def native_available() -> tuple[bool, str]:
+    """Whether the library was built, and the instruction sets that it can use here or what is missing.
+
+    Examples:
+        >>> available, reason = native_available()
+        >>> isinstance(available, bool), isinstance(reason, str)
+        (True, True)
+    """
+    found = library()
+    if isinstance(found, str):
+        return False, found
+    return True, ", ".join(INSTRUCTION_SETS[: found.sparse_levels()])
+
+
+def instruction_level(instruction_set: str | None = None) -> int:
+    """The number by which the library knows an instruction set; of the widest that this CPU has by default.
+
+    Raises:
+        ValueError: if this CPU does not have it.
+    """
+    available = INSTRUCTION_SETS[: library().sparse_levels()]
+    if instruction_set is None:
+        return len(available) - 1
+    if instruction_set not in available:
+        raise ValueError(
+            f"instruction_set: expected one of {list(available)} on this CPU, got {instruction_set!r}"
+        )
+    return available.index(instruction_set)
