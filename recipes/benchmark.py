@@ -39,6 +39,7 @@ from torchrl_sparse.evaluation.methods import (
     make_method,
     method_identity,
     record_queries,
+    time_planning,
     time_queries,
 )
 from torchrl_sparse.evaluation.paired import rollout_episodes
@@ -96,15 +97,23 @@ def main(config: DictConfig) -> None:
     with tqdm(total=config.latency_repeats, unit="round", desc=f"{'latency':>14}") as bar:
         latency = time_queries(
             methods,
-            queries[0],
+            queries,
             repeats=config.latency_repeats,
             threads=config.threads,
             on_round=lambda done, total: bar.update(done - bar.n),
         )
+    planning = {
+        name: time_planning(method, queries, threads=config.threads)
+        for name, method in methods.items()
+        if not isinstance(method.plan, StaticPlanner)
+    }
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
     results = build_results(
-        {name: MethodRun(episodes[name], latency[name], errors[name]) for name in methods},
+        {
+            name: MethodRun(episodes[name], latency[name], errors[name], planning.get(name))
+            for name in methods
+        },
         task=task.name,
         seed=config.seed,
         machine=describe_machine(threads=config.threads),

@@ -66,8 +66,8 @@ def main(config: DictConfig) -> None:
         calibration=calibration,
     )
     methods = {name: make(name) for name in dict.fromkeys(["dense", *config.methods])}
-    query = record_queries(ChunkExecutor(policy), environment, seeds[:1])[0]
-    latency = time_queries(methods, query, repeats=config.latency_repeats, threads=config.threads)
+    queries = record_queries(ChunkExecutor(policy), environment, seeds[:1])
+    latency = time_queries(methods, queries, repeats=config.latency_repeats, threads=config.threads)
 
     own = {name: delay(latency[name].p50, config) for name in methods}
     common = {delay(seconds, config) for seconds in config.latencies}

@@ -285,7 +285,9 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "benchmark", f"policy={policy}", f"schedules={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
         "episodes=1", "horizon=16", "latency_repeats=2", "probe_episodes=1", "videos=[sag@0.5]", f"out={work}/sparse",
     )  # fmt: skip
-    assert tuple(load_results(work / "sparse" / "results.json")["methods"]) == methods
+    entries = load_results(work / "sparse" / "results.json")["methods"]
+    assert tuple(entries) == methods
+    assert [name for name in methods if "planning_s" in entries[name]] == list(methods[3:])
     for name in methods[3:]:
         assert iio.imread(work / "sparse" / f"strip_{name}.png").std() > 5
         assert iio.imread(work / "sparse" / f"masks_{name}.png").std() > 5

@@ -73,6 +73,20 @@ def test_visual_tokens_are_reported_where_there_are_any():
         validate_results(results)
 
 
+def test_planning_is_reported_where_it_was_timed():
+    planned = replace(run([1, 1], latency=0.01), planning=summarize_latency([2e-4, 3e-4, 4e-4]))
+    results = build({"dense": run([1, 0]), "sag": planned})
+    assert results["methods"]["sag"]["planning_s"]["p50"] == 3e-4
+    assert "planning_s" not in results["methods"]["dense"]
+    assert "Planning takes, of that and measured within queries, 0.3 ms (3.0 %) under sag." in format_table(
+        results
+    )
+    assert "Planning takes" not in format_table(build({"dense": run([1, 0])}))
+    results["methods"]["sag"]["planning_s"]["p50"] = 0.0
+    with pytest.raises(ValueError, match=r"methods.sag.planning_s: expected 0 < p50 <= p95"):
+        validate_results(results)
+
+
 def test_any_two_methods_are_compared_seed_by_seed():
     won, lost = run([1, 1, 1, 0] * 5), run([1, 0, 0, 1] * 5)
     low, high = tango_interval(10, 5, 20)

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ class MethodRun:
         latency: of one query, measured interleaved with the other methods.
         action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
             observations and the same noise; (0, 0) for the dense policy.
+        planning: of the planner alone, within a query; where it looks at the observation.
     """
 
     episodes: Sequence[EpisodeResult]
     latency: Latency
     action_error: tuple[float, float]
+    planning: Latency | None = None
 
 
 def build_results(
@@ -95,6 +97,8 @@ def _method_entry(name: str, run: MethodRun, dense: MethodRun, margin: float) ->
         "action_error_vs_dense": {"mean": float(run.action_error[0]), "max": float(run.action_error[1])},
         "episode_length": cost.episode_length,
     }
+    if run.planning is not None:
+        entry["planning_s"] = run.planning.to_json()
     if tokens := token_totals(run.episodes):
         entry["tokens"] = {f"kept_{name}": count for name, count in asdict(tokens).items()}
     return entry
@@ -241,12 +245,23 @@ def results_note(results: Mapping[str, Any]) -> str:
         f"{machine['cpu']}, {machine['device']}, {threads}, torch {machine['torch']}, "
         f"{machine['date'][:10]}.",
     ]
+    if planning := ", ".join(_planning(results["methods"])):
+        lines.append(f"Planning takes, of that and measured within queries, {planning}.")
     if n < episodes_needed(margin):
         lines.append(
             f"{n} episodes cannot show non-inferiority at this margin even without one differing episode: "
             f"{episodes_needed(margin)} are needed."
         )
     return "\n".join(lines)
+
+
+def _planning(methods: Mapping[str, Any]) -> Iterator[str]:
+    """What each planner that looks at the observation takes, and its share of a query."""
+    for name, method in methods.items():
+        if "planning_s" in method:
+            seconds = method["planning_s"]["p50"]
+            share = 100 * seconds / method["latency_s"]["p50"]
+            yield f"{_milliseconds(seconds)} ms ({share:.1f} %) under {name}"
 
 
 def _percent_range(interval: Sequence[float]) -> str:

@@ -15,6 +15,7 @@ Schema version 1 (all numbers finite; no other keys)::
         "speedup_vs_dense": float,
         "action_error_vs_dense": {"mean": float, "max": float},
         "episode_length": float,
+        "planning_s": {"p50": float, "p95": float, "n": int},
         "tokens": {"kept_mean": float, "kept_fine": float | null, "kept_coarse": float | null}}}}
 
 ``success.ci95`` is Wilson's interval; ``paired_vs_dense`` compares success on the same seeds, with Tango's
@@ -23,7 +24,8 @@ interval and a verdict ``"non-inferior"``, ``"inferior"`` or ``"undecided"`` aga
 query, denoiser only, or of a whole vision-language-action model; ``latency_s`` is
 in seconds per query and ``speedup_vs_dense`` the ratio of the medians; ``action_error_vs_dense`` is the
 absolute difference of an action entry, on the same observations and the same noise; ``episode_length`` is a
-mean in environment steps. ``tokens`` is there for policies with visual tokens alone: how many are in a decoder layer, mean over
+mean in environment steps. ``planning_s``, the part of a query in which the planner decides, is there where it looks at the
+observation; ``tokens`` is there for policies with visual tokens alone: how many are in a decoder layer, mean over
 layers and queries, and over the queries in fine and in coarse mode, null without any.
 
 ``methods`` always holds ``"dense"``. Its own ``paired_vs_dense`` is ``diff 0, ci95 [0, 0], "non-
@@ -55,7 +57,11 @@ _METHOD = {
     "action_error_vs_dense": {"mean": float, "max": float},
     "episode_length": float,
 }
-_TOKENS = {"kept_mean": float, "kept_fine": "number or null", "kept_coarse": "number or null"}
+# Of some methods only.
+_PARTS = {
+    "planning_s": {"p50": float, "p95": float, "n": int},
+    "tokens": {"kept_mean": float, "kept_fine": "number or null", "kept_coarse": "number or null"},
+}
 _RESULTS = {
     "schema": int,
     "task": str,
@@ -110,8 +116,8 @@ def validate_results(results: Any) -> None:
     n = None
     for name, method in results["methods"].items():
         path = f"methods.{name}"
-        has_tokens = isinstance(method, Mapping) and "tokens" in method
-        check_types(method, _METHOD | ({"tokens": _TOKENS} if has_tokens else {}), path)
+        there = {key: spec for key, spec in _PARTS.items() if isinstance(method, Mapping) and key in method}
+        check_types(method, _METHOD | there, path)
         _check_method_values(method, path)
         n = method["success"]["n"] if n is None else n
         _require(
@@ -141,10 +147,16 @@ def _check_method_values(method: Mapping[str, Any], path: str) -> None:
         paired["verdict"],
     )
     _require(0 <= method["prune_rate"] <= 1, f"{path}.prune_rate", "0 to 1", method["prune_rate"])
-    _require(0 < latency["p50"] <= latency["p95"], f"{path}.latency_s", "0 < p50 <= p95", latency)
-    _require(latency["n"] >= 1, f"{path}.latency_s.n", "at least 1", latency["n"])
+    _check_latency(latency, f"{path}.latency_s")
+    if "planning_s" in method:
+        _check_latency(method["planning_s"], f"{path}.planning_s")
     for key in ("flops", "action_error_vs_dense"):
         _require(min(method[key].values()) >= 0, f"{path}.{key}", "values >= 0", method[key])
+
+
+def _check_latency(latency: Mapping[str, Any], path: str) -> None:
+    _require(0 < latency["p50"] <= latency["p95"], path, "0 < p50 <= p95", latency)
+    _require(latency["n"] >= 1, f"{path}.n", "at least 1", latency["n"])
 
 
 def check_types(value: Any, spec: Any, path: str) -> None:
