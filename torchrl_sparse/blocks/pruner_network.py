@@ -24,6 +24,9 @@ __all__ = ["PrunerNetwork"]
 class PrunerNetwork(nn.Module):
     """Logits of every block of every denoising step from an encoded observation.
 
+    In evaluation mode, what follows from the weights alone is kept until ``train()``, ``eval()``, ``load_state_dict()`` or a
+    move: call ``eval()`` after writing to a weight by hand.
+
     Args:
         timesteps: diffusion timesteps of the sampler in execution order, K of them.
         num_blocks: blocks 3L of a denoising step.
@@ -116,7 +119,7 @@ class PrunerNetwork(nn.Module):
         return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
 
     def _features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate], dim=-1)
+        return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
         """The first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""

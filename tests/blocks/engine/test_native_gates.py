@@ -73,7 +73,16 @@ def test_the_network_uses_it_without_gradients_and_a_row_is_as_alone(rows):
     assert_close(together, exact(network, cond, rate))
 
 
-@pytest.mark.parametrize("change", ["load_state_dict", "train", "double and back"])
+def test_a_rate_of_another_type_is_converted_and_a_missing_one_refused():
+    network, rate = make_network(rate_input=True), torch.full((5, 1), 0.5)
+    with torch.no_grad():
+        expected = network.prune_logits(observations(), rate)
+        assert torch.equal(network.prune_logits(observations(), rate.double()), expected)
+        with pytest.raises(ValueError, match=r"features: expected \[B, 47\], got \[5, 46\]"):
+            network.prune_logits(observations())
+
+
+@pytest.mark.parametrize("change", ["load_state_dict", "train", "eval", "double and back"])
 def test_it_follows_the_weights(change):
     network, cond = make_network(), observations()
     with torch.no_grad():
@@ -81,16 +90,14 @@ def test_it_follows_the_weights(change):
         new = {name: 2 * value for name, value in network.state_dict().items()}
         if change == "load_state_dict":
             network.load_state_dict(new)
-        elif change == "train":
-            network.train()
-            for name, parameter in network.named_parameters():
-                parameter.copy_(new[name])
-            network.eval()
         else:
-            network.double()
+            if change == "train":
+                network.train()
+            if change == "double and back":
+                network.double()
             for name, parameter in network.named_parameters():
                 parameter.copy_(new[name])
-            network.float()
+            network.float() if change == "double and back" else network.eval()
         after = network.prune_logits(cond)
     assert not torch.allclose(after, before)
     assert_close(after, exact(network, cond))

@@ -83,7 +83,13 @@ class NativeGates:
         return self._arena.floats(functional.pad(tensor, (0, -tensor.shape[-1] % PANEL)))
 
     def logits(self, features: Tensor) -> Tensor:
-        """By how much pruning is preferred, f32 [B, K, 3L], for flat observations (and rates) f32 [B, F] on the CPU."""
+        """By how much pruning is preferred, f32 [B, K, 3L], for flat observations (and rates) f32 [B, F] on the CPU.
+
+        Raises:
+            ValueError: if they do not have the network's number of features.
+        """
+        if features.shape[1] != self._gates.obs.rows:
+            raise ValueError(f"features: expected [B, {self._gates.obs.rows}], got {list(features.shape)}")
         features = features.contiguous()
         logits = torch.empty(len(features), *self._shape)
         gates, addresses = byref(self._gates), (features.data_ptr(), logits.data_ptr())
