@@ -121,13 +121,18 @@ class Planner(TensorDictModuleBase):
         spec = self.spec
         cond = read(tensordict, COND)
         batch = cond.shape[:-2]
-        rows = batch.numel()
-        masks = self.masks(cond.reshape(rows, *cond.shape[-2:]), **self.options(tensordict, rows))
+        rows, flat = (
+            batch.numel(),
+            len(batch) == 1,
+        )  # as nearly always: nothing to reshape, which also takes time
+        if not flat:
+            cond = cond.reshape(rows, *cond.shape[-2:])
+        masks = self.masks(cond, **self.options(tensordict, rows))
         try:
             validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
         except ValueError as error:
             raise ValueError(f"{type(self).__name__}.masks: {error}") from error
-        tensordict.set(PRUNE_MASK, masks.reshape(*batch, spec.num_inference_steps, spec.num_blocks))
+        tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
         return tensordict
 
 

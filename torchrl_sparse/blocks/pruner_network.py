@@ -106,6 +106,14 @@ class PrunerNetwork(nn.Module):
         logits = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
 
+    def prune_masks(self, cond: Tensor) -> Tensor:
+        """bool [B, K, 3L]: where pruning is preferred, which it never is in the first step; without a rate as input."""
+        if (native := self._native_gates(cond)) is not None:
+            return native.masks(cond.flatten(1))
+        masks = self.prune_logits(cond) > 0
+        masks[:, 0] = False
+        return masks
+
     def _native_gates(self, cond: Tensor) -> NativeGates | None:
         """The compiled MLP, or None where PyTorch has to compute."""
         if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):

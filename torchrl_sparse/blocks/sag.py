@@ -132,10 +132,6 @@ class SAGPruner(Planner):
         self.network, self.info, self.reuse = network.eval(), info, info.reuse
         self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
         self._rate = info.rate
-        # Added to what logits have to exceed: nothing exceeds it in the first step. [K, 1]
-        never_first = torch.zeros(len(network.timesteps), 1)
-        never_first[0] = torch.inf
-        self.register_buffer("_never_first", never_first, persistent=False)
 
     @property
     def rate(self) -> float:
@@ -193,7 +189,7 @@ class SAGPruner(Planner):
         Raises:
             ValueError: if the observations do not have the shape that the pruner was trained on.
         """
-        if tuple(cond.shape[1:]) != self.network.cond_shape:
+        if cond.shape[1:] != self.network.cond_shape:
             raise ValueError(
                 f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
                 f"got {list(cond.shape)}"
@@ -204,10 +200,12 @@ class SAGPruner(Planner):
             return self._decide(cond, rate)
 
     def _decide(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        logits = self.network.prune_logits(cond, rate)
         if rate is None:
-            return logits > self._never_first
-        return logits > rate_threshold(logits, rate) + self._never_first
+            return self.network.prune_masks(cond)
+        logits = self.network.prune_logits(cond, rate)
+        masks = logits > rate_threshold(logits, rate)
+        masks[:, 0] = False
+        return masks
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""

@@ -57,8 +57,11 @@ def test_the_logits_are_those_of_the_network(instruction_set, sizes):
     network = make_network(**sizes)
     cond = observations(cond_shape=network.cond_shape)
     expected = exact(network, cond)
-    got = NativeGates(network, instruction_set).logits(cond.flatten(1))
-    assert_close(got, expected)
+    gates = NativeGates(network, instruction_set)
+    assert_close(gates.logits(cond.flatten(1)), expected)
+    positive = gates.logits(cond.flatten(1)) > 0
+    positive[:, 0] = False
+    assert torch.equal(gates.masks(cond.flatten(1)), positive)
 
 
 @pytest.mark.parametrize("rows", [1, 16])
@@ -124,7 +127,9 @@ def test_what_it_cannot_compute_is_left_to_pytorch(why, monkeypatch):
     if why == "no library":
         monkeypatch.setattr(library, "library", lambda: "it was not built")
     with torch.set_grad_enabled(why == "gradients"):
-        logits = network.prune_logits(cond)
+        logits, masks = network.prune_logits(cond), network.prune_masks(cond)
     assert network._native is None
     assert logits.requires_grad == (why == "gradients")
     assert_close(logits.float(), expected)
+    assert torch.equal(masks[:, 1:], logits[:, 1:] > 0)
+    assert not masks[:, 0].any()

@@ -58,6 +58,7 @@ struct Gates {
     const float* last;   // [padded width]
     float bias;          // of the last layer
     int32_t count;       // of cells
+    int32_t first;       // cells of the first step, which is never pruned
 };
 }
 
@@ -175,10 +176,11 @@ void sparse_blocks(int32_t level, const Model* m, int32_t kind, float* scratch) 
     LEVELS[level].run_blocks(*m, kind, scratch);
 }
 
-// observations [n][obs.rows] -> logits [n][count].
-void sparse_prune(int32_t level, const Gates* gates, int32_t n, const float* observations, float* logits) {
+// observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.
+void sparse_prune(int32_t level, const Gates* gates, int32_t n, const float* observations, float* logits, uint8_t* masks) {
     for (ptrdiff_t i = 0; i < n; i++)
-        LEVELS[level].prune(*gates, observations + i * gates->obs.rows, logits + i * gates->count);
+        LEVELS[level].prune(*gates, observations + i * gates->obs.rows, logits ? logits + i * gates->count : nullptr,
+                            masks ? masks + i * gates->count : nullptr);
 }
 }
 
@@ -586,7 +588,7 @@ void run_blocks(const Model& m, int kind, float* scratch) {
 }
 
 // One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
-void prune(const Gates& g, const float* observation, float* logits) {
+void prune(const Gates& g, const float* observation, float* logits, uint8_t* mask) {
     // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
     constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
     constexpr int ld = stride(MAX_HIDDEN);
@@ -605,7 +607,9 @@ void prune(const Gates& g, const float* observation, float* logits) {
         for (int c = 0; c < n; c++) {
             V total{};
             for (int j = 0; j < width; j += VECTOR) total += relu(load(y + c * ld + j)) * load(g.last + j);
-            logits[first + c] = g.bias + sum(total);
+            const float logit = g.bias + sum(total);
+            if (logits) logits[first + c] = logit;
+            if (mask) mask[first + c] = logit > 0.f && first + c >= g.first;
         }
     }
 }

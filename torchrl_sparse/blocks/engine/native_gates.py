@@ -32,6 +32,7 @@ class _Gates(ctypes.Structure):
         *((name, c_void_p) for name in ("cells", "last")),
         ("bias", c_float),
         ("count", c_int32),
+        ("first", c_int32),
     ]
 
 
@@ -62,6 +63,7 @@ class NativeGates:
         self._arena = Arena()
         with torch.no_grad():
             self._gates = self._pack(network)
+        self._features = network.obs.in_features
         self._shape = len(network.timesteps), network.num_blocks
 
     def _pack(self, network: PrunerNetwork) -> _Gates:
@@ -77,21 +79,34 @@ class NativeGates:
             last=self._padded(last.weight[1] - last.weight[0]),
             bias=(last.bias[1] - last.bias[0]).item(),
             count=len(cells),
+            first=network.num_blocks,
         )
 
     def _padded(self, tensor: Tensor) -> int:
         return self._arena.floats(functional.pad(tensor, (0, -tensor.shape[-1] % PANEL)))
 
     def logits(self, features: Tensor) -> Tensor:
-        """By how much pruning is preferred, f32 [B, K, 3L], for flat observations (and rates) f32 [B, F] on the CPU.
+        """By how much pruning is preferred, f32 [B, K, 3L].
+
+        Args:
+            features: flat observations, and rates if the network reads them, f32 [B, F] on the CPU.
 
         Raises:
             ValueError: if they do not have the network's number of features.
         """
-        if features.shape[1] != self._gates.obs.rows:
-            raise ValueError(f"features: expected [B, {self._gates.obs.rows}], got {list(features.shape)}")
-        features = features.contiguous()
         logits = torch.empty(len(features), *self._shape)
-        gates, addresses = byref(self._gates), (features.data_ptr(), logits.data_ptr())
-        library().sparse_prune(self._level, gates, len(features), *addresses)
+        self._run(features, logits.data_ptr(), None)
         return logits
+
+    def masks(self, features: Tensor) -> Tensor:
+        """Where pruning is preferred, bool [B, K, 3L], False in the first step; see :meth:`logits`."""
+        masks = torch.empty(len(features), *self._shape, dtype=torch.bool)
+        self._run(features, None, masks.data_ptr())
+        return masks
+
+    def _run(self, features: Tensor, logits: int | None, masks: int | None) -> None:
+        if features.shape[1] != self._features:
+            raise ValueError(f"features: expected [B, {self._features}], got {list(features.shape)}")
+        features = features.contiguous()
+        gates = byref(self._gates)
+        library().sparse_prune(self._level, gates, len(features), features.data_ptr(), logits, masks)
