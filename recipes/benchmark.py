@@ -102,11 +102,10 @@ def main(config: DictConfig) -> None:
             threads=config.threads,
             on_round=lambda done, total: bar.update(done - bar.n),
         )
-    planning = {
-        name: time_planning(method, queries, threads=config.threads)
-        for name, method in methods.items()
-        if not isinstance(method.plan, StaticPlanner)
+    adaptive = {
+        name: method for name, method in methods.items() if not isinstance(method.plan, StaticPlanner)
     }
+    planning = time_planning(adaptive, queries, threads=config.threads)
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
     results = build_results(

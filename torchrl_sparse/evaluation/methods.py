@@ -253,20 +253,28 @@ def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> 
     answer(policy, next(queries))
 
 
-def time_planning(policy: DiffusionPolicy, queries: TensorDictBase, *, threads: int) -> Latency:
-    """Latency of the planner alone, within recorded queries [N]: from their encoding to their denoising.
+def time_planning(
+    methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
+) -> dict[str, Latency]:
+    """Latency of the planners alone, within recorded queries [N]: from their encoding to their denoising, interleaved.
 
-    In a loop of its own it is faster: nothing then drives its weights out of the caches, as the denoiser's do.
+    In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
     """
-    queries = queries.select(*policy.in_keys, strict=False)
-    device = next(policy.network.parameters()).device
-    seconds = []
+    seconds = {name: [] for name in methods}
     with num_threads(threads), torch.no_grad():
-        policy(queries[0])
+        for policy in methods.values():
+            answer(policy, queries[0])  # the first takes longer
         for query in queries.unbind(0):
-            encoded = policy.module["encode"](query)
-            start = synchronised_clock(device)
-            planned = policy.module["plan"](encoded)
-            seconds.append(synchronised_clock(device) - start)
-            policy.module["denoise"](planned)
-    return summarize_latency(seconds)
+            for name, policy in methods.items():
+                seconds[name].append(_planning_seconds(policy, query))
+    return {name: summarize_latency(samples) for name, samples in seconds.items()}
+
+
+def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
+    device = next(policy.network.parameters()).device
+    encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
+    start = synchronised_clock(device)
+    planned = policy.module["plan"](encoded)
+    seconds = synchronised_clock(device) - start
+    policy.module["denoise"](planned)
+    return seconds
