@@ -121,10 +121,8 @@ class Planner(TensorDictModuleBase):
         spec = self.spec
         cond = read(tensordict, COND)
         batch = cond.shape[:-2]
-        rows, flat = (
-            batch.numel(),
-            len(batch) == 1,
-        )  # as nearly always: nothing to reshape, which also takes time
+        rows = batch.numel()
+        flat = len(batch) == 1  # as nearly always: nothing to reshape, which also takes time
         if not flat:
             cond = cond.reshape(rows, *cond.shape[-2:])
         masks = self.masks(cond, **self.options(tensordict, rows))
