@@ -194,7 +194,7 @@ class SAGPruner(Planner):
                 f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
                 f"got {list(cond.shape)}"
             )
-        if not torch.is_grad_enabled():  # as in every collector: entering no_grad is a tenth of the time
+        if not torch.is_grad_enabled():  # as in every collector: entering no_grad again takes time
             return self._decide(cond, rate)
         with torch.no_grad():
             return self._decide(cond, rate)

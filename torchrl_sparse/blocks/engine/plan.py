@@ -1,4 +1,5 @@
-"""From a prune mask to a program: what an engine executes for one query, known before its loop starts.
+"""From a prune mask to a program: what the PyTorch engine executes for one query, known before its loop starts. The native
+engine does the same operations, but finds them in the mask as it goes.
 
 A denoising step of a program is a short list of operations on the residual stream ``x``. Pruned blocks come in
 runs, and a run adds a sum of vectors that are already there, so it is one operation however long it is:
@@ -10,7 +11,7 @@ runs, and a run adds a sum of vectors that are already there, so it is one opera
                            that of the latest collapsed step
 
 Blocks are the columns of the mask, :mod:`torchrl_sparse.blocks.mask` says which. The functions here are pure;
-engines give the operations their arithmetic and know the reuse rule: with ``"block"``, block b adds
+the engine gives the operations their arithmetic and knows the reuse rule: with ``"block"``, block b adds
 ``latest[b]``; with ``"type"`` all blocks of a type share one ``latest``, with ``"single"`` all blocks do, and a
 run adds it as often as they occur in the run (:func:`slot_counts`).
 """
