@@ -11,8 +11,10 @@ from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
+from torch import Tensor
 from tqdm import tqdm
 
+from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.evaluation.engine_cases import EngineCase, Variant, make_network
 from torchrl_sparse.evaluation.engine_report import (
     format_engine_table,
@@ -22,6 +24,7 @@ from torchrl_sparse.evaluation.engine_report import (
 )
 from torchrl_sparse.evaluation.latency import describe_machine, measure_latency, num_threads
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 QUICK_STEPS = 20
 
@@ -43,12 +46,18 @@ def main(config: DictConfig) -> None:
 
 
 def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
-    network = make_network(entry.shape, quick=config.quick)
-    if entry.shape == "low_dim" and config.policy is not None:
-        network = DiffusionPolicy.from_pretrained(config.policy).network
+    network, bac_mask = make_network(entry.shape, quick=config.quick), None
+    if entry.shape == "low_dim" and config.policy is not None and not config.quick:
+        network, bac_mask = load_trained(Path(config.policy))
     # Compiling takes minutes and changes nothing with the batch, so one case shows it.
     compiled = config.compile and not config.quick and entry.get("compile", False)
-    case = EngineCase(network, entry.batch, num_steps=QUICK_STEPS if config.quick else 100, compiled=compiled)
+    case = EngineCase(
+        network,
+        entry.batch,
+        num_steps=QUICK_STEPS if config.quick else 100,
+        compiled=compiled,
+        bac_mask=bac_mask,
+    )
     variants = case.variants()
     if compiled:
         drop_uncompilable(variants)
@@ -61,6 +70,13 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
             on_round=lambda done, total: bar.update(done - bar.n),
         )
     return shape_results(case, variants, latency, config.threads)
+
+
+def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
+    """A policy's network and the mask of its BAC schedule, which is refused if it was made for another policy."""
+    policy = DiffusionPolicy.from_pretrained(folder)
+    policy.plan = BAC(folder / "bac.json")
+    return policy.network, policy.plan.schedule.mask()
 
 
 def drop_uncompilable(variants: dict[str, Variant]) -> None:

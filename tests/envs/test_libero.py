@@ -1,7 +1,6 @@
 """What stands between LIBERO and a policy; LIBERO itself where it is installed."""
 
 import importlib.util
-from pathlib import Path
 
 import hydra
 import imageio.v3 as iio
@@ -12,6 +11,7 @@ from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.recipe_modules import RECIPES, load_recipe
 from torchrl_sparse import keys
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
 
@@ -93,10 +93,7 @@ class StillScene(EnvBase):
 
 def test_the_smoke_recipe_steps_and_draws_every_suite(tmp_path, monkeypatch, capsys):
     pytest.importorskip("transformers")
-    folder = Path(__file__).parents[2] / "recipes"
-    spec = importlib.util.spec_from_file_location("libero_smoke", folder / "libero_smoke.py")
-    recipe = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(recipe)
+    recipe = load_recipe("libero_smoke")
     asked = []
 
     def make(suite, task_id, image_size):
@@ -104,7 +101,7 @@ def test_the_smoke_recipe_steps_and_draws_every_suite(tmp_path, monkeypatch, cap
         return TransformedEnv(StillScene(image_size), InitTracker())
 
     monkeypatch.setattr(recipe, "make_libero_env", make)
-    with hydra.initialize_config_dir(str(folder), version_base=None):
+    with hydra.initialize_config_dir(str(RECIPES), version_base=None):
         config = hydra.compose(
             "libero_smoke", ["steps=10", "task_id=3", "n_action_steps=4", f"out={tmp_path}"]
         )

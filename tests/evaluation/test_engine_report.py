@@ -2,13 +2,15 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
+import torch
 
+from tests.recipe_modules import RECIPES, load_recipe
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.engine_cases import EngineCase, make_network
@@ -20,7 +22,8 @@ from torchrl_sparse.evaluation.engine_report import (
 )
 from torchrl_sparse.evaluation.latency import measure_latency
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "benchmark_engine.py"
+RECIPE = RECIPES / "benchmark_engine.py"
+ASSETS = RECIPES.parent / "assets"
 ROW = {"p50_s", "p10_s", "p90_s", "n", "x_eager", "x_dense", "max_err", "limit_s", "f32_limit_s"}
 
 
@@ -36,6 +39,25 @@ def test_rows_of_a_batch_have_masks_of_their_own_at_the_rate_that_the_name_says(
     assert prune_rate(case.queries["ddim10-random50"].mask).tolist() == pytest.approx([0.5, 0.5], abs=0.01)
     assert case.queries["all-pruned"].mask[:, 1:].all()
     assert case.queries["ddim8"].schedule.num_inference_steps == 8
+
+
+def test_a_schedule_of_bac_can_be_given():
+    network = make_network("low_dim", quick=True)
+    mask = torch.zeros(20, network.num_blocks, dtype=torch.bool)
+    mask[1::2, 3] = True
+    case = EngineCase(network, batch=2, num_steps=20, bac_mask=mask)
+    assert torch.equal(case.queries["bac10"].mask, torch.stack([mask, mask]))
+
+
+def test_a_trained_policy_brings_its_schedule_which_no_other_may_use(tmp_path):
+    recipe = load_recipe("benchmark_engine")
+    network, mask = recipe.load_trained(ASSETS / "lift")
+    assert mask.shape == (100, network.num_blocks)
+    assert prune_rate(mask) > 0.8
+    shutil.copytree(ASSETS / "lift", tmp_path / "lift", ignore=shutil.ignore_patterns("*.mp4", "*.png"))
+    shutil.copy(ASSETS / "can" / "bac.json", tmp_path / "lift")
+    with pytest.raises(ValueError, match="made for policy fingerprint"):
+        recipe.load_trained(tmp_path / "lift")
 
 
 def test_every_variant_answers_its_query(case):

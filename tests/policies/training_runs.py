@@ -1,18 +1,15 @@
 """Runs a training recipe as a user does: stops it, runs it again, and, beside it, trains without a break."""
 
-import importlib.util
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import hydra
 import torch
 
+from tests.recipe_modules import RECIPES, load_recipe
 from torchrl_sparse.evaluation.latency import num_threads
-
-RECIPES = Path(__file__).parents[2] / "recipes"
 
 
 def stop_and_go_on(recipe, out, settings):
@@ -29,9 +26,7 @@ def stop_and_go_on(recipe, out, settings):
 
 def train_unbroken(recipe, out, settings):
     """The same training in this process, without the recipe's loop."""
-    spec = importlib.util.spec_from_file_location(recipe, RECIPES / f"{recipe}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_recipe(recipe)
     with hydra.initialize_config_dir(str(RECIPES), version_base=None):
         config = hydra.compose(recipe, [*settings, f"out={out}"])
     trainer = module.make_trainer(config)

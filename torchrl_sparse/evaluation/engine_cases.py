@@ -100,10 +100,18 @@ class EngineCase:
         batch: rows B; each has a random mask of its own where masks are random.
         num_steps: denoising steps K of the dense query.
         compiled: also run the eager baseline through ``torch.compile``.
+        bac_mask: of a schedule of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
+            first of the case's own queries, whose observation is noise.
     """
 
     def __init__(
-        self, network: TransformerForDiffusion, batch: int, *, num_steps: int = 100, compiled: bool = False
+        self,
+        network: TransformerForDiffusion,
+        batch: int,
+        *,
+        num_steps: int = 100,
+        compiled: bool = False,
+        bac_mask: Tensor | None = None,
     ) -> None:
         self.network, self.batch, self._compiled = network, batch, compiled
         self._ddpm = NoiseSchedule("ddpm", num_steps, num_steps)
@@ -115,7 +123,8 @@ class EngineCase:
         drawn = torch.Generator().manual_seed(_DRAWN_SEED)
         steps = [torch.randn(shape, generator=drawn) for _ in range(num_steps - 1)]
         self.noise = torch.stack([initial, *steps], dim=1)
-        self.queries = self._make_queries(generator)
+        mask = self._calibrate_bac() if bac_mask is None else bac_mask
+        self.queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
 
     def reference(self, kind: str) -> Tensor:
         """The right answer to a query."""
@@ -166,7 +175,7 @@ class EngineCase:
 
         return call
 
-    def _make_queries(self, generator: torch.Generator) -> dict[str, Query]:
+    def _make_queries(self, generator: torch.Generator, bac_masks: Tensor) -> dict[str, Query]:
         ddpm, steps = self._ddpm, self._ddpm.num_inference_steps
         full = torch.linspace(0, steps - 1, round((1 - _PRUNE_RATE) * steps)).round().long()
         full_steps = torch.ones(self.batch, steps, self.network.num_blocks, dtype=torch.bool)
@@ -176,7 +185,7 @@ class EngineCase:
         queries = {
             "dense": Query(ddpm),
             "random91": Query(ddpm, self._random_mask(steps, _PRUNE_RATE, generator)),
-            "bac10": Query(ddpm, self._bac_mask()),
+            "bac10": Query(ddpm, bac_masks),
             f"full{len(full)}": Query(ddpm, full_steps),
             "all-pruned": Query(ddpm, all_pruned),
         }
@@ -196,8 +205,7 @@ class EngineCase:
         first = torch.zeros(self.batch, 1, blocks, dtype=torch.bool)
         return torch.cat([first, later.view(self.batch, steps - 1, blocks)], dim=1)
 
-    def _bac_mask(self) -> Tensor:
-        """The schedule of BAC (arXiv:2506.13456) for this network, from one of its own queries."""
+    def _calibrate_bac(self) -> Tensor:
         calibration = calibrate(self.network, self._ddpm, self.noise[:1], self.cond[:1])
         num_updates = min(_NUM_UPDATES, self._ddpm.num_inference_steps)
-        return bac_schedule(calibration, num_updates, policy="untrained").mask().repeat(self.batch, 1, 1)
+        return bac_schedule(calibration, num_updates, policy="untrained").mask()

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from torchrl_sparse.blocks.engine import denoise, library
+from torchrl_sparse.blocks.engine import denoise, library, native
 from torchrl_sparse.blocks.engine.library import INSTRUCTION_SETS, native_available
 from torchrl_sparse.blocks.engine.native import NativeEngine, native_supports
 from torchrl_sparse.blocks.engine.packing import pack_panels
@@ -180,15 +180,53 @@ def test_inputs_need_not_be_contiguous_and_are_left_alone():
     assert all(torch.equal(*pair) for pair in zip((noise, cond, mask), copies, strict=True))
 
 
-def test_changed_weights_are_noticed():
-    network, schedule = make_network(), NoiseSchedule("ddim", 5)
+def an_element(parameter):
+    parameter.view(-1)[-1] += 0.5
+
+
+def in_place_of_data(parameter):
+    parameter.data.mul_(1.5)
+
+
+def exchange(parameter):
+    parameter.data = parameter.data * 1.5
+
+
+@pytest.mark.parametrize("change", [an_element, in_place_of_data, exchange])
+def test_a_change_of_any_parameter_is_noticed(change):
+    network, schedule = make_network("one of each"), NoiseSchedule("ddim", 3)
     noise, cond, _ = make_query(network, schedule)
     engine = NativeEngine(network, schedule)
-    before = engine.denoise(noise, cond)
-    network.head.weight.mul_(0.5)
-    after = engine.denoise(noise, cond)
-    assert not torch.equal(before, after)
-    assert (after - exact(network, schedule, noise, cond)).abs().max() < 1e-5
+    for name, parameter in network.named_parameters():
+        change(parameter)
+        expected = NativeEngine(network, schedule).denoise(noise, cond)
+        assert torch.equal(engine.denoise(noise, cond), expected), name
+    assert (expected - exact(network, schedule, noise, cond)).abs().max() < 1e-5
+
+
+def test_weights_that_were_moved_to_another_device_are_not_read():
+    engine = NativeEngine(make_network("one of each"), NoiseSchedule("ddim", 3))
+    with pytest.raises(ValueError, match="it runs on the CPU, the network was moved to meta"):
+        engine._watch.locate([torch.empty(3), torch.empty(3, device="meta")])
+
+
+def test_weights_that_stay_are_not_packed_again(monkeypatch):
+    network, schedule = make_network("one of each"), NoiseSchedule("ddim", 3)
+    noise, cond, _ = make_query(network, schedule)
+    network.head.bias[0] = float("nan")  # equal to nothing, not even to itself
+    engine = NativeEngine(network, schedule)
+    monkeypatch.setattr(native, "PackedNetwork", None)
+    assert engine.denoise(noise, cond).isnan().any()
+
+
+def test_memory_of_a_query_in_inference_mode_serves_everything_after_it():
+    network, schedule = make_network("one of each"), NoiseSchedule("ddim", 3)
+    noise, cond, _ = make_query(network, schedule)
+    engine = NativeEngine(network, schedule)
+    with torch.inference_mode():
+        first = engine.denoise(noise, cond)
+    assert torch.equal(engine.denoise(noise, cond), first)
+    assert min(engine.block_seconds(2).values()) > 0
 
 
 def test_block_seconds_names_the_types():

@@ -176,6 +176,11 @@ void sparse_blocks(int32_t level, const Model* m, int32_t kind, float* scratch) 
     LEVELS[level].run_blocks(*m, kind, scratch);
 }
 
+// What lies at n places.
+void sparse_gather(int32_t n, const float* const* places, float* values) {
+    for (int32_t i = 0; i < n; i++) values[i] = *places[i];
+}
+
 // observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.
 void sparse_prune(int32_t level, const Gates* gates, int32_t n, const float* observations, float* logits, uint8_t* masks) {
     for (ptrdiff_t i = 0; i < n; i++)

@@ -7,9 +7,12 @@ the PyTorch engine's, its program is the mask.
 
 from __future__ import annotations
 
+import ctypes
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from ctypes import byref
+from contextlib import contextmanager
+from ctypes import byref, c_float, c_void_p
 from typing import TYPE_CHECKING
 
 import torch
@@ -57,6 +60,22 @@ def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
     if network.n_obs_steps > _MAX_OBS_STEPS:
         return False, f"it needs n_obs_steps <= {_MAX_OBS_STEPS}, the network has {network.n_obs_steps}"
     return True, ""
+
+
+class _NativeWatch(WeightWatch):
+    """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
+
+    def locate(self, samples: list[Tensor]) -> ctypes.Array:
+        elsewhere = next((sample.device for sample in samples if not sample.is_cpu), None)
+        if elsewhere is not None:
+            raise ValueError(f"native engine: it runs on the CPU, the network was moved to {elsewhere}")
+        places = [value.data_ptr() for sample in samples for value in sample]
+        return (c_void_p * len(places))(*places)
+
+    def read(self, places: ctypes.Array) -> bytes:
+        values = (c_float * len(places))()
+        library().sparse_gather(len(places), places, values)
+        return bytes(values)
 
 
 class NativeEngine:
@@ -115,7 +134,8 @@ class NativeEngine:
         self.network, self.schedule, self.weights, self.threads = network, schedule, weights, threads
         self._level = instruction_level(instruction_set)
         self._dense = torch.zeros(schedule.num_inference_steps, network.num_blocks, dtype=torch.bool)
-        self._watch = WeightWatch(network)
+        self._stock: list[Tensor] = []
+        self._watch = _NativeWatch(network)
         self._packed = (None, None)
         self._current()
 
@@ -123,7 +143,6 @@ class NativeEngine:
     def detail(self) -> str:
         return f"{INSTRUCTION_SETS[self._level]}, {self.weights} weights"
 
-    @torch.no_grad()
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
     ) -> Tensor:
@@ -136,24 +155,17 @@ class NativeEngine:
         if mask is None:
             mask = self._dense.expand(len(cond), -1, -1)
         self._check(noise, cond, mask)
-        noise, cond, mask = noise.contiguous(), cond.contiguous(), mask.contiguous()
-        packed = self._current()
-        slots = num_buffers(reuse, self.network.num_blocks)
+        query = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
         actions = torch.empty(len(cond), self.network.horizon, self.network.input_dim)
+        packed, slots = self._current(), num_buffers(reuse, self.network.num_blocks)
         rows = iter(range(len(cond)))
 
         def work() -> None:
-            scratch = self._scratch(packed, slots)
-            for row in rows:  # each thread takes the next: one that is held up holds up nothing else
-                self._run(packed, slots, mask[row], noise[row], cond[row], actions[row], scratch)
+            with self._scratch(packed) as scratch:
+                for row in rows:  # each thread takes the next: one that is held up holds up nothing else
+                    self._run(packed, slots, row, *query, actions, scratch)
 
-        helpers = min(self.threads or torch.get_num_threads(), len(cond)) - 1
-        # It starts a thread for each task, and none for a single row.
-        with ThreadPoolExecutor(max(helpers, 1)) as pool:
-            tasks = [pool.submit(work) for _ in range(helpers)]
-            work()
-        for task in tasks:
-            task.result()
+        _run_in_threads(work, min(self.threads or torch.get_num_threads(), len(cond)))
         return actions
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
@@ -162,7 +174,7 @@ class NativeEngine:
         The best of ``repeats`` walks over all layers, so that weights come from where they do in a query.
         """
         packed = self._current()
-        scratch = self._scratch(packed, len(BLOCK_TYPES)).zero_()
+        scratch = self._new_scratch(packed).zero_()
         return {
             name: self._time_block(packed, kind, repeats, scratch) for kind, name in enumerate(BLOCK_TYPES)
         }
@@ -175,13 +187,28 @@ class NativeEngine:
             best = min(best, time.perf_counter() - start)
         return best / self.network.n_layer
 
-    def _run(self, packed, slots: int, mask, noise, cond, actions, scratch) -> None:
-        addresses = (tensor.data_ptr() for tensor in (noise, cond, actions, scratch))
-        library().sparse_denoise(self._level, byref(packed.model), mask.data_ptr(), slots, *addresses)
+    def _run(self, packed, slots: int, row: int, mask, noise, cond, actions, scratch) -> None:
+        mask, noise, cond, actions = (
+            tensor.data_ptr() + row * tensor.stride(0) * tensor.element_size()
+            for tensor in (mask, noise, cond, actions)
+        )
+        library().sparse_denoise(
+            self._level, byref(packed.model), mask, slots, noise, cond, actions, scratch.data_ptr()
+        )
 
-    def _scratch(self, packed: PackedNetwork, slots: int) -> Tensor:
-        """Memory for one call at a time; PyTorch aligns it to cache lines."""
-        return torch.empty(library().sparse_scratch(byref(packed.model), slots))
+    @contextmanager
+    def _scratch(self, packed: PackedNetwork) -> Iterator[Tensor]:
+        """Memory for one call at a time, from a stock that grows to as many as there are calls at a time."""
+        try:
+            scratch = self._stock.pop()
+        except IndexError:
+            scratch = self._new_scratch(packed)
+        yield scratch
+        self._stock.append(scratch)
+
+    def _new_scratch(self, packed: PackedNetwork) -> Tensor:
+        """On a cache line, as all of PyTorch's memory; with a slot for each block, which is enough for every reuse rule."""
+        return torch.empty(library().sparse_scratch(byref(packed.model), self.network.num_blocks))
 
     def _current(self) -> PackedNetwork:
         """The packed weights, packed anew if the network has changed."""
@@ -204,3 +231,15 @@ class NativeEngine:
                 raise ValueError(
                     f"{name}: expected {dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
                 )
+
+
+def _run_in_threads(work: Callable[[], None], threads: int) -> None:
+    """Run ``work`` as often at the same time; one of the threads is the caller's."""
+    if threads == 1:
+        work()
+        return
+    with ThreadPoolExecutor(threads - 1) as pool:
+        tasks = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+    for task in tasks:
+        task.result()

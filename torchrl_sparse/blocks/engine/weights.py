@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -34,15 +36,23 @@ class WeightWatch:
 
     def __init__(self, network: nn.Module) -> None:
         self._parameters = list(network.parameters())
-        self._samples: tuple[list[int], list[Tensor]] = ([], [])
+        self._places: tuple[list[int], Any] = ([], None)
 
     def state(self) -> tuple:
         """Compares equal as long as the weights are the same."""
         addresses = [p.data_ptr() for p in self._parameters]
         # Tensors made in inference mode count no versions.
         versions = [0 if p.is_inference() else p._version for p in self._parameters]
-        known, views = self._samples  # read and replaced in one go: other threads may do the same
+        known, places = self._places  # read and replaced in one go: other threads may do the same
         if known != addresses:
-            views = [parameter.detach().view(-1)[:_SAMPLES] for parameter in self._parameters]
-            self._samples = addresses, views
-        return addresses, versions, torch.cat(views).tolist()
+            places = self.locate([p.detach().view(-1)[:_SAMPLES] for p in self._parameters])
+            self._places = addresses, places
+        return addresses, versions, self.read(places)
+
+    def locate(self, samples: list[Tensor]) -> Any:
+        """What :meth:`read` needs to read ``samples``, views of each parameter's first values."""
+        return samples
+
+    def read(self, places: Any) -> Any:
+        """The values at ``places``, as something that compares."""
+        return torch.cat(places).tolist()
