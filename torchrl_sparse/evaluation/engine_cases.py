@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
-from torchrl_sparse.blocks.engine import NativeEngine, ReferenceEngine, TorchEngine
+from torchrl_sparse.blocks.engine import Engine, NativeEngine, ReferenceEngine, TorchEngine
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.native import native_supports
 from torchrl_sparse.policies.diffusion.published import published_network
@@ -129,7 +129,7 @@ class EngineCase:
     def reference(self, kind: str) -> Tensor:
         """The right answer to a query."""
         query = self.queries[kind]
-        return self._denoise(ReferenceEngine(self.network, query.schedule), query)
+        return self._call(ReferenceEngine(self.network, query.schedule), query)()
 
     def variants(self) -> dict[str, Variant]:
         """Everything to time, by name."""
@@ -146,14 +146,15 @@ class EngineCase:
                     continue
                 if query.schedule not in engines:
                     engines[query.schedule] = make(self.network, query.schedule)
-                call = partial(self._denoise, engines[query.schedule], query)
+                call = self._call(engines[query.schedule], query)
                 weight_bytes = 2 if runner in _HALF_RUNNERS else 4
                 in_f32 = _HALF_RUNNERS.get(runner) != "bfloat16"
                 variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
         return variants
 
-    def _denoise(self, engine, query: Query) -> Tensor:
-        return engine.denoise(self.noise[:, : query.schedule.num_inference_steps], self.cond, query.mask)
+    def _call(self, engine: Engine, query: Query) -> Callable[[], Tensor]:
+        noise = self.noise[:, : query.schedule.num_inference_steps].contiguous()
+        return partial(engine.denoise, noise, self.cond, query.mask)
 
     def _eager_variants(self) -> dict[str, Variant]:
         kinds = [kind for kind, query in self.queries.items() if query.mask is None]

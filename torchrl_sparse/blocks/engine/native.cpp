@@ -43,7 +43,7 @@ struct Model {
     int32_t horizon, width, layers, heads, obs_steps, action_dim, cond_dim, steps, causal;
     float clip;
     const Layer* layer;
-    Matrix embed, head, cond, encode_up, encode_down;  // embed and cond have a bias for each row: it holds the positions
+    Matrix embed, head, encode_up, encode_down;  // embed and encode_up have a bias for each row: it holds the positions
     const float* time_key;      // [steps][layers][heads][padded width], the folded keys of the time tokens
     const float* time_value;    // likewise
     const float* time_bias;     // [steps][layers][heads]
@@ -519,8 +519,7 @@ struct Query {
     // Encodes the observations and folds them into the cross-attention of every layer.
     void encode(const float* cond) const {
         const int n = m.obs_steps, part = padded(b.inner), ldk = stride(2 * part);
-        product(cond, m.cond_dim, n, m.cond, b.y, b.ld);
-        product(b.y, b.ld, n, m.encode_up, b.hidden, b.ldh);
+        product(cond, m.cond_dim, n, m.encode_up, b.hidden, b.ldh);
         activate(n, MISH);
         product(b.hidden, b.ldh, n, m.encode_down, b.token, b.ld);
         for (int i = 0; i < m.layers; i++) {

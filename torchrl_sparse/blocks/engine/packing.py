@@ -9,6 +9,7 @@ and in float64, so that the only rounding it adds is that of the result:
   ``n . (Wq^T k) + bq . k`` and its contribution is ``Wo v``: two vectors of the network's width per head and
   token, and neither the query nor the output projection is left. Those of the time token are tabulated here for
   all denoising steps; those of the observations are computed within every query.
+* An observation's embedding and the first layer of its encoder are one matrix.
 * Position embeddings are biases of the layers before them, one row for each token.
 
 A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into panels of 32 columns,
@@ -66,7 +67,7 @@ class Model(ctypes.Structure):
         *((name, c_int32) for name in _SIZES),
         ("clip", c_float),
         ("layer", POINTER(_Layer)),
-        *((name, Matrix) for name in ("embed", "head", "cond", "encode_up", "encode_down")),
+        *((name, Matrix) for name in ("embed", "head", "encode_up", "encode_down")),
         *((name, c_void_p) for name in ("time_key", "time_value", "time_bias", "coefficients", "valid")),
     ]
 
@@ -183,7 +184,7 @@ class PackedNetwork:
             _Layer(**loop[i], **self._pack_memory(layer)) for i, layer in enumerate(network.decoder.layers)
         ]
         tables = self._time_tables(network, schedule)
-        positions, cond_positions = network.pos_emb[0].double(), network.cond_pos_emb[0, 1:].double()
+        positions = network.pos_emb[0].double()
         norm, head = network.ln_f, network.head
         valid = self._padded_width(torch.ones(network.n_emb))
         columns = ("noise_scale", "signal_scale", "clean_weight", "sample_weight", "eps_weight", "spread")
@@ -203,8 +204,7 @@ class PackedNetwork:
             layer=layer_array,
             embed=self._arena.matrix(network.input_emb.weight, network.input_emb.bias + positions),
             head=self._arena.matrix(*after_norm(norm, head.weight, head.bias)),
-            cond=self._arena.matrix(network.cond_obs_emb.weight, network.cond_obs_emb.bias + cond_positions),
-            encode_up=self._matrix(network.encoder[0].weight, network.encoder[0].bias),
+            encode_up=self._arena.matrix(*_embed_and_encode(network)),
             encode_down=self._matrix(network.encoder[2].weight, network.encoder[2].bias),
             coefficients=self._arena.floats(
                 torch.stack([getattr(coefficients, name) for name in columns], dim=1)
@@ -285,6 +285,14 @@ class PackedNetwork:
 
     def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
         return self._arena.matrix(weight, bias, self._weights)
+
+
+def _embed_and_encode(network: TransformerForDiffusion) -> tuple[Tensor, Tensor]:
+    """Weight [4d, D] and a bias for each observation token [To, 4d]."""
+    embed, up = network.cond_obs_emb, network.encoder[0]
+    weight = up.weight.double()
+    bias = (embed.bias.double() + network.cond_pos_emb[0, 1:]) @ weight.T + up.bias
+    return weight @ embed.weight.double(), bias
 
 
 def _in_proj(attention) -> tuple[Tensor, Tensor]:
