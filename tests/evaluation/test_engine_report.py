@@ -88,7 +88,9 @@ def test_results_compare_with_eager_and_own_dense(case):
     assert pruned["f32_limit_s"] / dense["f32_limit_s"] == pytest.approx(products(case) / (20 * 2), rel=1e-6)
     native = shape["rows"].get("native-bf16 dense")
     assert native is None or native["f32_limit_s"] is None
-    assert "| torch random91 |" in format_engine_table("toy", shape)
+    table = format_engine_table("toy", shape)
+    assert "| torch random91 |" in table
+    assert f"{1e6 * shape['all_pruned_step_s']['torch']:.1f} µs in torch" in table
 
 
 def products(case):

@@ -192,11 +192,15 @@ class EngineCase:
         }
         for count in (16, 10, 8):
             count = min(count, steps)
-            ddim = NoiseSchedule("ddim", count, ddpm.num_train_timesteps)
-            queries[f"ddim{count}"] = Query(ddim)
+            queries[f"ddim{count}"] = Query(self._ddim(count))
             mask = self._random_mask(count, _SHORT_PRUNE_RATE, generator)
-            queries[f"ddim{count}-random50"] = Query(ddim, mask)
+            queries[f"ddim{count}-random50"] = Query(self._ddim(count), mask)
+        # One step, and what a query takes besides its steps.
+        queries["ddim1"] = Query(self._ddim(1))
         return queries
+
+    def _ddim(self, num_steps: int) -> NoiseSchedule:
+        return NoiseSchedule("ddim", num_steps, self._ddpm.num_train_timesteps)
 
     def _random_mask(self, steps: int, rate: float, generator: torch.Generator) -> Tensor:
         """Each row a mask of its own that prunes ``rate`` of all blocks, of which the first step prunes none."""

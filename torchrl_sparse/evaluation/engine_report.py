@@ -152,12 +152,11 @@ def _all_weights(case: EngineCase) -> torch.Tensor:
 
 
 def _all_pruned_steps(case: EngineCase, rows: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds of a step that computes nothing, per runner: what all of them take, less one dense step."""
+    """Seconds of a step that computes nothing, per runner: what all of them take beyond a query of one dense step."""
     steps = case.queries["dense"].schedule.num_inference_steps
     runners = [name.split()[0] for name in rows if name.endswith(" all-pruned")]
     return {
-        runner: (rows[f"{runner} all-pruned"]["p50_s"] - rows[f"{runner} dense"]["p50_s"] / steps)
-        / (steps - 1)
+        runner: (rows[f"{runner} all-pruned"]["p50_s"] - rows[f"{runner} ddim1"]["p50_s"]) / (steps - 1)
         for runner in runners
     }
 
@@ -185,7 +184,8 @@ def format_engine_table(name: str, shape: Mapping[str, Any]) -> str:
             f"| {variant} | {1e3 * row['p50_s']:.1f} | {spread} | {row['x_eager']:.1f} | {row['x_dense']:.1f} "
             f"| {row['max_err']:.1e} |"
         )
-    return "\n".join(lines)
+    steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape["all_pruned_step_s"].items()]
+    return "\n".join([*lines, "", f"A step that computes nothing takes {', '.join(steps)}."])
 
 
 def plot_engine_times(
