@@ -158,7 +158,8 @@ class PackedNetwork:
     Args:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
         schedule: the denoising steps.
-        weights: type of the trunk's and the condition encoder's matrices, one of those of :func:`pack_panels`.
+        weights: type of the trunk's matrices and of the condition encoder's but the first, one of those of
+            :func:`pack_panels`.
 
     Attributes:
         model: the structure that native.cpp reads.
