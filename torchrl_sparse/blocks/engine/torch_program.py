@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -77,7 +78,9 @@ def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.de
     cells = np.argwhere(masks.any(axis=0) & ~pruned_by_all)
     computed = ~masks[:, cells[:, 0], cells[:, 1]].T
     if gather:
-        rows = [np.flatnonzero(cell).tolist() for cell in computed]
+        cell, row = np.nonzero(computed)
+        bounds, row = np.searchsorted(cell, np.arange(len(cells) + 1)).tolist(), row.tolist()
+        rows = [row[first:last] for first, last in pairwise(bounds)]
     else:
         rows = torch.from_numpy(computed[..., None]).to(device).unbind(0)  # in one transfer
     return dict(zip(map(tuple, cells.tolist()), rows, strict=True))
