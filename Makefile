@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native.cpp
+$(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native/native.cpp
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
@@ -29,7 +29,7 @@ SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined
 sanitize: install
 	mkdir -p build/sanitize
 	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -shared -fPIC \
-		-o build/sanitize/native.so torchrl_sparse/blocks/engine/native.cpp
+		-o build/sanitize/native.so torchrl_sparse/blocks/engine/native/native.cpp
 	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
 		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
 		$(BIN)/python -m pytest tests/blocks/engine/test_native.py tests/blocks/engine/test_native_gates.py -k "not library"

@@ -7,8 +7,8 @@ plain shared library without Python's or PyTorch's headers. Instruction sets are
 from setuptools import Extension, setup
 
 NATIVE = Extension(
-    "torchrl_sparse.blocks.engine._native",
-    sources=["torchrl_sparse/blocks/engine/native.cpp"],
+    "torchrl_sparse.blocks.engine.native._native",
+    sources=["torchrl_sparse/blocks/engine/native/native.cpp"],
     # A product may be fused with a sum; nothing else that changes results is allowed.
     extra_compile_args=[
         "-g0",

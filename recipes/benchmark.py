@@ -19,16 +19,29 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
-from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.fidelity import action_error, block_errors
-from torchrl_sparse.evaluation.latency import describe_machine
-from torchrl_sparse.evaluation.mask_figures import mask_panel, plot_mask_statistics, plot_mask_strip
-from torchrl_sparse.evaluation.methods import (
+from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
+from torchrl_sparse.evaluation.figures.plots import (
+    plot_error_surge,
+    plot_pareto,
+    plot_schedule,
+    plot_similarity,
+)
+from torchrl_sparse.evaluation.figures.video import Caption, write_video
+from torchrl_sparse.evaluation.latency.measure import describe_machine
+from torchrl_sparse.evaluation.results.report import (
+    MethodRun,
+    build_results,
+    format_pairs,
+    format_table,
+    save_results,
+)
+from torchrl_sparse.evaluation.results.tracking import log_benchmark
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
+from torchrl_sparse.evaluation.rollouts.methods import (
     CALIBRATION_SEED,
     EVALUATION_SEED,
     MethodName,
@@ -42,19 +55,11 @@ from torchrl_sparse.evaluation.methods import (
     time_planning,
     time_queries,
 )
-from torchrl_sparse.evaluation.paired import rollout_episodes
-from torchrl_sparse.evaluation.plots import plot_error_surge, plot_pareto, plot_schedule, plot_similarity
-from torchrl_sparse.evaluation.report import (
-    MethodRun,
-    build_results,
-    format_pairs,
-    format_table,
-    save_results,
-)
-from torchrl_sparse.evaluation.tracking import log_benchmark
-from torchrl_sparse.evaluation.video import Caption, write_video
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.published import published_shape
+from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.published import published_shape
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 
@@ -203,7 +208,7 @@ def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, querie
     if surging:
         dense = methods["dense"]
         noise = dense.sample_noise(queries[keys.SEED].squeeze(-1))
-        errors = block_errors(dense.network, dense.schedule, noise, queries[keys.COND], surging)
+        errors = block_errors(dense.network, dense.sampler, noise, queries[keys.COND], surging)
         plot_error_surge(
             {name: error.numpy() for name, error in errors.items()},
             {name: mask.numpy() for name, mask in surging.items()},

@@ -15,16 +15,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.bac import BAC
-from torchrl_sparse.evaluation.engine_cases import EngineCase, Variant, make_network
-from torchrl_sparse.evaluation.engine_report import (
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
+from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency, num_threads
+from torchrl_sparse.evaluation.results.engine_report import (
     format_engine_table,
     plot_engine_times,
     save_engine_results,
     shape_results,
 )
-from torchrl_sparse.evaluation.latency import describe_machine, measure_latency, num_threads
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
 
 QUICK_STEPS = 20
 

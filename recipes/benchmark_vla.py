@@ -20,30 +20,28 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
-from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.evaluation.episodes import EpisodeResult, token_totals
-from torchrl_sparse.evaluation.fidelity import action_error
-from torchrl_sparse.evaluation.latency import describe_machine, measure_latency
-from torchrl_sparse.evaluation.methods import EVALUATION_SEED
-from torchrl_sparse.evaluation.paired import rollout_episodes
-from torchrl_sparse.evaluation.plots import plot_pareto
-from torchrl_sparse.evaluation.report import (
+from torchrl_sparse.evaluation.figures.plots import plot_pareto
+from torchrl_sparse.evaluation.figures.tokens import (
+    draw_tokens,
+    plot_control,
+    plot_token_strip,
+    plot_tokens_per_layer,
+)
+from torchrl_sparse.evaluation.figures.video import Caption, write_video
+from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
+from torchrl_sparse.evaluation.results.report import (
     MethodRun,
     build_results,
     format_pairs,
     format_table,
     save_results,
 )
-from torchrl_sparse.evaluation.token_figures import (
-    draw_tokens,
-    plot_control,
-    plot_token_strip,
-    plot_tokens_per_layer,
-)
-from torchrl_sparse.evaluation.tracking import log_benchmark
-from torchrl_sparse.evaluation.video import Caption, write_video
-from torchrl_sparse.evaluation.vla_methods import (
+from torchrl_sparse.evaluation.results.tracking import log_benchmark
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
+from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.evaluation.rollouts.vla_methods import (
     TokenMethod,
     answer,
     instructed_env,
@@ -52,8 +50,10 @@ from torchrl_sparse.evaluation.vla_methods import (
     mid_episode_query,
     seen_images,
 )
+from torchrl_sparse.evaluation.statistics.fidelity import action_error
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
-from torchrl_sparse.tokens.calibration import recorded_queries, replay
+from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.vla.token_budget import recorded_queries, replay
 
 _SHOWN = 6  # queries of a strip
 _ZOOM = 2

@@ -15,14 +15,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_sparse.blocks.pruner_reference import make_reference
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.benchmarks import find_task
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.published import published_shape
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.diffusion.timesteps import demonstration_error, search_timesteps
+from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.timesteps import demonstration_error, search_timesteps
+from torchrl_sparse.training.pruner.reference import make_reference
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_timesteps")
@@ -36,8 +36,8 @@ def main(config: DictConfig) -> None:
     reference = make_reference(
         policy, demos, target="data", n_action_steps=n_action_steps, **config.reference
     )
-    train_steps = policy.schedule.num_train_timesteps
-    start = NoiseSchedule("ddim", config.num_inference_steps, train_steps).timesteps.tolist()
+    train_steps = policy.sampler.num_train_timesteps
+    start = Sampler("ddim", config.num_inference_steps, train_steps).timesteps.tolist()
     with tqdm(desc="chains", unit="chain", mininterval=2) as bar:
 
         def error(timesteps: tuple[int, ...]) -> float:
@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
             return demonstration_error(policy, reference, timesteps, n_action_steps=n_action_steps)
 
         best, tried = search_timesteps(error, start, num_train_timesteps=train_steps, strides=config.strides)
-    chosen = NoiseSchedule("ddim", num_train_timesteps=train_steps, timesteps=best)
+    chosen = Sampler("ddim", num_train_timesteps=train_steps, timesteps=best)
     path = Path(config.out) / f"{chosen.name}.json"
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(report(policy, tried, config), indent=1) + "\n")

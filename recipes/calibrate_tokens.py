@@ -25,10 +25,10 @@ from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.evaluation.token_figures import plot_token_budget
+from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.policies.vla.training import InstructedDemonstrations
-from torchrl_sparse.tokens.calibration import (
+from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.training.vla.token_budget import (
     MEASURES,
     BudgetPoint,
     TokenBudget,
@@ -38,7 +38,7 @@ from torchrl_sparse.tokens.calibration import (
     recorded_queries,
     smallest_alpha,
 )
-from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_tokens")
@@ -103,7 +103,7 @@ def seeds(config: DictConfig) -> range:
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
     # Here, since queries of demonstrations need no simulator.
-    from torchrl_sparse.evaluation.vla_methods import instructed_env
+    from torchrl_sparse.evaluation.rollouts.vla_methods import instructed_env
 
     return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 

@@ -22,9 +22,9 @@ from torchrl_sparse import keys
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.libero import SUITES, make_libero_env
-from torchrl_sparse.evaluation.token_figures import draw_tokens, plot_token_strip
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.evaluation.figures.tokens import draw_tokens, plot_token_strip
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.specprune import SpecPrune
 

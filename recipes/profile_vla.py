@@ -15,16 +15,16 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.evaluation.latency import describe_machine, num_threads
-from torchrl_sparse.evaluation.vla_cases import VLACase, make_policy
-from torchrl_sparse.evaluation.vla_report import (
+from torchrl_sparse.evaluation.latency.measure import describe_machine, num_threads
+from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
+from torchrl_sparse.evaluation.results.vla_report import (
     DENSE,
     format_vla_table,
     measure_vla,
     plot_vla_times,
     save_vla_results,
 )
-from torchrl_sparse.policies.vla.pruning import TokenPruner
+from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
 
 

@@ -15,14 +15,20 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.backends import backend_runtime
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.episodes import EpisodeResult
-from torchrl_sparse.evaluation.latency import describe_machine
-from torchrl_sparse.evaluation.methods import (
+from torchrl_sparse.evaluation.latency.measure import describe_machine
+from torchrl_sparse.evaluation.results.realtime import (
+    RealtimeRun,
+    build_realtime,
+    format_realtime,
+    plot_realtime,
+    save_realtime,
+)
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.methods import (
     CALIBRATION_SEED,
     EVALUATION_SEED,
     calibrate_policy,
@@ -32,15 +38,9 @@ from torchrl_sparse.evaluation.methods import (
     record_queries,
     time_queries,
 )
-from torchrl_sparse.evaluation.paired import rollout_episodes
-from torchrl_sparse.evaluation.realtime import (
-    RealtimeRun,
-    build_realtime,
-    format_realtime,
-    plot_realtime,
-    save_realtime,
-)
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.backends import backend_runtime
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")

@@ -11,7 +11,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_sparse.evaluation.html_report import write_report
+from torchrl_sparse.evaluation.figures.html_report import write_report
 
 
 @hydra.main(version_base=None, config_path=".", config_name="report")

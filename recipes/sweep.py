@@ -21,11 +21,17 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_sparse.evaluation.plots import plot_pareto
-from torchrl_sparse.evaluation.report import format_table, save_results
-from torchrl_sparse.evaluation.sweeps import LocalSweep, Trial, merge_trials, read_sweep, trial_command
-from torchrl_sparse.evaluation.tracking import trial_metrics
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.evaluation.figures.plots import plot_pareto
+from torchrl_sparse.evaluation.results.report import format_table, save_results
+from torchrl_sparse.evaluation.results.sweeps import (
+    LocalSweep,
+    Trial,
+    merge_trials,
+    read_sweep,
+    trial_command,
+)
+from torchrl_sparse.evaluation.results.tracking import trial_metrics
+from torchrl_sparse.storage.atomic import atomic_path
 
 RECIPES = Path(__file__).parent
 

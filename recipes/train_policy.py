@@ -19,17 +19,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.published import published_shape
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.diffusion.training import PolicyTrainer
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.policies.diffusion.vision import VisionEncoder
-from torchrl_sparse.policies.trainer import TrainConfig
-from torchrl_sparse.policies.training_loop import train
+from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
+from torchrl_sparse.training.loop import train
+from torchrl_sparse.training.trainer import TrainConfig
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_policy")
@@ -109,10 +109,10 @@ def save(trainer: PolicyTrainer, config: DictConfig) -> None:
 
 
 def averaged_policy(
-    trainer: PolicyTrainer, config: DictConfig, schedule: NoiseSchedule | None = None
+    trainer: PolicyTrainer, config: DictConfig, sampler: Sampler | None = None
 ) -> DiffusionPolicy:
     """With a note of the cameras, for whoever makes an environment for it."""
-    policy = trainer.ema_policy(schedule)
+    policy = trainer.ema_policy(sampler)
     if cameras := chosen_cameras(config.cameras):
         policy.source = {"task": find_task(config.task).alias, "cameras": cameras}
     return policy
@@ -124,11 +124,11 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.methods import env_options
-    from torchrl_sparse.evaluation.paired import rollout_episodes
+    from torchrl_sparse.evaluation.rollouts.methods import env_options
+    from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 
-    schedule = NoiseSchedule("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else NoiseSchedule()
-    policy = averaged_policy(trainer, config, schedule)
+    sampler = Sampler("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else Sampler()
+    policy = averaged_policy(trainer, config, sampler)
     episodes = rollout_episodes(
         ChunkExecutor(policy, trainer.config.n_action_steps),
         partial(make_env, find_task(config.task).name, **env_options(policy)),

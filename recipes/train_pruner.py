@@ -25,20 +25,20 @@ from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.l2c import StaticGates
-from torchrl_sparse.blocks.pruner_network import PrunerNetwork
-from torchrl_sparse.blocks.pruner_reference import make_reference, with_queries
-from torchrl_sparse.blocks.pruner_training import PrunerConfig, PrunerTrainer, imitate
-from torchrl_sparse.blocks.sag import PrunerInfo, SAGPruner
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.benchmarks import find_task
-from torchrl_sparse.evaluation.training_figures import plot_pruner_curves, read_scalars
-from torchrl_sparse.files import atomic_path
-from torchrl_sparse.interrupt import StopSignal
+from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.diffusion.published import published_shape
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.training_loop import make_logger
+from torchrl_sparse.runtime.interrupt import StopSignal
+from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.loop import make_logger
+from torchrl_sparse.training.pruner.reference import make_reference, with_queries
+from torchrl_sparse.training.pruner.trainer import PrunerConfig, PrunerTrainer, imitate
 
 ROLLOUT_SEED = 2_000_000  # of the first episode; no demonstration, calibration or evaluation has it
 
@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     policy = DiffusionPolicy.from_pretrained(config.policy)
     if config.sampler is not None:
-        policy.schedule = NoiseSchedule(**config.sampler)
+        policy.sampler = Sampler(**config.sampler)
     out = Path(config.out)
     trainer = make_trainer(policy, reference_set(policy, config), config)
     if (out / "checkpoint.pt").exists():
@@ -70,7 +70,7 @@ def reference_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     path = Path(config.out) / "reference.safetensors"
     made_for = {
         "policy": policy.fingerprint,
-        **policy.schedule.config,
+        **policy.sampler.config,
         "demos": config.demos,
         **config.reference,
         "rollouts": [config.rollouts, *initial_schedules(config)[:1]] if config.rollouts else [],
@@ -99,14 +99,14 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
         )
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.methods import env_options, record_queries
+    from torchrl_sparse.evaluation.rollouts.methods import env_options, record_queries
 
     task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
         policy.network,
         policy.normalizer,
         vision=policy.vision,
-        schedule=policy.schedule,
+        sampler=policy.sampler,
         plan=StaticSchedule(schedules[0]) if schedules else None,
         engine=policy.engine,
     )
@@ -143,7 +143,7 @@ def make_trainer(policy: DiffusionPolicy, reference: TensorDict, config: DictCon
     torch.manual_seed(options.seed)
     if config.method == "sag":
         gates = PrunerNetwork(
-            policy.schedule.timesteps.tolist(),
+            policy.sampler.timesteps.tolist(),
             policy.num_blocks,
             (policy.n_obs_steps, policy.network.cond_dim),
             rate_input=options.rate_range is not None,
@@ -199,7 +199,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         trainer.fixed_mask(),
         method="l2c" if config.method == "l2c" else "sag_fixed",
         policy=policy.fingerprint,
-        sampler=policy.schedule.name,
+        sampler=policy.sampler.name,
         reuse=trainer.config.reuse,
         settings=settings,
     )
@@ -209,7 +209,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         return path
     info = PrunerInfo(
         policy=policy.fingerprint,
-        sampler=policy.schedule.name,
+        sampler=policy.sampler.name,
         rate=trainer.config.rate,
         rate_range=trainer.config.rate_range,
         reuse=trainer.config.reuse,

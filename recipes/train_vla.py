@@ -22,17 +22,17 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.rotations import ABSOLUTE_DIM
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.policies.trainer import TrainConfig
-from torchrl_sparse.policies.training_loop import train
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.grounding import GroundingConfig, ObjectPositions
-from torchrl_sparse.policies.vla.network import VLANetwork
-from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.policies.vla.text import WordTokenizer
-from torchrl_sparse.policies.vla.training import InstructedDemonstrations, VLATrainer
+from torchrl_sparse.rotations import ABSOLUTE_DIM
+from torchrl_sparse.training.loop import train
+from torchrl_sparse.training.trainer import TrainConfig
+from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
+from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
 
 SIZES = {"tiny": VLAConfig.tiny, "small": VLAConfig.small, "published": VLAConfig}
 
@@ -118,8 +118,8 @@ def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.evaluation.paired import rollout_episodes
-    from torchrl_sparse.evaluation.vla_methods import instructed_env
+    from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+    from torchrl_sparse.evaluation.rollouts.vla_methods import instructed_env
 
     policy = averaged_policy(trainer)
     episodes = rollout_episodes(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from torchrl_sparse.backends import backend_runtime
+from torchrl_sparse.runtime.backends import backend_runtime
 
 
 @pytest.fixture(scope="session")

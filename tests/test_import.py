@@ -24,8 +24,8 @@ def test_policies_training_and_blocks_need_no_simulator():
 import sys
 for name in ("robosuite", "mujoco"):
     sys.modules[name] = None  # any import of it fails
-from torchrl_sparse import BAC, ChunkExecutor, DiffusionPolicy, NoiseSchedule, Uniform
-import torchrl_sparse.data.robomimic, torchrl_sparse.policies.diffusion.training
+from torchrl_sparse import BAC, ChunkExecutor, DiffusionPolicy, Sampler, Uniform
+import torchrl_sparse.data.robomimic, torchrl_sparse.training.diffusion.trainer
 print("fine")
 """
     assert python(code).endswith("fine")
@@ -36,7 +36,7 @@ def test_without_transformers_all_but_the_network_imports():
 import sys
 sys.modules["transformers"] = None  # any import of it fails
 from torchrl_sparse import BAC, ChunkExecutor, DiffusionPolicy, TokenPruner, VLAConfig
-import torchrl_sparse.policies.vla.flops, torchrl_sparse.policies.vla.text, torchrl_sparse.policies.vla.normalize
+import torchrl_sparse.networks.vla.flops, torchrl_sparse.networks.vla.text, torchrl_sparse.networks.vla.normalize
 try:
     from torchrl_sparse import VLAPolicy
 except ImportError as error:

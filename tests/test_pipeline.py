@@ -12,9 +12,9 @@ from torchrl.envs.utils import ExplorationType
 from torchrl_sparse import (
     ChunkExecutor,
     DiffusionPolicy,
-    NoiseSchedule,
     Normalizer,
     Planner,
+    Sampler,
     TransformerForDiffusion,
     keys,
     make_env,
@@ -45,7 +45,7 @@ def small_policy():
     scale[:3], offset[:3] = 20.0, -20.0 * torch.tensor([0.0, 0.0, 1.0])
     offset[3:9] = -torch.tensor([0.0, 1, 0, 1, 0, 0])
     normalizer = Normalizer(torch.ones(19), torch.zeros(19), scale, offset)
-    policy = DiffusionPolicy(network, normalizer, schedule=NoiseSchedule("ddpm", 6))
+    policy = DiffusionPolicy(network, normalizer, sampler=Sampler("ddpm", 6))
     policy.plan = FarMeansCareful()
     return policy
 

@@ -21,7 +21,7 @@ from torchrl_sparse.blocks.static import Schedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.evaluation import load_results, save_results
-from torchrl_sparse.evaluation.realtime import load_realtime
+from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}

@@ -14,13 +14,13 @@ _HOME = {
     "make_env": "envs.transforms",
     "EndEffectorVelocity": "envs.transforms",
     "DiffusionPolicy": "policies.diffusion.policy",
-    "TransformerForDiffusion": "policies.diffusion.transformer",
-    "NoiseSchedule": "policies.diffusion.schedule",
+    "TransformerForDiffusion": "networks.diffusion.transformer",
+    "Sampler": "networks.diffusion.sampler",
     "VLAPolicy": "policies.vla.policy",
-    "VLAConfig": "policies.vla.config",
-    "TokenPruner": "policies.vla.pruning",
-    "load_openvla_oft": "policies.checkpoints.openvla_oft",
-    "Normalizer": "data.normalize",
+    "VLAConfig": "networks.vla.config",
+    "TokenPruner": "networks.vla.pruning",
+    "load_openvla_oft": "storage.published.openvla_oft",
+    "Normalizer": "networks.normalize",
     "Planner": "blocks.planner",
     "StaticPlanner": "blocks.planner",
     "Dense": "blocks.planner",
@@ -28,14 +28,14 @@ _HOME = {
     "Schedule": "blocks.static",
     "StaticSchedule": "blocks.static",
     "BAC": "blocks.bac",
-    "SAGPruner": "blocks.sag",
+    "SAGPruner": "blocks.sag.planner",
     "make_engine": "blocks.engine.factory",
     "SpecPrune": "tokens.specprune",
     "ActionAwareController": "control.action_aware",
     "ChunkExecutor": "control.chunk_executor",
     "RealtimeExecutor": "control.realtime_executor",
-    "rollout_episodes": "evaluation.paired",
-    "measure_latency": "evaluation.latency",
+    "rollout_episodes": "evaluation.rollouts.paired",
+    "measure_latency": "evaluation.latency.measure",
 }
 
 __all__ = [*_HOME]
@@ -44,24 +44,24 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.bac import BAC
     from torchrl_sparse.blocks.engine.factory import make_engine
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
-    from torchrl_sparse.blocks.sag import SAGPruner
+    from torchrl_sparse.blocks.sag.planner import SAGPruner
     from torchrl_sparse.blocks.static import Schedule, StaticSchedule
     from torchrl_sparse.blocks.uniform import Uniform
     from torchrl_sparse.control.action_aware import ActionAwareController
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.control.realtime_executor import RealtimeExecutor
-    from torchrl_sparse.data.normalize import Normalizer
     from torchrl_sparse.envs.robosuite import RobosuiteEnv
     from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env
-    from torchrl_sparse.evaluation.latency import measure_latency
-    from torchrl_sparse.evaluation.paired import rollout_episodes
-    from torchrl_sparse.policies.checkpoints.openvla_oft import load_openvla_oft
+    from torchrl_sparse.evaluation.latency.measure import measure_latency
+    from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.normalize import Normalizer
+    from torchrl_sparse.networks.vla.config import VLAConfig
+    from torchrl_sparse.networks.vla.pruning import TokenPruner
     from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-    from torchrl_sparse.policies.vla.config import VLAConfig
     from torchrl_sparse.policies.vla.policy import VLAPolicy
-    from torchrl_sparse.policies.vla.pruning import TokenPruner
+    from torchrl_sparse.storage.published.openvla_oft import load_openvla_oft
     from torchrl_sparse.tokens.specprune import SpecPrune
 
 

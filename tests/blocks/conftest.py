@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 NUM_STEPS, NUM_LAYERS, HORIZON, ACTION_DIM, OBS_STEPS, COND_DIM = 10, 2, 6, 4, 2, 5
 
@@ -28,13 +28,13 @@ def network():
 
 
 @pytest.fixture(params=["ddpm", "ddim"])
-def scheduler(request):
-    return NoiseSchedule(request.param, NUM_STEPS)
+def sampler(request):
+    return Sampler(request.param, NUM_STEPS)
 
 
 @pytest.fixture
 def ddpm():
-    return NoiseSchedule("ddpm", NUM_STEPS)
+    return Sampler("ddpm", NUM_STEPS)
 
 
 @pytest.fixture

@@ -25,10 +25,10 @@ def test_block_error_is_the_mean_l1_distance_of_all_pairs_of_steps():
     assert block_error(features).item() == pytest.approx(torch.stack(pairs).mean().item(), rel=1e-5)
 
 
-def test_calibration_averages_its_samples(network, scheduler, query):
+def test_calibration_averages_its_samples(network, sampler, query):
     noise, cond = query
-    together = calibrate(network, scheduler, noise[:3], cond[:3])
-    alone = [calibrate(network, scheduler, noise[i : i + 1], cond[i : i + 1]) for i in range(3)]
+    together = calibrate(network, sampler, noise[:3], cond[:3])
+    alone = [calibrate(network, sampler, noise[i : i + 1], cond[i : i + 1]) for i in range(3)]
     assert together.num_samples == 3
     assert together.similarity.shape == (6, 10, 10)
     torch.testing.assert_close(together.similarity, torch.stack([a.similarity for a in alone]).mean(dim=0))

@@ -3,6 +3,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from tests.blocks.conftest import random_mask
 from torchrl_sparse.blocks.mask import (
     NetworkSizes,
     block_macs,
@@ -15,9 +16,7 @@ from torchrl_sparse.blocks.mask import (
     steps_from_mask,
     validate_mask,
 )
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-
-from .conftest import random_mask
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 LIFT = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
 

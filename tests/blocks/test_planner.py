@@ -4,11 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.keys import COND, PRUNE_MASK
-
-from .conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
 
 SPEC = PlanSpec(NUM_STEPS, NUM_LAYERS, policy="a policy")
 

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
+from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS, random_mask
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
-
-from .conftest import NUM_LAYERS, NUM_STEPS, random_mask
 
 NUM_BLOCKS = 3 * NUM_LAYERS
 
@@ -23,42 +22,42 @@ def double_query(network, query):
 
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])
 @pytest.mark.parametrize("explore", [1.0, 0.3])
-def test_values_are_those_of_the_reference(network, scheduler, query, reuse, explore):
+def test_values_are_those_of_the_reference(network, sampler, query, reuse, explore):
     mask = random_mask(5, rate=0.7)
-    expected = denoise(network, scheduler, *query, mask, reuse=reuse)
-    actions = denoise_relaxed(network, scheduler, *query, mask.float(), reuse=reuse, explore=explore)
+    expected = denoise(network, sampler, *query, mask, reuse=reuse)
+    actions = denoise_relaxed(network, sampler, *query, mask.float(), reuse=reuse, explore=explore)
     torch.testing.assert_close(actions, expected, rtol=0, atol=1e-5)
 
 
-def test_no_gate_is_dense(network, scheduler, query):
+def test_no_gate_is_dense(network, sampler, query):
     gate = torch.zeros(5, NUM_STEPS, NUM_BLOCKS)
-    assert torch.equal(denoise_relaxed(network, scheduler, *query, gate), denoise(network, scheduler, *query))
+    assert torch.equal(denoise_relaxed(network, sampler, *query, gate), denoise(network, sampler, *query))
 
 
 @pytest.mark.parametrize("reuse", ["block", "type"])
-def test_the_gradient_is_that_of_the_mixture(network, scheduler, double_query, reuse):
+def test_the_gradient_is_that_of_the_mixture(network, sampler, double_query, reuse):
     """Against finite differences of a chain that mixes with real gates, written out naively."""
     noise, cond = double_query
     mask = random_mask(5, rate=0.6)
     gate = gate_of(mask)
-    denoise_relaxed(network, scheduler, noise, cond, gate, reuse=reuse).square().sum().backward()
+    denoise_relaxed(network, sampler, noise, cond, gate, reuse=reuse).square().sum().backward()
     step = 1e-6
     for cell in [(0, 1, 0), (1, 3, 2), (2, 5, 4), (3, 9, 5), (4, 2, 1)]:
         ahead, behind = mask.double(), mask.double()
         ahead[cell] += step
         behind[cell] -= step
         values = [
-            mixed_chain(network, scheduler, noise, cond, gates, reuse).square().sum()
+            mixed_chain(network, sampler, noise, cond, gates, reuse).square().sum()
             for gates in (ahead, behind)
         ]
         slope = ((values[0] - values[1]) / (2 * step)).item()
         assert gate.grad[cell].item() == pytest.approx(slope, rel=1e-4, abs=1e-6)
 
 
-def mixed_chain(network, scheduler, noise, cond, gate, reuse):
+def mixed_chain(network, sampler, noise, cond, gate, reuse):
     slots = {"block": NUM_BLOCKS, "type": 3}[reuse]
     latest, sample = [None] * slots, noise[:, 0]
-    for k, timestep in enumerate(scheduler.timesteps.tolist()):
+    for k, timestep in enumerate(sampler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(NUM_BLOCKS):
             fresh, slot = network.block(block, x, memory), block % slots
@@ -66,15 +65,15 @@ def mixed_chain(network, scheduler, noise, cond, gate, reuse):
             latest[slot] = fresh if k == 0 else pruned * latest[slot] + (1 - pruned) * fresh
             x = x + latest[slot]
         noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
-        sample = scheduler.step(network.head_out(x), k, sample, noise_k)
+        sample = sampler.step(network.head_out(x), k, sample, noise_k)
     return sample
 
 
-def test_checkpointing_changes_nothing(network, scheduler, query):
+def test_checkpointing_changes_nothing(network, sampler, query):
     gates = [random_mask(5).float().requires_grad_() for _ in range(2)]
     for gate, checkpointed in zip(gates, (False, True), strict=True):
         torch.manual_seed(7)
-        actions = denoise_relaxed(network, scheduler, *query, gate, explore=0.5, checkpointed=checkpointed)
+        actions = denoise_relaxed(network, sampler, *query, gate, explore=0.5, checkpointed=checkpointed)
         actions.sum().backward()
     assert torch.equal(gates[0].grad, gates[1].grad)
 
@@ -98,17 +97,17 @@ def test_exploring_some_blocks_has_the_gradient_of_exploring_all_on_average(netw
     assert (samples[:, :, 1:][:, ~mask[:, 1:]] != 0).all()
 
 
-def test_cut_steps_have_no_gradient_from_later_ones(network, scheduler, query):
+def test_cut_steps_have_no_gradient_from_later_ones(network, sampler, query):
     gate = random_mask(5, rate=0.6).float().requires_grad_()
-    errors = step_errors(network, scheduler, *query, gate)
+    errors = step_errors(network, sampler, *query, gate)
     assert errors.shape == (5, NUM_STEPS - 1, *query[0].shape[2:])
     errors[:, 4].sum().backward()  # what step 5 does wrong
     touched = gate.grad.abs().sum(dim=(0, 2)) > 0
     assert touched.nonzero().flatten().tolist() == [5]
 
 
-def test_the_error_of_a_dense_step_is_zero(network, scheduler, query):
-    errors = step_errors(network, scheduler, *query, torch.zeros(5, NUM_STEPS, NUM_BLOCKS))
+def test_the_error_of_a_dense_step_is_zero(network, sampler, query):
+    errors = step_errors(network, sampler, *query, torch.zeros(5, NUM_STEPS, NUM_BLOCKS))
     assert errors.abs().max() < 1e-6
 
 

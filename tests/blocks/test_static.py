@@ -5,11 +5,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS, random_mask
 from torchrl_sparse.blocks.planner import PlanSpec
 from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.keys import COND, PRUNE_MASK
-
-from .conftest import NUM_LAYERS, NUM_STEPS, random_mask
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from torchrl_sparse import (
     ActionAwareController,
     ChunkExecutor,
     DiffusionPolicy,
-    NoiseSchedule,
+    Sampler,
     keys,
     make_env,
 )
@@ -208,7 +208,7 @@ def test_mistakes_are_named():
 
 def lift_actor():
     policy = DiffusionPolicy.from_pretrained("assets/lift")
-    policy.schedule = NoiseSchedule("ddim", 10)
+    policy.sampler = Sampler("ddim", 10)
     return ChunkExecutor(policy, n_action_steps=8, gate=ActionAwareController())
 
 

@@ -10,11 +10,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.collectors import Collector
 
-from torchrl_sparse import ChunkExecutor, DiffusionPolicy, NoiseSchedule, keys, make_env
+from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys, make_env
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.evaluation.paired import rollout_episodes
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 
 HOLDING = -7.0
 HOLD = TensorDictModule(lambda now: torch.full_like(now, HOLDING), in_keys=["now"], out_keys=[keys.HOLD])
@@ -127,7 +127,7 @@ def test_holding_leaves_the_arm_where_it_is():
 @pytest.fixture(scope="module")
 def policy():
     policy = DiffusionPolicy.from_pretrained("assets/lift")
-    policy.schedule = NoiseSchedule("ddim", 5)
+    policy.sampler = Sampler("ddim", 5)
     return policy
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.data.published import env_args_14, env_args_15, record, write
+from tests.data.published_demos import env_args_14, env_args_15, record, write
 from torchrl_sparse import keys
 from torchrl_sparse.data import absolute
 from torchrl_sparse.data.absolute import AbsoluteActions, convert_demos

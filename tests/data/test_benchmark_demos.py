@@ -7,9 +7,9 @@ import torch
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.demos import Collection, collect
-from torchrl_sparse.data.normalize import Normalizer
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.block_push_scene import published_start
+from torchrl_sparse.networks.normalize import Normalizer
 
 pytest.importorskip("pybullet", reason="needs the extra blockpush")
 TWO = Collection("block_push", episodes=2, seed=20)

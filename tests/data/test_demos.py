@@ -19,8 +19,8 @@ from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_ini
 from torchrl_sparse.data.hdf5_writer import Episode
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.rotations import pose_to_absolute
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect_demos.py"
 THREE = Collection("Lift", episodes=3, seed=50)

@@ -9,8 +9,8 @@ from torchrl_sparse import keys, make_env
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.rendering import render_demos
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.rotations import pose_to_absolute
 
 CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 

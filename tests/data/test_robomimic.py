@@ -7,7 +7,7 @@ import torch
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.rotations import absolute_to_pose
+from torchrl_sparse.rotations import absolute_to_pose
 
 STATE_KEYS = ("object", "robot0_eef_pos")
 LENGTHS = (7, 4, 12)

@@ -11,7 +11,7 @@ from torchrl_sparse.envs.experts import EXPERTS, OPERATORS, Disturbance, draw_op
 from torchrl_sparse.envs.experts.base import DOWNWARD, Hand, downward, nearest
 from torchrl_sparse.envs.experts.nut_assembly_square import grasp_yaw
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.rotations import pose_to_absolute
+from torchrl_sparse.rotations import pose_to_absolute
 
 PROFICIENT = OPERATORS["proficient"][0]
 STILL = replace(PROFICIENT, noise=0.0, bump=0.0, slip=0.0, hesitation=0.0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from tests.envs import published
+from tests.envs import published_benchmarks as published
 from torchrl_sparse import keys
 from torchrl_sparse.envs.kitchen import KitchenEnv
 

@@ -9,9 +9,9 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.rotations import matrix_to_rot6d
 from torchrl_sparse.envs.tasks import TASKS, get_task
 from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env
+from torchrl_sparse.rotations import matrix_to_rot6d
 
 STATE_DIMS = {"Lift": 19, "PickPlaceCan": 23, "NutAssemblySquare": 23, "TwoArmTransport": 59, "ToolHang": 53}
 

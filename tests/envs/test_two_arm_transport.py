@@ -12,8 +12,8 @@ from torchrl_sparse.envs.experts import OPERATORS, make_expert
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Hand, downward
 from torchrl_sparse.envs.experts.two_arm_transport import Hammer
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.rotations import pose_to_absolute
 
 TASK = "TwoArmTransport"
 OFFERED = np.array([0.0, -0.01, 1.08])

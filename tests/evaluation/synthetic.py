@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torchrl_sparse.evaluation.episodes import EpisodeResult
-from torchrl_sparse.evaluation.latency import summarize_latency
-from torchrl_sparse.evaluation.report import MethodRun, build_results
+from torchrl_sparse.evaluation.latency.measure import summarize_latency
+from torchrl_sparse.evaluation.results.report import MethodRun, build_results
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
 # name: success rate, prune rate, FLOPs ratio, latency (s), mean action error, episode length
 METHODS = {

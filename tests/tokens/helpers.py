@@ -4,10 +4,10 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.policies.vla.pruning import TokenPruner
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner

@@ -6,7 +6,7 @@ from torch.nn import functional
 
 from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Watch, later, make_policy, query
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.pruning import TokenKind
+from torchrl_sparse.networks.vla.pruning import TokenKind
 from torchrl_sparse.tokens.efficientvla import (
     LAYER_SIMILARITY,
     EfficientVLAPruner,

@@ -10,8 +10,8 @@ from torchrl.envs.utils import ExplorationType
 from tests.tokens.helpers import LAYERS, PER_CAMERA, SIZE
 from torchrl_sparse import ActionAwareController, ChunkExecutor, keys, make_env
 from torchrl_sparse.control.action_aware import Thresholds
-from torchrl_sparse.policies.vla.config import TransformerSize, VLAConfig
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.specprune import SpecPrune
 

@@ -15,7 +15,7 @@ from tests.tokens.helpers import (
     query,
 )
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.pruning import TokenKind
+from torchrl_sparse.networks.vla.pruning import TokenKind
 
 METHODS = list(PRUNERS)
 DROPS = [name for name in METHODS if name != "vla_cache"]  # which reuses tokens instead

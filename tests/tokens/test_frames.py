@@ -8,9 +8,9 @@ from torch.nn import functional
 
 from tests.tokens.helpers import CONFIG, SPEC, later, patch, query
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.policies.vla.vision import center_crop
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
 from torchrl_sparse.tokens.frames import compare_frames, patches, similarity
 

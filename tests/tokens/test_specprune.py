@@ -9,11 +9,11 @@ from tensordict import TensorDict
 
 from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Watch, later, make_policy, query
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla import decoder
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.decoder import pack
-from torchrl_sparse.policies.vla.flops import query_flops
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, VisualSpec
+from torchrl_sparse.networks.vla import decoder
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.decoder import pack
+from torchrl_sparse.networks.vla.flops import query_flops
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, VisualSpec
 from torchrl_sparse.tokens.specprune import (
     SpecPrune,
     confidence,

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["Calibration", "block_error", "calibrate", "feature_similarity"]
 
@@ -69,14 +69,12 @@ class Calibration:
 
 
 @torch.no_grad()
-def calibrate(
-    network: TransformerForDiffusion, scheduler: NoiseSchedule, noise: Tensor, cond: Tensor
-) -> Calibration:
+def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Calibration:
     """Record the block outputs of dense queries; the paper uses a single one, several average its noise out.
 
     Args:
         network: the denoiser, in eval mode.
-        scheduler: the denoising steps, K of them.
+        sampler: the denoising steps, K of them.
         noise: f32 [N, K, H, A], as :func:`~torchrl_sparse.blocks.engine.reference.denoise` takes it.
         cond: encoded observations f32 [N, To, D].
 
@@ -84,13 +82,13 @@ def calibrate(
         ValueError: if the network is in training mode, there is no sample, or shapes do not fit.
 
     Examples:
-        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
-        >>> scheduler = NoiseSchedule("ddpm", 8)
-        >>> calibration = calibrate(network, scheduler, torch.randn(2, 8, 4, 7), torch.randn(2, 2, 5))
+        >>> sampler = Sampler("ddpm", 8)
+        >>> calibration = calibrate(network, sampler, torch.randn(2, 8, 4, 7), torch.randn(2, 2, 5))
         >>> calibration.similarity.shape, calibration.errors.shape
         (torch.Size([3, 8, 8]), torch.Size([3]))
     """
@@ -104,7 +102,7 @@ def calibrate(
     for sample in range(len(cond)):  # One at a time bounds the memory to the features of one query.
         recorder = FeatureRecorder()
         rows = slice(sample, sample + 1)
-        denoise(network, scheduler, noise[rows], cond[rows], record=recorder)
+        denoise(network, sampler, noise[rows], cond[rows], record=recorder)
         blocks = recorder.features()
         similarity = similarity + torch.stack([feature_similarity(block) for block in blocks])
         errors = errors + torch.stack([block_error(block) for block in blocks])

@@ -5,7 +5,7 @@ baseline that tells what a learned mask is worth without the observation. As rel
 other step and weighs sparsity with an L1 term; here every step but the first may be pruned and the sparsity term
 is SAG's, so that both methods can be compared at the same cost. Pruned blocks reuse their own latest output.
 
-:mod:`torchrl_sparse.blocks.pruner_training` trains it; its mask is kept as a
+:mod:`torchrl_sparse.training.pruner.trainer` trains it; its mask is kept as a
 :class:`~torchrl_sparse.blocks.static.Schedule`.
 """
 

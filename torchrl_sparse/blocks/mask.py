@@ -2,7 +2,7 @@
 
 A mask is bool [*B, K, 3L] with **True = pruned** (the symbol M of SAG, arXiv:2601.12894). Axis K counts the
 calls of the network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456,
-counts diffusion timesteps, which run down; ``NoiseSchedule.timesteps[step]`` translates.) The column names
+counts diffusion timesteps, which run down; ``Sampler.timesteps[step]`` translates.) The column names
 the block: ``3 * layer + {0: SA, 1: CA, 2: FFN}``. Row 0 never prunes, so there is always something to reuse.
 
 A pruned block adds an earlier output to the residual stream. Which one is the *reuse rule*:
@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = [
     "BLOCK_TYPES",

@@ -22,8 +22,8 @@ from torchrl_sparse.blocks.engine.reference import ComputedRows, check_query
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
 
@@ -63,7 +63,7 @@ def _spare_first(gate: Tensor) -> Tensor:
 
 def denoise_relaxed(
     network: TransformerForDiffusion,
-    schedule: NoiseSchedule,
+    sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     gate: Tensor,
@@ -75,7 +75,7 @@ def denoise_relaxed(
     """Normalised actions [B, H, A], differentiable with respect to the gates.
 
     Args:
-        network, schedule, noise, cond, reuse: as in :func:`~torchrl_sparse.blocks.engine.reference.denoise`.
+        network, sampler, noise, cond, reuse: as in :func:`~torchrl_sparse.blocks.engine.reference.denoise`.
         gate: f32 [B, K, 3L] of 0 and 1 (1 = pruned), row 0 all 0, as the functions above make them.
         explore: probability in (0, 1] with which a pruned block is evaluated all the same, to learn what
             computing it would change; drawn for the whole batch from torch's global generator. The gradient
@@ -87,13 +87,13 @@ def denoise_relaxed(
         ValueError: as ``denoise`` does.
     """
     options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
-    *_, (_, actions) = _chain(network, schedule, noise, cond, gate, **options)
+    *_, (_, actions) = _chain(network, sampler, noise, cond, gate, **options)
     return actions
 
 
 def step_errors(
     network: TransformerForDiffusion,
-    schedule: NoiseSchedule,
+    sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     gate: Tensor,
@@ -113,21 +113,21 @@ def step_errors(
         f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
     """
     options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
-    chain = _chain(network, schedule, noise, cond, gate, **options, cut=True)
+    chain = _chain(network, sampler, noise, cond, gate, **options, cut=True)
     errors = []
     for k, (before, after) in enumerate(chain):
         if k == 0:  # dense by definition
             continue
         with torch.no_grad():
-            eps = network(before, int(schedule.timesteps[k]), cond)
-            dense = schedule.step(eps, k, before, _transition_noise(noise, k))
+            eps = network(before, int(sampler.timesteps[k]), cond)
+            dense = sampler.step(eps, k, before, _transition_noise(noise, k))
         errors.append((after - dense).abs())
     return torch.stack(errors, dim=1)
 
 
 def _chain(
     network,
-    schedule,
+    sampler,
     noise: Tensor,
     cond: Tensor,
     gate: Tensor,
@@ -139,7 +139,7 @@ def _chain(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """The samples before and after each denoising step."""
     pruned = gate.detach().bool()
-    check_query(network, schedule, noise, cond, pruned, reuse)
+    check_query(network, sampler, noise, cond, pruned, reuse)
     if not 0 < explore <= 1:
         raise ValueError(f"explore: expected a probability in (0, 1], got {explore}")
     explored = torch.rand(gate.shape[1:], device=gate.device) < explore
@@ -147,10 +147,10 @@ def _chain(
     gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))
     slots, buffers = num_buffers(reuse, network.num_blocks), ()
     sample = noise[:, 0]
-    for k in range(schedule.num_inference_steps):
+    for k in range(sampler.num_inference_steps):
         if cut:
             sample, buffers = sample.detach(), tuple(buffer.detach() for buffer in buffers)
-        run = _Step(network, schedule, k, cond, _transition_noise(noise, k), computed, slots)
+        run = _Step(network, sampler, k, cond, _transition_noise(noise, k), computed, slots)
         arguments = (sample, gate[:, k], *buffers)
         after, *buffers = (
             checkpoint(run, *arguments, use_reentrant=False) if checkpointed else run(*arguments)
@@ -165,14 +165,14 @@ class _Step:
     def __init__(
         self,
         network,
-        schedule,
+        sampler,
         k: int,
         cond: Tensor,
         noise: Tensor | None,
         computed: ComputedRows,
         slots: int,
     ) -> None:
-        self._network, self._schedule, self._k = network, schedule, k
+        self._network, self._schedule, self._k = network, sampler, k
         self._cond, self._noise = cond, noise
         self._computed, self._slots = computed, slots
 

@@ -44,8 +44,8 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
-from torchrl_sparse.files import atomic_path
-from torchrl_sparse.policies.diffusion.schedule import split_sampler
+from torchrl_sparse.networks.diffusion.sampler import split_sampler
+from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["Schedule", "StaticSchedule"]
 
@@ -74,7 +74,7 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
-        sampler: name of the denoising schedule that it was made for, see `NoiseSchedule.name`.
+        sampler: name of the denoising schedule that it was made for, see `Sampler.name`.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 

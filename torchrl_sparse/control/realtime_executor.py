@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
-from torchrl_sparse.envs.rotations import quaternion_to_rot6d
 from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.rotations import quaternion_to_rot6d
 
 
 class RealtimeExecutor(ChunkExecutor):
@@ -42,11 +42,11 @@ class RealtimeExecutor(ChunkExecutor):
         ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
 
     Examples:
-        >>> from torchrl_sparse import DiffusionPolicy, NoiseSchedule, make_env
+        >>> from torchrl_sparse import DiffusionPolicy, Sampler, make_env
         >>> from torchrl_sparse.envs.tasks import get_task
         >>> env = make_env("Lift", seeds=[7])
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
-        >>> policy.schedule = NoiseSchedule("ddim", 10)
+        >>> policy.sampler = Sampler("ddim", 10)
         >>> actor = RealtimeExecutor(policy, HoldPose(get_task("lift")), latency=0.1)
         >>> env.rollout(3, actor)["control", "delay"].flatten().tolist()
         [2, 2, 2]

@@ -29,9 +29,9 @@ from torchrl_sparse.data.hdf5_writer import copy_attributes, lay_out
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.rotations import POSE_DIM
 from torchrl_sparse.envs.tasks import get_task
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.rotations import POSE_DIM
+from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["AbsoluteActions", "convert_demos"]
 

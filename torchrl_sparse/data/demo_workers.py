@@ -15,7 +15,7 @@ from itertools import count
 from multiprocessing import get_context
 from typing import Any
 
-from torchrl_sparse.backends import backend_runtime, ray_death
+from torchrl_sparse.runtime.backends import backend_runtime, ray_death
 
 __all__ = ["in_order"]
 

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 
 from torchrl_sparse import keys
-from torchrl_sparse.backends import check_backend
 from torchrl_sparse.data.benchmark_demos import benchmark_env_args, demonstrate_benchmark
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
@@ -30,10 +29,11 @@ from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.benchmarks import Benchmark, find_task
 from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
-from torchrl_sparse.envs.rotations import pose_to_absolute
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.rotations import pose_to_absolute
+from torchrl_sparse.runtime.backends import check_backend
 
 # Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
 _EXPERT_STREAM = 1

@@ -29,7 +29,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.storage.atomic import atomic_path
 
 
 @dataclass(frozen=True)

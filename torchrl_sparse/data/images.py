@@ -12,7 +12,7 @@ from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from torchrl_sparse.data.hdf5_reader import naming
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["chosen_cameras", "read_images"]
 

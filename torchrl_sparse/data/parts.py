@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["check_same", "claim_parts", "parts_of"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from torchrl_sparse.envs.rotations import POSE_DIM
+from torchrl_sparse.rotations import POSE_DIM
 
 __all__ = ["RecordedControl", "read_control"]
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from torchrl_sparse.data.demos import read_initial_state
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.files import atomic_path
+from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["render_demos"]
 

@@ -25,7 +25,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.hdf5_reader import demo_names, naming, open_demos, read_array
 from torchrl_sparse.data.images import read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
-from torchrl_sparse.envs.rotations import POSE_DIM, pose_to_absolute
+from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "read_demos"]
 

@@ -13,10 +13,10 @@ from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.rendering import CameraRenderer
-from torchrl_sparse.envs.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
 from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional
 
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner, VisualSpec
 from torchrl_sparse.tokens.selection import best, check_share
 
 LAYER_SIMILARITY = ("tokens", "layer_similarity")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec
 from torchrl_sparse.tokens.selection import best, check_share
 
 

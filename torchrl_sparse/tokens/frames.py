@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.pruning import VisualSpec
 
 __all__ = ["FRAME_KEYS", "compare_frames", "patches", "similarity"]
 

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.diffusion.noise import query_seed
-from torchrl_sparse.policies.vla.pruning import TokenPruner, VisualSpec
+from torchrl_sparse.networks.diffusion.noise import query_seed
+from torchrl_sparse.networks.vla.pruning import TokenPruner, VisualSpec
 from torchrl_sparse.tokens.selection import best, check_share
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sparse.policies.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.pruning import VisualSpec
 
 __all__ = ["best", "best_per_camera", "check_budget", "check_share", "ranks", "scaled_layers"]
 

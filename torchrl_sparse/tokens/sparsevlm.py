@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenKind, TokenPruner
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner
 from torchrl_sparse.tokens.selection import check_share, scaled_layers
 
 _DEPTH = 32

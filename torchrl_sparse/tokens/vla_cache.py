@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.pruning import LayerState, TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner, VisualSpec
 from torchrl_sparse.tokens.efficientvla import visual_features
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 from torchrl_sparse.tokens.selection import best, best_per_camera, check_share

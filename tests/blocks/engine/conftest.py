@@ -3,7 +3,7 @@
 import ctypes
 import os
 
-from torchrl_sparse.blocks.engine import library, packing
+from torchrl_sparse.blocks.engine.native import library, packing
 
 SANITIZED = os.environ.get("SANITIZED_NATIVE")
 if SANITIZED:

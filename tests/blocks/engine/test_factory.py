@@ -6,14 +6,13 @@ import pickle
 import pytest
 import torch
 
+from tests.blocks.conftest import ACTION_DIM, HORIZON, NUM_STEPS, random_mask
 from torchrl_sparse.blocks.engine import factory, make_engine
 from torchrl_sparse.blocks.engine.costs import engine_block_costs
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.factory import EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-
-from ..conftest import ACTION_DIM, HORIZON, NUM_STEPS, random_mask
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 
 @pytest.fixture
@@ -81,15 +80,15 @@ class TestEagerBaseline:
         return torch.stack([initial, *steps], dim=1)
 
     @pytest.mark.parametrize("pruned", [False, True])
-    def test_equals_the_reference_on_the_noise_that_diffusers_draws(self, network, scheduler, query, pruned):
+    def test_equals_the_reference_on_the_noise_that_diffusers_draws(self, network, sampler, query, pruned):
         noise, cond = self.noise(7), query[1][:1]
         mask = random_mask(1) if pruned else None
-        expected = denoise(network, scheduler, noise, cond, mask)
-        eager = EagerBaseline(network, scheduler)
+        expected = denoise(network, sampler, noise, cond, mask)
+        eager = EagerBaseline(network, sampler)
         generator = torch.Generator().manual_seed(7)
         actions = eager.denoise(noise[:, 0], cond, mask if mask is None else mask[0], generator=generator)
         torch.testing.assert_close(actions, expected, atol=1e-4, rtol=0)
 
     def test_timesteps_that_diffusers_does_not_have_are_refused(self, network):
         with pytest.raises(ValueError, match="diffusers has no sampler 'ddim_90_50'"):
-            EagerBaseline(network, NoiseSchedule("ddim", timesteps=[90, 50]))
+            EagerBaseline(network, Sampler("ddim", timesteps=[90, 50]))

@@ -1,20 +1,19 @@
 import pytest
 import torch
 
+from tests.blocks.conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.blocks.mask import mask_from_steps, reuse_source
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-
-from ..conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 NUM_BLOCKS = 3 * NUM_LAYERS
 
 
-def dense_loop(network, scheduler, noise, cond):
+def dense_loop(network, sampler, noise, cond):
     sample = noise[:, 0]
-    for k, timestep in enumerate(scheduler.timesteps.tolist()):
+    for k, timestep in enumerate(sampler.timesteps.tolist()):
         noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
-        sample = scheduler.step(network(sample, timestep, cond), k, sample, noise_k)
+        sample = sampler.step(network(sample, timestep, cond), k, sample, noise_k)
     return sample
 
 
@@ -41,53 +40,51 @@ class TracingNetwork:
         return torch.zeros_like(x)
 
 
-def trace(scheduler, masks, reuse):
+def trace(sampler, masks, reuse):
     """What each block added, [B, K, 3L]."""
     recorder = FeatureRecorder()
     noise = torch.zeros(len(masks), NUM_STEPS, HORIZON, ACTION_DIM)
     cond = torch.zeros(len(masks), OBS_STEPS, COND_DIM)
-    denoise(TracingNetwork(), scheduler, noise, cond, masks, reuse=reuse, record=recorder)
+    denoise(TracingNetwork(), sampler, noise, cond, masks, reuse=reuse, record=recorder)
     return recorder.features()[..., 0, 0].permute(2, 1, 0)
 
 
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])
-def test_no_mask_and_an_all_false_mask_are_bit_exactly_dense(network, scheduler, query, reuse):
-    expected = dense_loop(network, scheduler, *query)
+def test_no_mask_and_an_all_false_mask_are_bit_exactly_dense(network, sampler, query, reuse):
+    expected = dense_loop(network, sampler, *query)
     mask = torch.zeros(5, NUM_STEPS, NUM_BLOCKS, dtype=torch.bool)
-    assert torch.equal(denoise(network, scheduler, *query), expected)
-    assert torch.equal(denoise(network, scheduler, *query, mask, reuse=reuse), expected)
+    assert torch.equal(denoise(network, sampler, *query), expected)
+    assert torch.equal(denoise(network, sampler, *query, mask, reuse=reuse), expected)
 
 
-def test_pruning_changes_the_result(network, scheduler, query):
-    difference = denoise(network, scheduler, *query, random_mask(5)) - denoise(network, scheduler, *query)
+def test_pruning_changes_the_result(network, sampler, query):
+    difference = denoise(network, sampler, *query, random_mask(5)) - denoise(network, sampler, *query)
     assert (difference.abs().amax(dim=(1, 2)) > 1e-3).all()
 
 
-def assert_rows_equal_rows_alone(network, scheduler, noise, cond, reuse, tolerance):
+def assert_rows_equal_rows_alone(network, sampler, noise, cond, reuse, tolerance):
     masks = random_mask(5, rate=0.6)
     masks[1] = False
     masks[2, 1:] = True
-    together = denoise(network, scheduler, noise, cond, masks, reuse=reuse)
+    together = denoise(network, sampler, noise, cond, masks, reuse=reuse)
     for row in range(5):
         part = slice(row, row + 1)
-        alone = denoise(network, scheduler, noise[part], cond[part], masks[part], reuse=reuse)
+        alone = denoise(network, sampler, noise[part], cond[part], masks[part], reuse=reuse)
         torch.testing.assert_close(together[part], alone, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])
-def test_a_row_with_its_own_mask_equals_the_row_alone(network, scheduler, query, reuse):
+def test_a_row_with_its_own_mask_equals_the_row_alone(network, sampler, query, reuse):
     # Matrix products round by batch size, dense or not; the published initialisation does not amplify that.
     torch.manual_seed(0)
     initial = TransformerForDiffusion(**network.config).eval().requires_grad_(False)
-    assert_rows_equal_rows_alone(initial, scheduler, *query, reuse, tolerance=1e-6)
+    assert_rows_equal_rows_alone(initial, sampler, *query, reuse, tolerance=1e-6)
 
 
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])
-def test_float64_shows_that_a_row_differs_from_the_row_alone_by_rounding_only(
-    network, scheduler, query, reuse
-):
+def test_float64_shows_that_a_row_differs_from_the_row_alone_by_rounding_only(network, sampler, query, reuse):
     noise, cond = (tensor.double() for tensor in query)
-    assert_rows_equal_rows_alone(network.double(), scheduler, noise, cond, reuse, tolerance=1e-13)
+    assert_rows_equal_rows_alone(network.double(), sampler, noise, cond, reuse, tolerance=1e-13)
 
 
 def test_type_reuse_follows_a_hand_computed_zigzag(ddpm):

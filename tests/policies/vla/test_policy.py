@@ -9,12 +9,12 @@ from torchrl.envs.custom import ToyVLAEnv
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.flops import query_flops
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.flops import query_flops
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.pruning import TokenPruner
+from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.policies.vla.pruning import TokenPruner
-from torchrl_sparse.policies.vla.text import WordTokenizer
 
 
 def keep(batch, *rows):

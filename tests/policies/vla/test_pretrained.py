@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 

@@ -12,14 +12,14 @@ from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["Engine", "ReferenceEngine"]
 
 
 class Engine(Protocol):
-    """Runs queries of one network with one schedule; made by
+    """Runs queries of one network with one sampler; made by
     :func:`torchrl_sparse.blocks.engine.make_engine`.
 
     An engine answers for the weights that its network has when it is asked.
@@ -59,14 +59,14 @@ class ReferenceEngine:
 
     Args:
         network: the denoiser.
-        schedule: the sampler.
+        sampler: the sampler.
     """
 
     name = "reference"
     detail = "eager and differentiable"
 
-    def __init__(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> None:
-        self._network, self._schedule = network, schedule
+    def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
+        self._network, self._schedule = network, sampler
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"

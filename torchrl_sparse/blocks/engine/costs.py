@@ -13,7 +13,7 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, block_macs
 
 if TYPE_CHECKING:
     from torchrl_sparse.blocks.engine.base import Engine
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["BlockCost", "engine_block_costs", "folded_block_macs", "time_blocks"]
 

@@ -1,6 +1,6 @@
 """The eager baseline: a query as the published implementation of Diffusion Policy runs it.
 
-``torch.nn.TransformerDecoder`` and a diffusers scheduler that draws its own noise, step by step
+``torch.nn.TransformerDecoder`` and a diffusers sampler that draws its own noise, step by step
 (arXiv:2303.04137, ``DiffusionTransformerLowdimPolicy``). Speed-ups are quoted against it; nothing else uses
 it.
 """
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["EagerBaseline", "published_forward"]
 
@@ -31,36 +31,34 @@ def published_forward(
 
 
 class EagerBaseline:
-    """Denoises with the modules and the scheduler of the published implementation.
+    """Denoises with the modules and the sampler of the published implementation.
 
     Args:
         network: the denoiser, in eval mode.
-        schedule: the sampler.
+        sampler: the sampler.
         compiled: put :func:`published_forward` through ``torch.compile``.
 
     Raises:
         ValueError: for chosen timesteps, which diffusers' DDIM does not have.
 
     Examples:
-        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
-        >>> eager = EagerBaseline(network, NoiseSchedule("ddim", 10))
+        >>> eager = EagerBaseline(network, Sampler("ddim", 10))
         >>> eager.denoise(torch.randn(1, 4, 7), torch.randn(1, 2, 5)).shape
         torch.Size([1, 4, 7])
     """
 
-    def __init__(
-        self, network: TransformerForDiffusion, schedule: NoiseSchedule, *, compiled: bool = False
-    ) -> None:
-        if "timesteps" in schedule.config:
+    def __init__(self, network: TransformerForDiffusion, sampler: Sampler, *, compiled: bool = False) -> None:
+        if "timesteps" in sampler.config:
             raise ValueError(
-                f"eager baseline: diffusers has no sampler {schedule.name!r}, only evenly spaced timesteps"
+                f"eager baseline: diffusers has no sampler {sampler.name!r}, only evenly spaced timesteps"
             )
-        self._network, self._scheduler = network, schedule.scheduler
-        self._timesteps = schedule.timesteps
+        self._network, self._scheduler = network, sampler.sampler
+        self._timesteps = sampler.timesteps
         self._forward = torch.compile(published_forward) if compiled else published_forward
 
     @torch.no_grad()
@@ -80,7 +78,7 @@ class EagerBaseline:
             mask: bool [K, 3L], one for the whole batch, True = pruned, row 0 all False: blocks are skipped by
                 an ``if`` around each and reuse their own latest output, as caching methods are commonly
                 published. None runs the decoder.
-            generator: of the noise that the scheduler adds.
+            generator: of the noise that the sampler adds.
         """
         extra = {} if self._is_ddim() else {"generator": generator}
         computed = None if mask is None else (~mask).tolist()

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from torchrl_sparse.blocks.engine.base import Engine, ReferenceEngine
-from torchrl_sparse.blocks.engine.native import NativeEngine, native_supports
-from torchrl_sparse.blocks.engine.torch_engine import TorchEngine
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
+from torchrl_sparse.blocks.engine.torch.engine import TorchEngine
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["EngineName", "EngineSlot", "check_engine", "make_engine"]
 
@@ -23,8 +23,8 @@ def check_engine(name: str) -> None:
         raise ValueError(f"engine: expected one of {list(get_args(EngineName))}, got {name!r}")
 
 
-def make_engine(name: EngineName, network: TransformerForDiffusion, schedule: NoiseSchedule) -> Engine:
-    """The engine ``name`` for ``network`` and ``schedule``.
+def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
+    """The engine ``name`` for ``network`` and ``sampler``.
 
     ``"auto"`` takes the fastest that applies: native on a CPU where it was built, else torch.
 
@@ -32,24 +32,24 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, schedule: No
         ValueError: on an unknown name, or if ``"native"`` cannot run the network here; the message says why.
 
     Examples:
-        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
-        >>> make_engine("torch", network, NoiseSchedule("ddim", 10)).name
+        >>> make_engine("torch", network, Sampler("ddim", 10)).name
         'torch'
     """
     check_engine(name)
     if name == "reference":
-        return ReferenceEngine(network, schedule)
+        return ReferenceEngine(network, sampler)
     if name == "native" or (name == "auto" and native_supports(network)[0]):
-        return NativeEngine(network, schedule)
-    return TorchEngine(network, schedule)
+        return NativeEngine(network, sampler)
+    return TorchEngine(network, sampler)
 
 
 class EngineSlot:
-    """Holds the engine of a policy: made when it is first needed, and anew for another schedule or device.
+    """Holds the engine of a policy: made when it is first needed, and anew for another sampler or device.
 
     Copies and pickles carry the choice, not the engine.
 
@@ -65,23 +65,23 @@ class EngineSlot:
         self.name = name
         self._made: tuple[Any, Engine | None] = (None, None)
 
-    def get(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> Engine:
-        """The engine for ``network`` and ``schedule``.
+    def get(self, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
+        """The engine for ``network`` and ``sampler``.
 
         Raises:
             ValueError: if the chosen engine cannot run the network.
         """
         parameter = network.pos_emb
-        wanted = (network, schedule, parameter.device, parameter.dtype)
+        wanted = (network, sampler, parameter.device, parameter.dtype)
         made_for, engine = self._made  # read and replaced in one go: other threads may do the same
         if engine is None or made_for != wanted:
-            engine = make_engine(self.name, network, schedule)
+            engine = make_engine(self.name, network, sampler)
             self._made = wanted, engine
         return engine
 
-    def describe(self, network: TransformerForDiffusion, schedule: NoiseSchedule) -> str:
+    def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
         """Which engine runs and on what; if ``"auto"`` had to do without the native one, why."""
-        engine = self.get(network, schedule)
+        engine = self.get(network, sampler)
         text = f"{engine.name}: {engine.detail}"
         if self.name == "auto" and engine.name != "native":
             text += f" (not native: {native_supports(network)[1]})"

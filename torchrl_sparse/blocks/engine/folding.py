@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from torchrl_sparse.blocks.engine.linear import make_linear
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.blocks.engine.torch.linear import make_linear
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = [
     "ConditionEncoder",

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl_sparse.blocks.mask import Reuse, check_reuse, num_buffers, validate_mask
 
 if TYPE_CHECKING:
-    from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-    from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["ComputedRows", "FeatureRecorder", "check_query", "denoise"]
 
@@ -48,7 +48,7 @@ class FeatureRecorder:
 
 def denoise(
     network: TransformerForDiffusion,
-    scheduler: NoiseSchedule,
+    sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     mask: Tensor | None = None,
@@ -64,7 +64,7 @@ def denoise(
 
     Args:
         network: the denoiser; gradients flow through it, and to ``noise`` and ``cond``.
-        scheduler: the denoising steps, K of them.
+        sampler: the denoising steps, K of them.
         noise: f32 [B, K, H, A], standard normal; ``noise[:, 0]`` is the initial sample, ``noise[:, k]`` the
             gaussian of the transition from step k-1 to step k (not read by DDIM).
         cond: encoded observations f32 [B, To, D].
@@ -83,22 +83,22 @@ def denoise(
         ``reuse``.
 
     Examples:
-        >>> from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-        >>> from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
         >>> mask = torch.zeros(3, 10, 3, dtype=torch.bool)
         >>> mask[:, 1::2] = True
         >>> noise, cond = torch.randn(3, 10, 4, 7), torch.randn(3, 2, 5)
-        >>> denoise(network, NoiseSchedule("ddim", 10), noise, cond, mask).shape
+        >>> denoise(network, Sampler("ddim", 10), noise, cond, mask).shape
         torch.Size([3, 4, 7])
     """
-    check_query(network, scheduler, noise, cond, mask, reuse)
+    check_query(network, sampler, noise, cond, mask, reuse)
     computed = ComputedRows(mask)
     latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks)
     sample = noise[:, 0]
-    for step, timestep in enumerate(scheduler.timesteps.tolist()):
+    for step, timestep in enumerate(sampler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(network.num_blocks):
             slot = block % len(latest)
@@ -107,8 +107,8 @@ def denoise(
             x = x + output
             if record is not None:
                 record(step, block, output)
-        noise_k = noise[:, step + 1] if step + 1 < scheduler.num_inference_steps else None
-        sample = scheduler.step(network.head_out(x), step, sample, noise_k)
+        noise_k = noise[:, step + 1] if step + 1 < sampler.num_inference_steps else None
+        sample = sampler.step(network.head_out(x), step, sample, noise_k)
     return sample
 
 
@@ -147,7 +147,7 @@ class ComputedRows:
 
 def check_query(
     network: TransformerForDiffusion,
-    scheduler: NoiseSchedule,
+    sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     mask: Tensor | None = None,
@@ -158,7 +158,7 @@ def check_query(
     Raises:
         ValueError: naming what was expected and what came.
     """
-    num_steps, batch = scheduler.num_inference_steps, len(cond)
+    num_steps, batch = sampler.num_inference_steps, len(cond)
     for name, tensor, expected in (
         ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
         ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),

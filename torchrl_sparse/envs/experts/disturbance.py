@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchrl_sparse.envs.experts.operators import Operator
-from torchrl_sparse.envs.rotations import POSE_DIM
+from torchrl_sparse.rotations import POSE_DIM
 
 _MEMORY = 0.8  # autocorrelation of the noise from one step to the next
 _RAD_PER_M = 4.0  # 8 mm of position noise come with 0.03 rad of rotation noise

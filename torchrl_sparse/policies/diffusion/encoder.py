@@ -8,10 +8,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
-from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.noise import query_seed
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.policies.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.diffusion.noise import query_seed
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
 
 __all__ = ["ConditionEncoder", "ObservationEncoder"]
 

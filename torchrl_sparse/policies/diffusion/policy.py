@@ -22,15 +22,15 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import Reuse, query_flops
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
-from torchrl_sparse.data.normalize import Normalizer
-from torchrl_sparse.policies.checkpoints.diffusion_policy import read_diffusion_policy
-from torchrl_sparse.policies.checkpoints.pretrained import StoredPolicy, read_pretrained, write_pretrained
-from torchrl_sparse.policies.clock import synchronised_clock
+from torchrl_sparse.networks.diffusion.noise import sample_noise
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
-from torchrl_sparse.policies.diffusion.noise import sample_noise
-from torchrl_sparse.policies.diffusion.schedule import NoiseSchedule
-from torchrl_sparse.policies.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.policies.diffusion.vision import VisionEncoder
+from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
+from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
 
 class DiffusionPolicy(TensorDictSequential):
@@ -45,7 +45,7 @@ class DiffusionPolicy(TensorDictSequential):
         network: the denoiser.
         normalizer: of states and actions.
         vision: encoder of the cameras; their features come before the state in the network's condition.
-        schedule: sampler; DDPM with all training steps by default.
+        sampler: sampler; DDPM with all training steps by default.
         plan: what to skip; nothing by default.
         engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
             fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the
@@ -54,13 +54,13 @@ class DiffusionPolicy(TensorDictSequential):
 
     Attributes:
         plan: the planner. Assign another to change the method: ``policy.plan = planner``.
-        schedule: the sampler. Assign another to change it: ``policy.schedule = NoiseSchedule("ddim", 10)``.
+        sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
-        >>> policy.schedule = NoiseSchedule("ddim", 10)
+        >>> policy.sampler = Sampler("ddim", 10)
         >>> td = policy(TensorDict({"history": {"state": torch.zeros(4, 2, 19)}}, [4]))
         >>> td["vla_action", "chunk"].shape
         torch.Size([4, 9, 10])
@@ -72,16 +72,16 @@ class DiffusionPolicy(TensorDictSequential):
         normalizer: Normalizer,
         *,
         vision: VisionEncoder | None = None,
-        schedule: NoiseSchedule | None = None,
+        sampler: Sampler | None = None,
         plan: Planner | None = None,
         engine: EngineName = "auto",
     ):
-        schedule = NoiseSchedule() if schedule is None else schedule
+        sampler = Sampler() if sampler is None else sampler
         plan = Dense() if plan is None else plan
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
             plan=plan,
-            denoise=ActionDenoiser(network, normalizer, schedule, engine),
+            denoise=ActionDenoiser(network, normalizer, sampler, engine),
         )
         super().__init__(stages)
         self.plan = plan  # binds it to this network and sampler
@@ -108,25 +108,23 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["plan"]
 
     @property
-    def schedule(self) -> NoiseSchedule:
-        return self.module["denoise"].schedule
+    def sampler(self) -> Sampler:
+        return self.module["denoise"].sampler
 
     def __setattr__(self, name: str, value: Any) -> None:
         # nn.Module registers any module that is assigned, so properties with setters never see it.
         if name == "plan":
-            self._install(value, self.schedule)
-        elif name == "schedule":
+            self._install(value, self.sampler)
+        elif name == "sampler":
             self._install(self.plan, value)
         else:
             super().__setattr__(name, value)
 
-    def _install(self, plan: Planner, schedule: NoiseSchedule) -> None:
+    def _install(self, plan: Planner, sampler: Sampler) -> None:
         """Changes planner and sampler together, or, if the planner cannot serve that sampler, neither."""
-        plan.bind(
-            PlanSpec(schedule.num_inference_steps, self.network.n_layer, self.fingerprint, schedule.name)
-        )
+        plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         denoiser = self.module["denoise"]
-        denoiser.schedule, denoiser.reuse = schedule, plan.reuse
+        denoiser.sampler, denoiser.reuse = sampler, plan.reuse
         self.module["plan"] = plan
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
@@ -136,7 +134,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def num_inference_steps(self) -> int:
         """Denoising steps K."""
-        return self.schedule.num_inference_steps
+        return self.sampler.num_inference_steps
 
     @property
     def num_blocks(self) -> int:
@@ -179,12 +177,12 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             ValueError: if the chosen engine cannot run this network here.
         """
-        return self.module["denoise"].engine.describe(self.network, self.schedule)
+        return self.module["denoise"].engine.describe(self.network, self.sampler)
 
     def block_costs(self) -> dict[str, BlockCost]:
         """Seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
         slot = self.module["denoise"].engine
-        return engine_block_costs(slot.get(self.network, self.schedule), self.network)
+        return engine_block_costs(slot.get(self.network, self.sampler), self.network)
 
     # -- running it ----------------------------------------------------------------------------------------------------
 
@@ -209,7 +207,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Writes ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
-        stored = StoredPolicy(self.network, self.normalizer, self.schedule, self.vision, self.source)
+        stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source)
         write_pretrained(Path(path), stored, half=half)
 
     @classmethod
@@ -223,7 +221,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Reads a ``.ckpt`` of the published code (`torchrl_sparse.policies.checkpoints.diffusion_policy`).
+        """Reads a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
 
         The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
         what the policy was trained for. Nothing in the file is executed.
@@ -242,7 +240,7 @@ class DiffusionPolicy(TensorDictSequential):
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
         policy = cls(
-            stored.network, stored.normalizer, vision=stored.vision, schedule=stored.schedule, engine=engine
+            stored.network, stored.normalizer, vision=stored.vision, sampler=stored.sampler, engine=engine
         )
         policy.source = stored.source
         return policy
@@ -258,13 +256,13 @@ class ActionDenoiser(TensorDictModuleBase):
         self,
         network: TransformerForDiffusion,
         normalizer: Normalizer,
-        schedule: NoiseSchedule,
+        sampler: Sampler,
         engine: EngineName,
     ):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
-        self.schedule = schedule
+        self.sampler = sampler
         self.reuse = "block"
         self.engine = EngineSlot(engine)
 
@@ -273,7 +271,7 @@ class ActionDenoiser(TensorDictModuleBase):
         cond = tensordict.get(keys.COND).flatten(0, -3) if batch else tensordict.get(keys.COND)[None]
         mask = tensordict.get(keys.PRUNE_MASK).reshape(cond.shape[0], -1, self.network.num_blocks)
         shape = (self.network.horizon, self.network.input_dim)
-        noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.schedule.num_inference_steps, shape)
+        noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
         actions = self.run(noise, cond, mask, self.reuse)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
@@ -282,5 +280,5 @@ class ActionDenoiser(TensorDictModuleBase):
     def run(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
         """Normalised actions [B, H, A], all that the network denoises."""
         if self.network.training or cond.requires_grad:
-            return denoise(self.network, self.schedule, noise, cond, mask, reuse=reuse)
-        return self.engine.get(self.network, self.schedule).denoise(noise, cond, mask, reuse)
+            return denoise(self.network, self.sampler, noise, cond, mask, reuse=reuse)
+        return self.engine.get(self.network, self.sampler).denoise(noise, cond, mask, reuse)

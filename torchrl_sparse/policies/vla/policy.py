@@ -11,17 +11,17 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.checkpoints.vla_pretrained import read_vla, write_vla
-from torchrl_sparse.policies.clock import synchronised_clock
-from torchrl_sparse.policies.vla.config import VLAConfig
-from torchrl_sparse.policies.vla.decoder import Decoded
-from torchrl_sparse.policies.vla.flops import query_flops
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.decoder import Decoded
+from torchrl_sparse.networks.vla.flops import query_flops
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.pruning import TokenPruner
+from torchrl_sparse.networks.vla.text import InstructionTokenizer, WordTokenizer
+from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
-from torchrl_sparse.policies.vla.network import VLANetwork
-from torchrl_sparse.policies.vla.normalize import QuantileNormalizer
-from torchrl_sparse.policies.vla.pruning import TokenPruner
-from torchrl_sparse.policies.vla.text import InstructionTokenizer, WordTokenizer
-from torchrl_sparse.policies.vla.vision import center_crop
+from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.storage.vla import read_vla, write_vla
 
 __all__ = ["VLAPolicy", "with_pruner"]
 
@@ -41,7 +41,7 @@ class VLAPolicy(VLAWrapperBase):
 
     Attributes:
         pruner: what drops visual tokens between the decoder's layers; None (dense) at first. Assign another to change the
-            method, see `torchrl_sparse.policies.vla.pruning`.
+            method, see `torchrl_sparse.networks.vla.pruning`.
 
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.

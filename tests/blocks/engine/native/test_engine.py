@@ -1,0 +1,328 @@
+"""The native engine against the reference, in double precision: same noise, same mask, same actions."""
+
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from torchrl_sparse.blocks.engine import denoise
+from torchrl_sparse.blocks.engine.native import engine as native
+from torchrl_sparse.blocks.engine.native import library
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
+from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, native_available
+from torchrl_sparse.blocks.engine.native.packing import pack_panels
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+
+AVAILABLE, REASON = native_available()
+pytestmark = pytest.mark.skipif(not AVAILABLE, reason=REASON)
+SETS = REASON.split(", ") if AVAILABLE else []
+
+SHAPES = {
+    "lift": {"horizon": 10, "n_obs_steps": 2, "cond_dim": 19, "n_layer": 2, "n_emb": 64},
+    "block push": {"horizon": 5, "n_obs_steps": 3, "cond_dim": 16, "n_layer": 2, "n_emb": 64},
+    "kitchen": {"horizon": 16, "n_obs_steps": 4, "cond_dim": 60, "n_layer": 1, "n_emb": 96},
+    "no multiple of a vector": {"horizon": 7, "n_obs_steps": 2, "cond_dim": 3, "n_layer": 2, "n_emb": 42, "n_head": 3},
+    "more than one part": {"horizon": 3, "n_obs_steps": 1, "cond_dim": 300, "n_layer": 1, "n_emb": 132, "n_head": 2},
+    "more rows than registers": {"horizon": 37, "n_obs_steps": 2, "cond_dim": 3, "n_layer": 1, "n_emb": 32},
+    "more observations than actions": {"horizon": 2, "n_obs_steps": 9, "cond_dim": 3, "n_layer": 3, "n_emb": 16},
+    "one of each": {"horizon": 1, "n_obs_steps": 1, "cond_dim": 1, "n_layer": 1, "n_emb": 8, "n_head": 1},
+    "not causal": {"horizon": 6, "n_obs_steps": 3, "cond_dim": 5, "n_layer": 2, "n_emb": 32, "causal_attn": False},
+}  # fmt: skip
+
+
+def make_network(shape="lift", action_dim=7, std=0.08, **changes):
+    torch.manual_seed(0)
+    sizes = {"input_dim": action_dim, "output_dim": action_dim} | SHAPES[shape] | changes
+    network = TransformerForDiffusion(**sizes)
+    for name, parameter in network.named_parameters():
+        torch.nn.init.normal_(parameter, mean=1.0 if "norm" in name and "weight" in name else 0.0, std=std)
+    return network.eval().requires_grad_(False)
+
+
+def make_query(network, sampler, batch=2, rate=0.7, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    steps = sampler.num_inference_steps
+    noise = torch.randn(batch, steps, network.horizon, network.input_dim, generator=generator)
+    cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)
+    mask = torch.rand(batch, steps, network.num_blocks, generator=generator) < rate
+    mask[:, 0] = False
+    return noise, cond, mask
+
+
+def exact(network, sampler, noise, cond, mask=None, reuse="block"):
+    network.double()
+    actions = denoise(network, sampler, noise.double(), cond.double(), mask, reuse=reuse)
+    network.float()
+    return actions.float()
+
+
+@pytest.mark.parametrize("instruction_set", SETS)
+@pytest.mark.parametrize(("kind", "steps"), [("ddpm", 12), ("ddim", 10), ("ddpm", 1)])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_equals_the_reference_for_random_masks(shape, kind, steps, instruction_set):
+    network, sampler = make_network(shape), Sampler(kind, steps)
+    engine = NativeEngine(network, sampler, instruction_set=instruction_set)
+    noise, cond, mask = make_query(network, sampler)
+    for masks, reuse in ((None, "block"), (mask, "block"), (mask, "type"), (mask, "single")):
+        expected = exact(network, sampler, noise, cond, masks, reuse)
+        assert (engine.denoise(noise, cond, masks, reuse) - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_property_any_rate_and_rule(seed):
+    generator = torch.Generator().manual_seed(seed)
+    rate = torch.rand((), generator=generator).item() ** 0.3
+    kind, reuse = ("ddpm", "ddim")[seed % 2], ("block", "type", "single")[seed // 2 % 3]
+    shape = list(SHAPES)[torch.randint(len(SHAPES), (), generator=generator)]
+    network, sampler = make_network(shape, action_dim=1 + seed), Sampler(kind, 9)
+    noise, cond, mask = make_query(network, sampler, batch=3, rate=rate, seed=seed)
+    expected = exact(network, sampler, noise, cond, mask, reuse)
+    actual = NativeEngine(network, sampler).denoise(noise, cond, mask, reuse)
+    assert (actual - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("timesteps", [[90, 50, 49, 10], [7], [99, 0]])
+def test_chosen_timesteps(timesteps):
+    network, sampler = make_network(), Sampler("ddim", timesteps=timesteps)
+    noise, cond, mask = make_query(network, sampler)
+    actual = NativeEngine(network, sampler).denoise(noise, cond, mask)
+    assert (actual - exact(network, sampler, noise, cond, mask)).abs().max() < 1e-5
+
+
+def test_published_sizes_over_the_whole_chain():
+    network, sampler = make_network(n_layer=8, n_emb=256, std=0.03), Sampler("ddpm", 100)
+    noise, cond, mask = make_query(network, sampler, batch=1, rate=0.91)
+    engine = NativeEngine(network, sampler)
+    expected = denoise(network, sampler, noise, cond, mask)
+    assert (engine.denoise(noise, cond, mask) - expected).abs().max() < 1e-5
+
+
+def test_all_but_the_first_step_pruned():
+    network, sampler = make_network(), Sampler("ddpm", 8)
+    noise, cond, mask = make_query(network, sampler, rate=1.1)
+    for reuse in ("block", "type", "single"):
+        expected = exact(network, sampler, noise, cond, mask, reuse)
+        assert (
+            NativeEngine(network, sampler).denoise(noise, cond, mask, reuse) - expected
+        ).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("instruction_set", SETS)
+def test_half_precision_weights_are_those_of_a_network_rounded_to_half(instruction_set):
+    """Exactly that: what is stored is what is computed with, so only the folded weights differ."""
+    network, sampler = make_network(), Sampler("ddim", 5)
+    noise, cond, mask = make_query(network, sampler)
+    engine = NativeEngine(network, sampler, weights="float16", instruction_set=instruction_set)
+    error = (engine.denoise(noise, cond, mask) - exact(network, sampler, noise, cond, mask)).abs().max()
+    assert 0 < error < 2e-2
+    for parameter in network.parameters():
+        parameter.copy_(parameter.half())
+    for (
+        layer
+    ) in network.decoder.layers:  # with neutral norms and a head size of 16, folding keeps f16 numbers
+        for norm in (layer.norm1, layer.norm2, layer.norm3):
+            norm.weight.fill_(1)
+    expected = exact(network, sampler, noise, cond, mask)
+    assert (engine.denoise(noise, cond, mask) - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("instruction_set", SETS)
+@pytest.mark.parametrize("shape", ["lift", "kitchen", "more rows than registers", "no multiple of a vector"])
+def test_bfloat16_rounds_and_nothing_else(shape, instruction_set):
+    """Half an ulp of bfloat16 is 0.2 %; pairs in the wrong order or a lost input would change results by their size."""
+    network, sampler = make_network(shape), Sampler("ddpm", 10)
+    noise, cond, mask = make_query(network, sampler)
+    engine = NativeEngine(network, sampler, weights="bfloat16", instruction_set=instruction_set)
+    actions, expected = engine.denoise(noise, cond, mask), exact(network, sampler, noise, cond, mask)
+    assert 0 < (actions - expected).abs().max() < 2e-2
+    portable = NativeEngine(network, sampler, weights="bfloat16", instruction_set="portable")
+    assert (actions - portable.denoise(noise, cond, mask)).abs().max() < 2e-2
+
+
+@pytest.mark.parametrize("weights", ["float32", "float16", "bfloat16"])
+def test_a_row_of_a_batch_is_bit_identical_to_the_row_alone_and_threads_change_nothing(weights):
+    network, sampler = make_network(), Sampler("ddpm", 10)
+    noise, cond, mask = make_query(network, sampler, batch=5)
+    together = NativeEngine(network, sampler, weights=weights, threads=1).denoise(noise, cond, mask)
+    for threads in (2, 3, 9):
+        engine = NativeEngine(network, sampler, weights=weights, threads=threads)
+        assert torch.equal(together, engine.denoise(noise, cond, mask))
+    engine = NativeEngine(network, sampler, weights=weights)
+    for row in range(5):
+        one = slice(row, row + 1)
+        assert torch.equal(together[one], engine.denoise(noise[one], cond[one], mask[one]))
+
+
+def test_runs_are_identical_also_when_threads_share_an_engine():
+    network, sampler = make_network(), Sampler("ddpm", 30)
+    engine, query = NativeEngine(network, sampler), make_query(network, sampler)
+    expected = engine.denoise(*query)
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda _: engine.denoise(*query), range(24)))
+    assert all(torch.equal(result, expected) for result in results)
+
+
+def test_an_all_false_mask_is_bit_exactly_dense():
+    network, sampler = make_network(), Sampler("ddpm", 10)
+    noise, cond, mask = make_query(network, sampler)
+    engine = NativeEngine(network, sampler)
+    assert torch.equal(engine.denoise(noise, cond), engine.denoise(noise, cond, torch.zeros_like(mask)))
+
+
+def test_inputs_need_not_be_contiguous_and_are_left_alone():
+    network, sampler = make_network(), Sampler("ddpm", 6)
+    noise, cond, mask = make_query(network, sampler)
+    copies = noise.clone(), cond.clone(), mask.clone()
+    engine = NativeEngine(network, sampler)
+    expected = engine.denoise(noise, cond, mask)
+    turned = [tensor.transpose(1, 2).contiguous().transpose(1, 2) for tensor in (noise, cond, mask)]
+    assert torch.equal(engine.denoise(*turned), expected)
+    assert all(torch.equal(*pair) for pair in zip((noise, cond, mask), copies, strict=True))
+
+
+def an_element(parameter):
+    parameter.view(-1)[-1] += 0.5
+
+
+def in_place_of_data(parameter):
+    parameter.data.mul_(1.5)
+
+
+def exchange(parameter):
+    parameter.data = parameter.data * 1.5
+
+
+@pytest.mark.parametrize("change", [an_element, in_place_of_data, exchange])
+def test_a_change_of_any_parameter_is_noticed(change):
+    network, sampler = make_network("one of each"), Sampler("ddim", 3)
+    noise, cond, _ = make_query(network, sampler)
+    engine = NativeEngine(network, sampler)
+    for name, parameter in network.named_parameters():
+        change(parameter)
+        expected = NativeEngine(network, sampler).denoise(noise, cond)
+        assert torch.equal(engine.denoise(noise, cond), expected), name
+    assert (expected - exact(network, sampler, noise, cond)).abs().max() < 1e-5
+
+
+def test_weights_that_were_moved_to_another_device_are_not_read():
+    engine = NativeEngine(make_network("one of each"), Sampler("ddim", 3))
+    with pytest.raises(ValueError, match="it runs on the CPU, the network was moved to meta"):
+        engine._watch.locate([torch.empty(3), torch.empty(3, device="meta")])
+
+
+def test_weights_that_stay_are_not_packed_again(monkeypatch):
+    network, sampler = make_network("one of each"), Sampler("ddim", 3)
+    noise, cond, _ = make_query(network, sampler)
+    network.head.bias[0] = float("nan")  # equal to nothing, not even to itself
+    engine = NativeEngine(network, sampler)
+    monkeypatch.setattr(native, "PackedNetwork", None)
+    assert engine.denoise(noise, cond).isnan().any()
+
+
+def test_memory_of_a_query_in_inference_mode_serves_everything_after_it():
+    network, sampler = make_network("one of each"), Sampler("ddim", 3)
+    noise, cond, _ = make_query(network, sampler)
+    engine = NativeEngine(network, sampler)
+    with torch.inference_mode():
+        first = engine.denoise(noise, cond)
+    assert torch.equal(engine.denoise(noise, cond), first)
+    assert min(engine.block_seconds(2).values()) > 0
+
+
+def test_block_seconds_names_the_types():
+    engine = NativeEngine(make_network(), Sampler("ddim", 5))
+    seconds = engine.block_seconds(repeats=2)
+    assert list(seconds) == ["SA", "CA", "FFN"]
+    assert all(value > 0 for value in seconds.values())
+
+
+def test_wrong_inputs_are_named():
+    network, sampler = make_network(), Sampler("ddpm", 6)
+    noise, cond, mask = make_query(network, sampler)
+    engine = NativeEngine(network, sampler)
+    with pytest.raises(ValueError, match=r"noise: expected shape \[2, 6, 10, 7\], got \[2, 5, 10, 7\]"):
+        engine.denoise(noise[:, :5], cond)
+    with pytest.raises(ValueError, match=r"cond: expected torch\.float32 on the CPU, got torch\.float64"):
+        engine.denoise(noise, cond.double())
+    with pytest.raises(ValueError, match="prune mask: expected shape"):
+        engine.denoise(noise, cond, mask[..., :3])
+    with pytest.raises(ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\]"):
+        engine.denoise(noise, cond, mask, "layer")
+    network.train()
+    with pytest.raises(ValueError, match="expected eval mode"):
+        engine.denoise(noise, cond)
+
+
+def test_what_it_cannot_run_is_refused_with_the_reason():
+    sampler = Sampler("ddim", 5)
+    assert native_supports(make_network()) == (True, "")
+    for network, reason in (
+        (make_network(n_cond_layers=1), "needs n_cond_layers = 0, the network has 1"),
+        (make_network(output_dim=3), "needs output_dim = input_dim, got 3 and 7"),
+        (make_network().double(), "reads float32 weights"),
+        (make_network(n_obs_steps=64), "needs n_obs_steps <= 63, the network has 64"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            NativeEngine(network, sampler)
+    with pytest.raises(ValueError, match=r"weights: expected one of .*'bfloat16'\], got 'int8'"):
+        NativeEngine(make_network(), sampler, weights="int8")
+    with pytest.raises(ValueError, match="instruction_set: expected one of"):
+        NativeEngine(make_network(), sampler, instruction_set="mmx")
+    with pytest.raises(ValueError, match="threads: expected at least 1"):
+        NativeEngine(make_network(), sampler, threads=0)
+
+
+def test_weights_outside_the_range_of_half_precision_are_refused():
+    network = make_network()
+    network.decoder.layers[0].linear1.weight[0, 0] = 1e6
+    with pytest.raises(ValueError, match=r"range of torch\.float16"):
+        NativeEngine(network, Sampler("ddim", 5), weights="float16")
+
+
+def test_panels_hold_the_matrix():
+    weight = torch.randn(40, 300)
+    parts = [part.view(2, -1, 32) for part in pack_panels(weight).split([2 * 256 * 32, 2 * 44 * 32])]
+    panels = torch.cat(parts, dim=1)
+    assert torch.equal(panels.transpose(1, 2).reshape(64, 300)[:40], weight)
+    assert not panels[1, :, 8:].any()
+
+
+def test_panels_of_bfloat16_hold_pairs_of_inputs():
+    weight = torch.randn(32, 7).bfloat16()
+    pairs = (
+        pack_panels(weight.float(), torch.bfloat16)
+        .view(4, 32)
+        .contiguous()
+        .view(torch.bfloat16)
+        .view(4, 32, 2)
+    )
+    assert torch.equal(pairs.transpose(1, 2).reshape(8, 32)[:7], weight.T)
+    assert not pairs[3, :, 1].any()
+
+
+def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monkeypatch):
+    assert "was not built" in library._load(tmp_path)
+    suffix = library.importlib.machinery.EXTENSION_SUFFIXES[0]
+    (tmp_path / f"_native{suffix}").write_bytes(b"no library")
+    assert "cannot be loaded" in library._load(tmp_path)
+
+    monkeypatch.setattr(library, "_load", lambda _: "it was not built")
+    library.library.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="without its native engine: it was not built"):
+            assert native_available() == (False, "it was not built")
+        assert native_supports(make_network()) == (False, "it was not built")
+    finally:
+        library.library.cache_clear()
+
+
+def test_the_library_depends_on_nothing_but_the_c_runtime():
+    """No PyTorch, no Python: any version of them can load it."""
+    found = library.library()
+    assert isinstance(found, ctypes.CDLL)
+    with open(found._name, "rb") as file:
+        content = file.read()
+    assert not any(name in content for name in (b"libtorch", b"libc10", b"libpython"))
+    assert set(SETS) <= set(INSTRUCTION_SETS)

@@ -1,0 +1,99 @@
+"""The page holds everything, asks for nothing, and takes nothing that it reads for markup."""
+
+import json
+from html.parser import HTMLParser
+
+import pytest
+
+from tests.evaluation import synthetic
+from tests.evaluation.results.test_realtime import DENSE, FAST, build
+from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
+from torchrl_sparse.evaluation.results.realtime import save_realtime
+from torchrl_sparse.evaluation.results.report import save_results
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and whether every tag that is opened is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.text = [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in ("meta", "link", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture
+def runs(tmp_path):
+    root = tmp_path / "runs"
+    save_results(synthetic.make_results(20, names=("dense", "bac")), root / "lift" / "results.json")
+    save_realtime(build(dense=DENSE, bac=FAST), root / "moving" / "realtime.json")
+    figure, _ = make_figure(2, 2)
+    save_figure(figure, root / "lift" / "figures" / "schedule_bac.png")
+    (root / "lift" / "rollout_bac.mp4").write_bytes(b"a video")
+    return root
+
+
+def test_everything_is_in_one_file_that_asks_for_nothing(runs, tmp_path):
+    assert write_report(runs, tmp_path / "report.html") == {}
+    text = (tmp_path / "report.html").read_text()
+    page = Page(text)
+    assert page.open == []
+    sources = [
+        value for _, attributes in page.tags for key, value in attributes.items() if key in ("src", "href")
+    ]
+    assert len(sources) == 5  # icon, two figures that are drawn, a mask, a video
+    assert all(source.startswith("data:") for source in sources)
+    assert "http:" not in text
+    assert "https:" not in text
+    assert "url(" not in text
+    assert ("video", "data:video/mp4;base64,YSB2aWRlbw==") in [(tag, a.get("src")) for tag, a in page.tags]
+    for name in ("bac", "lift/results.json", "moving/realtime.json", "schedule bac", "rollout bac"):
+        assert name in page.text
+    assert not any(tag == "script" for tag, _ in page.tags)
+
+
+def test_names_are_text_and_never_markup(tmp_path):
+    evil = '<img src=x onerror=alert(1)>"&'
+    results = synthetic.make_results(20, names=("dense", "bac"))
+    results["task"], results["methods"][evil] = evil, results["methods"].pop("bac")
+    folder = tmp_path / "runs" / "<b>bold"
+    save_results(results, folder / "results.json")
+    (folder / "<i>.mp4").write_bytes(b"")
+    write_report(tmp_path / "runs", tmp_path / "report.html", title=evil)
+    page = Page((tmp_path / "report.html").read_text())
+    assert not {"b", "i"} & {tag for tag, _ in page.tags}
+    assert all(attributes["src"].startswith("data:") for tag, attributes in page.tags if tag == "img")
+    assert not any("onerror" in attributes for _, attributes in page.tags)
+    assert page.text.count(evil) >= 3
+
+
+def test_a_damaged_file_is_named_and_the_others_are_shown(runs, tmp_path):
+    (runs / "broken").mkdir()
+    (runs / "broken" / "results.json").write_text(json.dumps({"schema": 7}))
+    faults = write_report(runs, tmp_path / "report.html")
+    assert list(faults) == ["broken/results.json"]
+    text = (tmp_path / "report.html").read_text()
+    assert "schema: expected 1, got 7" in text
+    assert text.count("<table>") == 2
+
+
+def test_pictures_belong_to_the_nearest_run(runs, tmp_path):
+    save_results(synthetic.make_results(20, names=("dense",)), runs / "results.json")
+    write_report(runs, tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text().count("YSB2aWRlbw==") == 1
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"expected results.json or realtime.json"):
+        find_runs(tmp_path)

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from tests.evaluation.figures.test_plots import has_color, read
+from torchrl_sparse.evaluation.figures.tokens import (
+    _QUERY,
+    draw_tokens,
+    plot_control,
+    plot_token_strip,
+    plot_tokens_per_layer,
+)
+
+IMAGES = np.random.default_rng(0).integers(0, 256, (2, 3, 24, 24), np.uint8)
+
+
+def test_tokens_that_were_kept_look_as_they_are_and_others_are_darkened_in_their_place():
+    depth = np.full(32, 6)
+    depth[[5, 16 + 11]] = (
+        0,
+        3,
+    )  # second row, second column of the first camera; third row, last column of the other
+    picture = draw_tokens(IMAGES, depth, num_layers=6)
+    original = np.concatenate(np.moveaxis(IMAGES, 1, -1), axis=1)
+    changed = (picture != original).any(-1)
+    expected = np.zeros((24, 48), bool)
+    expected[6:12, 6:12] = expected[12:18, 42:48] = True
+    assert not changed[~expected].any()
+    assert changed[expected].mean() > 0.9
+    dark, half = picture[6:12, 6:12].mean(), picture[12:18, 42:48].mean()
+    assert dark < half < original.mean()
+
+
+def test_pictures_are_scaled_by_whole_pixels():
+    picture = draw_tokens(IMAGES, np.full(32, 6), num_layers=6, scale=3)
+    assert np.array_equal(picture[::3, ::3], draw_tokens(IMAGES, np.full(32, 6), num_layers=6))
+    assert picture.shape == (72, 144, 3)
+
+
+@pytest.mark.parametrize("tokens", [31, 18, 50])
+def test_tokens_that_do_not_fit_the_images_are_named(tokens):
+    if tokens == 18:
+        assert draw_tokens(IMAGES, np.ones(18), 1).shape == (24, 48, 3)  # 3 x 3 divide 24
+    else:
+        with pytest.raises(ValueError, match=f"2 images of 24 x 24 that divides them, got {tokens} tokens"):
+            draw_tokens(IMAGES, np.ones(tokens), 1)
+
+
+def test_strip(tmp_path):
+    pictures = [draw_tokens(IMAGES, np.arange(32) % 7, 6, scale=4)] * 5
+    path = plot_token_strip(pictures, [f"step {8 * i}" for i in range(5)], tmp_path / "strip.png")
+    assert read(path).shape[1] == 900
+    with pytest.raises(ValueError, match="a label for each, got 5 and 1"):
+        plot_token_strip(pictures, ["one"], tmp_path / "strip.png")
+
+
+def test_control_timeline_shows_fine_mode_only_where_there_is_some(tmp_path):
+    steps = np.arange(40)
+    speed, fine, queried = np.exp(-steps / 9), steps > 25, steps % 8 == 0
+    kept = np.where(fine, 40.0, 20.0)
+    read(plot_control(speed, fine, queried, tmp_path / "a.png", kept=kept))
+    with_fine, without = (
+        read(plot_control(speed, mode, queried, tmp_path / "b.png")) for mode in (fine, ~fine & fine)
+    )
+    assert has_color(with_fine, _QUERY)
+    yellow = [
+        (np.ptp(pixels.astype(int), axis=-1) > 30) & (pixels[..., 2] < 215) for pixels in (with_fine, without)
+    ]
+    assert yellow[0].sum() > yellow[1].sum() + 5000
+    with pytest.raises(ValueError, match="kept: expected 40 steps like speed, got 3"):
+        plot_control(speed, fine, queried, tmp_path / "c.png", kept=kept[:3])
+
+
+def test_tokens_per_layer(tmp_path):
+    depth = {"dense": np.full((3, 32), 8), "pruned": np.tile(np.arange(32) % 8 + 1, (3, 1))}
+    read(plot_tokens_per_layer(depth, 8, tmp_path / "layers.png"))
+    with pytest.raises(ValueError, match=r"at least one method, got \{'none': \[0, 32\]\}"):
+        plot_tokens_per_layer({"none": np.zeros((0, 32))}, 8, tmp_path / "layers.png")

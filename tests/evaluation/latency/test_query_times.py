@@ -1,0 +1,50 @@
+"""Timing recorded queries: each is asked, of every method, and of its time the planner's part is told apart."""
+
+import time
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, TransformerForDiffusion, keys
+from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.evaluation.rollouts.methods import time_planning, time_queries
+
+QUERIES = TensorDict({"history": {"state": torch.arange(3.0).view(3, 1, 1).expand(3, 2, 5).clone()}}, [3])
+
+
+class Slow(Planner):
+    """Sleeps, and notes what it was asked."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def masks(self, cond):
+        self.asked.append(cond[0, 0, 0].item())
+        time.sleep(0.02)
+        return torch.zeros(len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool)
+
+
+@pytest.fixture
+def policy():
+    sizes = {"input_dim": 4, "output_dim": 4, "horizon": 6, "n_obs_steps": 2, "cond_dim": 5}
+    network = TransformerForDiffusion(**sizes, n_layer=1, n_emb=16)
+    normalizer = Normalizer(torch.ones(5), torch.zeros(5), torch.ones(4), torch.zeros(4))
+    return DiffusionPolicy(network, normalizer, sampler=Sampler("ddim", 2), plan=Slow())
+
+
+def test_every_round_asks_all_methods_the_next_query(policy):
+    twin = DiffusionPolicy(policy.network, policy.normalizer, sampler=policy.sampler, plan=Slow())
+    latency = time_queries({"a": policy, "b": twin}, QUERIES, repeats=4, threads=1)
+    # After three rounds to warm up.
+    assert policy.plan.asked == twin.plan.asked == [0, 1, 2, 0, 1, 2, 0]
+    assert latency["a"].n == latency["b"].n == 4
+
+
+def test_the_planner_is_timed_within_its_queries(policy):
+    latency = time_planning({"slow": policy}, QUERIES, threads=1)["slow"]
+    assert policy.plan.asked == [0, 0, 1, 2]  # once to warm up
+    assert latency.n == 3
+    assert latency.p50 >= 0.02
+    assert keys.PRUNE_MASK not in QUERIES.keys(include_nested=True)

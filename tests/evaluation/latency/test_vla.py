@@ -1,0 +1,121 @@
+"""The latency benchmark of vision-language-action models at toy size: what it runs, what it writes, what it draws."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+pytest.importorskip("transformers")
+
+from torchrl_sparse import keys
+from torchrl_sparse.evaluation.latency.vla_cases import SHAPES, VLACase, make_policy
+from torchrl_sparse.evaluation.results.vla_report import measure_vla
+from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops
+from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
+
+RECIPE = Path(__file__).parents[3] / "recipes" / "profile_vla.py"
+SPEC = SHAPES["toy"].visual_spec
+
+
+@pytest.fixture(scope="module")
+def case():
+    pruners = {
+        "dense": None,
+        "specprune": SpecPrune(),
+        "fastv": FastVPruner(),
+        "frames": FrameDifferencePruner(),
+    }
+    with torch.no_grad():
+        return VLACase(make_policy("toy"), pruners)
+
+
+def test_the_reduced_shape_has_the_published_tokens_and_about_the_published_share_of_the_decoder():
+    reduced, published = SHAPES["reduced"], SHAPES["published"]
+    assert (reduced.num_visual, reduced.num_slots) == (published.num_visual, published.num_slots) == (512, 56)
+    shares = []
+    for config in (reduced, published):
+        decoder = decoder_flops(config, torch.full((config.llm.layers,), 605)).item()
+        shares.append(decoder / (decoder + sum(fixed_flops(config).values())))
+    assert shares[0] == pytest.approx(shares[1], abs=0.03)
+
+
+@torch.no_grad()
+def test_every_method_answers_the_second_query_with_what_it_remembers_of_the_first(case):
+    for name in case.policies:
+        assert torch.equal(
+            case.answer(name)[keys.CHUNK], case.answer(name)[keys.CHUNK]
+        )  # nothing is left behind
+    assert case.answer("dense")[keys.KEPT].item() == SPEC.num_visual
+    assert case.answer("frames")[keys.KEPT].item() == SPEC.num_visual / 2  # a first query would keep all
+    depth = case.answer("specprune")[keys.TOKEN_DEPTH][0]
+    assert SPEC.num_visual > (depth > 2).sum() > (depth == SPEC.num_layers).sum() > 0
+
+
+@torch.no_grad()
+def test_replayed_helpers_do_what_the_query_did(case):
+    watch = case.watch("specprune")
+    scored = case.policies["specprune"].pruner.layers_scored(SPEC.num_layers)
+    assert [state.layer for state, _ in watch.scored] == sorted(scored)
+    lengths = [state.hidden.shape[1] for state, _ in watch.answered]
+    assert lengths[0] == lengths[1] == case.sequence().hidden.shape[1]
+    assert lengths[-1] < lengths[2] < lengths[1]
+    keeps = [keep for _, keep in watch.answered]
+    watch.choose()  # and the answers are the same again
+    again = case.watch("specprune")
+    for one, (_, other) in zip(keeps, again.answered, strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or torch.equal(one, other)
+    assert set(case.helpers("specprune")) == {"choosing", "comparing", "scoring", "gathering"}
+    assert set(case.helpers("fastv")) == {"choosing", "scoring", "gathering"}
+    assert set(case.helpers("frames")) == {"choosing", "comparing"}
+
+
+def test_numbers_are_those_of_the_medians(case):
+    with torch.no_grad():
+        results = measure_vla(case, repeats=3, warmup=0)
+    parts, methods = results["parts"], results["methods"]
+    assert sum(part["p50_s"] for part in parts.values()) >= methods["dense"]["p50_s"] * 0.999
+    assert (
+        methods["dense"]["speedup"] == methods["dense"]["flops_speedup"] == methods["dense"]["realised"] == 1
+    )
+    assert methods["dense"]["helper_share"] == 0
+    for name, row in methods.items():
+        assert row["speedup"] == pytest.approx(methods["dense"]["p50_s"] / row["p50_s"])
+        assert row["flops_speedup"] == pytest.approx(methods["dense"]["flops"] / row["flops"])
+        assert row["realised"] == pytest.approx(row["speedup"] / row["flops_speedup"])
+        assert row["helper_share"] == pytest.approx(sum(part["share"] for part in row["helpers"].values()))
+        assert sum(row["tokens_per_layer"]) / len(row["tokens_per_layer"]) == pytest.approx(row["kept"])
+        assert (row["flops_speedup"] > 1) == (name != "dense")
+    # BOS, proprio and stop; the slots of two actions; the prompt, of which 17 words are the instruction's
+    assert results["shape"]["tokens"] == SPEC.num_visual + 3 + 14 + (9 + 17 + 4)
+
+
+def test_the_recipe_leaves_json_table_and_chart(tmp_path):
+    command = [
+        sys.executable,
+        str(RECIPE),
+        "shape=toy",
+        "repeats=1",
+        "warmup=0",
+        "alphas=[1]",
+        "shares=[0.5]",
+        f"out={tmp_path}",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-3000:]
+    results = json.loads((tmp_path / "vla_latency.json").read_text())
+    assert results["machine"]["threads"] == 1
+    assert results["shape"]["name"] == "toy"
+    assert list(results["methods"]) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
+    assert all(f"| {name} " in done.stdout for name in [*results["methods"], *results["parts"]])
+    assert iio.imread(tmp_path / "vla_latency.png").std() > 5
+
+
+def test_unknown_shapes_are_refused():
+    with pytest.raises(ValueError, match="shape: expected one of published, reduced, toy, got 'huge'"):
+        make_policy("huge")

@@ -1,0 +1,133 @@
+"""The benchmark of the engines at toy size: what it runs, what it writes, what it draws."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from tests.recipe_modules import RECIPES, load_recipe
+from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse.blocks.mask import prune_rate
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
+from torchrl_sparse.evaluation.latency.measure import measure_latency
+from torchrl_sparse.evaluation.results.engine_report import (
+    format_engine_table,
+    measure_bandwidth,
+    measure_multiply_adds,
+    shape_results,
+)
+
+RECIPE = RECIPES / "benchmark_engine.py"
+ASSETS = RECIPES.parent / "assets"
+ROW = {"p50_s", "p10_s", "p90_s", "n", "x_eager", "x_dense", "max_err", "limit_s", "f32_limit_s"}
+
+
+@pytest.fixture(scope="module")
+def case():
+    return EngineCase(make_network("low_dim", quick=True), batch=2, num_steps=20)
+
+
+def test_rows_of_a_batch_have_masks_of_their_own_at_the_rate_that_the_name_says(case):
+    masks = case.queries["random91"].mask
+    assert prune_rate(masks).tolist() == pytest.approx([0.91, 0.91], abs=0.005)
+    assert (masks[0] != masks[1]).any()
+    assert prune_rate(case.queries["ddim10-random50"].mask).tolist() == pytest.approx([0.5, 0.5], abs=0.01)
+    assert case.queries["all-pruned"].mask[:, 1:].all()
+    assert case.queries["ddim8"].schedule.num_inference_steps == 8
+
+
+def test_a_schedule_of_bac_can_be_given():
+    network = make_network("low_dim", quick=True)
+    mask = torch.zeros(20, network.num_blocks, dtype=torch.bool)
+    mask[1::2, 3] = True
+    case = EngineCase(network, batch=2, num_steps=20, bac_mask=mask)
+    assert torch.equal(case.queries["bac10"].mask, torch.stack([mask, mask]))
+
+
+def test_a_trained_policy_brings_its_schedule_which_no_other_may_use(tmp_path):
+    recipe = load_recipe("benchmark_engine")
+    network, mask = recipe.load_trained(ASSETS / "lift")
+    assert mask.shape == (100, network.num_blocks)
+    assert prune_rate(mask) > 0.8
+    shutil.copytree(ASSETS / "lift", tmp_path / "lift", ignore=shutil.ignore_patterns("*.mp4", "*.png"))
+    shutil.copy(ASSETS / "can" / "bac.json", tmp_path / "lift")
+    with pytest.raises(ValueError, match="made for policy fingerprint"):
+        recipe.load_trained(tmp_path / "lift")
+
+
+def test_every_variant_answers_its_query(case):
+    variants = case.variants()
+    assert {"eager dense", "eager ddim10", "reference dense", "torch dense", "torch random91"} <= set(
+        variants
+    )
+    assert ("native bac10" in variants) == native_available()[0]
+    for name, variant in variants.items():
+        error = (variant.call() - case.reference(variant.kind)).abs().max()
+        bound = {"native-fp16": 1e-2, "native-bf16": 1e-1}.get(name.split()[0], 1e-5)
+        assert error < bound, name
+
+
+def test_results_compare_with_eager_and_own_dense(case):
+    variants = case.variants()
+    latency = measure_latency({name: variant.call for name, variant in variants.items()}, repeats=3, warmup=1)
+    shape = shape_results(case, variants, latency, threads=1)
+    assert set(shape["rows"]) == set(variants)
+    for name, row in shape["rows"].items():
+        assert set(row) == ROW, name
+        assert row["p10_s"] <= row["p50_s"] <= row["p90_s"]
+        assert row["n"] == 3
+    dense, pruned = shape["rows"]["torch dense"], shape["rows"]["torch random91"]
+    assert pruned["x_dense"] == pytest.approx(dense["p50_s"] / pruned["p50_s"])
+    assert pruned["limit_s"] < dense["limit_s"]
+    # Two rows, of each of which all steps but the first are pruned by 91 % of all.
+    assert pruned["f32_limit_s"] / dense["f32_limit_s"] == pytest.approx(products(case) / (20 * 2), rel=1e-6)
+    native = shape["rows"].get("native-bf16 dense")
+    assert native is None or native["f32_limit_s"] is None
+    table = format_engine_table("toy", shape)
+    assert "| torch random91 |" in table
+    assert f"{1e6 * shape['all_pruned_step_s']['torch']:.1f} µs in torch" in table
+
+
+def products(case):
+    """Dense steps of one row that have as many products as the random masks of all rows leave: one FFN is two of SA."""
+    computed = (~case.queries["random91"].mask).sum(dim=(0, 1)).view(-1, 3).sum(dim=0)
+    return (computed[0] + 2 * computed[2]).item() / (3 * case.network.n_layer)
+
+
+def test_limits_are_rates_that_a_machine_can_have(case):
+    assert 1e8 < measure_bandwidth(case.network) < 1e12
+    assert 1e8 < measure_multiply_adds(size=256) < 1e13
+
+
+def test_an_unknown_shape_is_refused():
+    with pytest.raises(
+        ValueError, match=r"shape: expected one of \['low_dim', 'image', 'kitchen'\], got 'moon'"
+    ):
+        make_network("moon")
+
+
+def test_recipe_writes_results_and_charts(tmp_path):
+    options = (
+        "quick=true",
+        "cases=[{shape: low_dim, batch: 1}, {shape: kitchen, batch: 2}]",
+        f"out={tmp_path}",
+    )
+    done = subprocess.run(
+        [sys.executable, str(RECIPE), *options],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    results = json.loads((tmp_path / "engine.json").read_text())
+    assert results["schema"] == 1
+    assert list(results["shapes"]) == ["low_dim_b1", "kitchen_b2"]
+    assert "eager-ifs random91" in results["shapes"]["low_dim_b1"]["rows"]
+    for name in results["shapes"]:
+        assert iio.imread(tmp_path / f"engine_{name}.png").std() > 5
+        assert f"{name}: batch" in done.stdout

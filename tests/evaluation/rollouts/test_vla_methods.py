@@ -1,0 +1,171 @@
+"""The token pruners of a benchmark by name, matched in tokens, asked in mid-episode; and the recipe, rendered."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+pytest.importorskip("transformers")
+
+from tests.tokens.helpers import CONFIG, later, make_policy, query
+from torchrl_sparse import keys
+from torchrl_sparse.envs.rendering import GL_HINT
+from torchrl_sparse.evaluation import load_results
+from torchrl_sparse.evaluation.rollouts.vla_methods import (
+    TokenMethod,
+    answer,
+    matching_share,
+    mid_episode_query,
+    seen_images,
+)
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.text import WordTokenizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
+from torchrl_sparse.training.vla.token_budget import replay
+
+RECIPE = Path(__file__).parents[3] / "recipes" / "benchmark_vla.py"
+
+
+def episode(steps=5):
+    queries = [query(1)]
+    for step in range(1, steps):
+        queries.append(later(queries[-1], seed=step))
+    return [td[0] for td in queries]
+
+
+def test_names_make_pruners():
+    assert TokenMethod.parse("dense").pruner() is None
+    assert TokenMethod.parse("specprune@0.4").pruner().options.alpha == 0.4
+    assert not TokenMethod.parse("specprune_static").pruner().options.dynamic
+    gentle = (
+        TokenMethod.parse("specprune_static@0.4").pruner(options={"keep_share": 0.9, "dynamic": True}).options
+    )
+    assert (gentle.keep_share, gentle.dynamic, gentle.alpha) == (0.9, False, 0.4)
+    assert TokenMethod.parse("random@0.25").pruner().share == 0.25
+    assert TokenMethod.parse("fastv@specprune").pruner(0.125).share == 0.125
+    gates = [
+        TokenMethod.parse(name).executor(make_policy(), 2).gate for name in ("specprune", "specprune_static")
+    ]
+    assert gates[0] is not None
+    assert gates[1] is None
+
+
+@pytest.mark.parametrize(
+    "text", ["fastw", "dense@0.5", "fastv@", "fastv@-1", "sparsevlm@specprune", "specprune@fastv"]
+)
+def test_other_names_are_refused(text):
+    with pytest.raises(ValueError, match=f"methods: expected .*, got '{text}'"):
+        TokenMethod.parse(text)
+
+
+@pytest.mark.parametrize("make", [FastVPruner, RandomPruner])
+def test_a_matching_share_keeps_as_many_tokens(make):
+    policy, queries = make_policy(), episode()
+    target = replay(policy, queries, SpecPrune(alpha=0.2, budget=8))[keys.KEPT].mean().item()
+    share = matching_share(make, policy, [queries], target)
+    kept = [replay(policy, queries, make(s))[keys.KEPT].mean().item() for s in (share, share + 2**-9)]
+    assert kept[0] <= target <= kept[1] + 1e-4
+    assert target - kept[0] <= 1  # token
+
+
+def test_a_pruner_that_cannot_keep_so_few_is_refused():
+    with pytest.raises(ValueError, match=r"as few as 1.0 visual tokens, got at least \d"):
+        matching_share(FastVPruner, make_policy(), [episode(2)], 1.0)
+
+
+def test_a_query_in_mid_episode_remembers_those_before():
+    policy = make_policy(SpecPrune(alpha=0.2, budget=8))
+    queries = episode()
+    prepared = mid_episode_query(policy, queries)
+    before = set(prepared.keys(True))
+    expected = replay(policy, queries, policy.pruner)[2]
+    for _ in range(2):  # asking leaves the query as it is
+        answered = answer(policy, prepared)
+        assert torch.equal(answered[keys.CHUNK], expected[keys.CHUNK])
+        assert torch.equal(answered[keys.TOKEN_DEPTH], expected[keys.TOKEN_DEPTH])
+    assert set(prepared.keys(True)) == before
+
+
+def test_images_are_seen_as_the_network_crops_them():
+    policy, step = make_policy(), episode(1)[0]
+    whole = torch.stack([step[camera] for camera in CONFIG.cameras])
+    assert torch.equal(seen_images(policy, step), whole)
+    cropped = VLAPolicy(VLANetwork(VLAConfig.tiny(image_size=CONFIG.image_size, crop_area=0.5)))
+    assert seen_images(cropped, step).shape == whole.shape
+    assert not torch.equal(seen_images(cropped, step), whole)
+
+
+@pytest.fixture(scope="module")
+def policy_folder(tmp_path_factory):
+    torch.manual_seed(0)
+    sizes = {"state_dim": 9, "action_dim": 10, "chunk_size": 4, "llm": TransformerSize(32, 6, 2, 64)}
+    words = WordTokenizer(["lift", "the", "red", "green", "blue", "cube"])
+    policy = VLAPolicy(VLANetwork(VLAConfig.tiny(image_size=56, **sizes)), tokenizer=words)
+    policy.save_pretrained(tmp_path_factory.mktemp("vla") / "policy")
+    return tmp_path_factory.getbasetemp() / "vla0" / "policy"
+
+
+def run(policy, out, *options):
+    small = ["episodes=2", "horizon=8", "n_action_steps=2", "probe_episodes=1", "latency_repeats=2"]
+    command = [sys.executable, str(RECIPE), f"policy={policy}", f"out={out}", *small, *options]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+
+
+def read_episodes(log):
+    """Everything but the times, by seed."""
+    episodes = [json.loads(line) for line in log.read_text().splitlines()[1:]]
+    return {episode["seed"]: {k: v for k, v in episode.items() if k != "latency"} for episode in episodes}
+
+
+def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
+    methods = "methods=[specprune@0.2,fastv@specprune@0.2]"
+    done = run(
+        policy_folder,
+        tmp_path,
+        methods,
+        "pairs=[[specprune@0.2,fastv@specprune@0.2]]",
+        "videos=[specprune@0.2]",
+        "+specprune.keep_share=0.9",
+    )
+    if GL_HINT in done.stderr:
+        pytest.skip(GL_HINT)
+    assert done.returncode == 0, done.stderr[-3000:]
+    results = load_results(tmp_path / "results.json")["methods"]
+    assert list(results) == ["dense", "specprune@0.2", "fastv@specprune@0.2"]
+    kept = [method["tokens"]["kept_mean"] for method in results.values()]
+    assert kept[0] == 32
+    assert kept[1] < 32
+    assert abs(kept[2] - kept[1]) < 2
+    assert results["specprune@0.2"]["prune_rate"] == pytest.approx(1 - kept[1] / 32)
+    assert results["dense"]["action_error_vs_dense"] == {"mean": 0, "max": 0}
+    assert "| specprune@0.2 | fastv@specprune@0.2 |" in done.stdout
+    for picture in ("pareto", "tokens_per_layer", "strip_specprune@0.2", "control_specprune@0.2"):
+        assert iio.imread(tmp_path / f"{picture}.png").std() > 5
+    frames = iio.imread(tmp_path / "rollout_specprune@0.2.mp4")
+    assert frames[:8].std() > 5
+
+    log = tmp_path / "episodes" / "dense.jsonl"
+    found = read_episodes(log)
+    two = run(policy_folder, tmp_path / "two", "methods=[]", "pairs=[]", "videos=[]", "workers=2")
+    assert two.returncode == 0, two.stderr[-3000:]
+    assert read_episodes(tmp_path / "two/episodes/dense.jsonl") == found
+
+    first, *_, last = log.read_text().splitlines(keepends=True)
+    log.write_text(first + last)
+    again = run(policy_folder, tmp_path, methods, "pairs=[]", "videos=[]", "+specprune.keep_share=0.9")
+    assert again.returncode == 0, again.stderr[-3000:]
+    assert read_episodes(log) == found
+    assert sorted(found) == [100000, 100001]
+
+
+def test_a_reference_that_is_not_run_is_refused(policy_folder, tmp_path):
+    done = run(policy_folder, tmp_path, "methods=[fastv@specprune]")
+    assert "fastv@specprune: expected one of dense after @, got 'specprune'" in done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,1 @@
+from tests.fixtures.diffusion import demos, make_network  # noqa: F401

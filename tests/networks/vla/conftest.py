@@ -1,0 +1,1 @@
+from tests.fixtures.vla import config, network, policy, query  # noqa: F401

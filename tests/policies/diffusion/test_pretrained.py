@@ -1,0 +1,125 @@
+"""Policies on disk: round trips, and files that are wrong in many ways."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from tests.policies.diffusion.test_policy import request
+from torchrl_sparse import DiffusionPolicy, Sampler, keys
+
+
+@pytest.fixture
+def folder(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    return tmp_path
+
+
+def test_round_trip_at_half_precision(policy, folder):
+    loaded = DiffusionPolicy.from_pretrained(folder)
+    assert loaded.sampler.config == policy.sampler.config
+    assert loaded.network.config == policy.network.config
+    for name, value in policy.network.state_dict().items():
+        assert torch.equal(loaded.network.state_dict()[name], value.half().float())
+    assert torch.equal(loaded.normalizer.action_scale, policy.normalizer.action_scale)
+    loaded.save_pretrained(folder / "again")
+    again = DiffusionPolicy.from_pretrained(folder / "again")
+    assert torch.equal(again(request(2))[keys.CHUNK], loaded(request(2))[keys.CHUNK])
+
+
+def change_tensors(folder, change):
+    tensors = load_file(folder / "model.safetensors")
+    change(tensors)
+    save_file(tensors, folder / "model.safetensors")
+
+
+def change_config(folder, change):
+    config = json.loads((folder / "config.json").read_text())
+    change(config)
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+TENSOR_FAULTS = {
+    "missing": (lambda t: t.pop("network.head.bias"), r"missing \['head.bias'\]"),
+    "extra": (lambda t: t.update({"network.more": torch.zeros(1)}), r"unexpected \['more'\]"),
+    "foreign": (lambda t: t.update({"optimizer": torch.zeros(1)}), r"got \['optimizer'\]"),
+    "shape": (
+        lambda t: t.update({"network.head.bias": torch.zeros(9)}),
+        r"expected shape \(4,\), got \(9,\)",
+    ),
+    "nan": (lambda t: t.update({"network.head.bias": torch.full((4,), float("nan"))}), "finite"),
+    "normalizer": (lambda t: t.pop("normalizer.state_scale"), r"missing \['state_scale'\]"),
+}
+
+
+@pytest.mark.parametrize("fault", TENSOR_FAULTS)
+def test_wrong_tensors_are_named(folder, fault):
+    change, message = TENSOR_FAULTS[fault]
+    change_tensors(folder, change)
+    with pytest.raises(ValueError, match=f"model.safetensors.*{message}"):
+        DiffusionPolicy.from_pretrained(folder)
+
+
+CONFIG_FAULTS = {
+    "format": (
+        lambda c: c.update(format="other/1"),
+        "format: expected 'torchrl_sparse.diffusion_policy/1', got 'other/1'",
+    ),
+    "field": (lambda c: c.pop("schedule"), "expected the fields"),
+    "unknown argument": (lambda c: c["network"].update(n_experts=3), "n_experts"),
+    "size": (lambda c: c["network"].update(n_emb=30), "n_emb must be a multiple of n_head"),
+    "timesteps": (
+        lambda c: c["schedule"].update(kind="ddim", num_inference_steps=2, timesteps=[10, 90]),
+        r"config.json: sampler: timesteps: expected 2 .* got \[10, 90\]",
+    ),
+    "depth": (lambda c: c["network"].update(n_layer=3), "missing"),
+}
+
+
+@pytest.mark.parametrize("fault", CONFIG_FAULTS)
+def test_wrong_configs_are_named(folder, fault):
+    change, message = CONFIG_FAULTS[fault]
+    change_config(folder, change)
+    with pytest.raises(ValueError, match=message):
+        DiffusionPolicy.from_pretrained(folder)
+
+
+def test_chosen_timesteps_are_kept(policy, tmp_path):
+    policy.sampler = Sampler("ddim", timesteps=[90, 10])
+    policy.save_pretrained(tmp_path)
+    assert DiffusionPolicy.from_pretrained(tmp_path).sampler.name == "ddim_90_10"
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_truncated_and_missing_files_are_named(folder, name):
+    file = folder / name
+    file.write_bytes(file.read_bytes()[:60])
+    with pytest.raises(ValueError, match=f"{name}: expected a complete"):
+        DiffusionPolicy.from_pretrained(folder)
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match=name):
+        DiffusionPolicy.from_pretrained(folder)
+
+
+def test_a_pickle_in_place_of_the_weights_executes_nothing(folder, tmp_path):
+    class Attack:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "executed"), "w"))
+
+    torch.save(Attack(), folder / "model.safetensors")
+    with pytest.raises(ValueError, match="expected a complete safetensors file"):
+        DiffusionPolicy.from_pretrained(folder)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_failed_save_leaves_the_old_files(policy, folder, monkeypatch):
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("torchrl_sparse.storage.files.save_file", fail)
+    with pytest.raises(OSError, match="disk full"):
+        policy.save_pretrained(folder)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before

@@ -1,0 +1,53 @@
+"""The published tables follow from the published episodes, and those from the published policies and planners."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from torchrl_sparse.evaluation.results.report import load_results
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
+from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED, make_method, method_identity
+from torchrl_sparse.evaluation.statistics.intervals import paired_difference
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+ASSETS = Path(__file__).parents[1] / "assets"
+FOLDERS = sorted(path.parent for path in ASSETS.glob("*/episodes"))
+
+
+def identity(log: Path) -> dict:
+    with log.open(encoding="utf-8") as lines:
+        return json.loads(next(lines))["identity"]
+
+
+def outcomes(log: Path) -> dict[int, bool]:
+    return {seed: episode.success for seed, episode in EpisodeLog(log, identity(log)).episodes.items()}
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
+    policy = DiffusionPolicy.from_pretrained(folder)
+    for log in (folder / "episodes").glob("*.jsonl"):
+        method = make_method(log.stem, policy, num_updates=10, schedules=folder, calibration=pytest.fail)
+        published = identity(log)
+        assert published | method_identity(log.stem, method) == published, log
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_tables_count_the_episodes(folder):
+    logs = {log.stem: outcomes(log) for log in (folder / "episodes").glob("*.jsonl")}
+    tabled = set()
+    for path in sorted(folder.glob("results*.json")):
+        results = load_results(path)
+        for name in results["methods"].keys() & logs.keys():
+            entry = results["methods"][name]
+            first = EVALUATION_SEED + results["seed"]
+            seeds = range(first, first + entry["success"]["n"])
+            ours, dense = ([logs[method][seed] for seed in seeds] for method in (name, "dense"))
+            assert entry["success"]["k"] == sum(ours), (path, name)
+            if name != "dense":
+                difference = paired_difference(ours, dense, entry["paired_vs_dense"]["margin"])
+                assert entry["paired_vs_dense"]["diff"] == pytest.approx(difference.diff)
+                assert entry["paired_vs_dense"]["verdict"] == difference.verdict
+            tabled.add(name)
+    assert tabled == logs.keys()

@@ -1,0 +1,1 @@
+from tests.blocks.conftest import ddpm, network, query, sampler  # noqa: F401

@@ -1,0 +1,197 @@
+"""Picking SpecPrune's budget: replayed queries are those of a rollout, and the choice keeps what it promises."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import InitTracker, StepCounter, TransformedEnv
+from torchrl.envs.custom import ToyVLAEnv
+
+from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, later, make_policy, query
+from tests.training.vla.rendered import write_demos
+from torchrl_sparse import ChunkExecutor, keys
+from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.text import WordTokenizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.training.vla.token_budget import (
+    BudgetPoint,
+    TokenBudget,
+    demonstrated_queries,
+    measure_errors,
+    measure_success,
+    recorded_queries,
+    replay,
+    smallest_alpha,
+)
+from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
+
+RECIPE = Path(__file__).parents[3] / "recipes" / "calibrate_tokens.py"
+POINTS = (
+    BudgetPoint(0.2, 40, 0.05),
+    BudgetPoint(0.5, 70, 0.01),
+    BudgetPoint(0.7, 90, 0.03),
+    BudgetPoint(1.0, 99, 0.0),
+)
+
+
+def episode(steps=4):
+    """Queries of one episode, each []."""
+    queries = [query(1)]
+    for step in range(1, steps):
+        queries.append(later(queries[-1], seed=step))
+    return [td[0] for td in queries]
+
+
+def pruner(alpha):
+    return SpecPrune(alpha=alpha, budget=PER_CAMERA, dynamic=False)
+
+
+def test_replaying_is_what_a_rollout_does():
+    policy, queries = make_policy(), episode()
+    answers = replay(policy, queries, pruner(0.2))
+    worker, td = make_policy(pruner(0.2)), TensorDict({}, [])
+    for index, recorded in enumerate(queries):
+        td = worker(td.update(recorded))
+        for key in (keys.CHUNK, keys.KEPT, keys.TOKEN_DEPTH):
+            assert torch.equal(td[key], answers[key][index])
+    kept = answers[keys.KEPT]
+    assert kept[0] == CONFIG.num_visual > kept[1:].max()
+    assert policy.pruner is None
+    assert all(keys.TOKEN_SCORE not in recorded.keys(True) for recorded in queries)
+
+
+def test_errors_are_those_of_the_executed_actions_after_the_first_query():
+    policy, queries = make_policy(), episode()
+    tight, whole = measure_errors(
+        policy, [queries, queries[:1]], [pruner(0.2), pruner(1.0)], n_action_steps=1
+    )
+    answers = (replay(policy, queries, method)[keys.CHUNK] for method in (None, pruner(0.2)))
+    dense, pruned = (policy.normalizer.normalize_action(chunks)[1:, :1] for chunks in answers)
+    assert tight.loss == pytest.approx((pruned - dense).abs().mean().item())
+    assert tight.loss > 0 == whole.loss
+    assert tight.kept < whole.kept == CONFIG.num_visual
+    assert (tight.alpha, whole.alpha) == (0.2, 1.0)
+    with pytest.raises(ValueError, match=r"expected one with at least two queries, got \[1, 1\]"):
+        measure_errors(policy, [queries[:1]] * 2, [pruner(0.2)], n_action_steps=1)
+
+
+@pytest.mark.parametrize(("tolerance", "alpha"), [(0.0, 1.0), (0.02, 1.0), (0.03, 0.5), (0.05, 0.2)])
+def test_no_larger_alpha_may_lose_more_than_the_tolerance(tolerance, alpha):
+    """At 0.02, 0.5 would do, but 0.7 would not: that 0.5 does is luck."""
+    assert smallest_alpha(POINTS, tolerance) == alpha
+    assert smallest_alpha(POINTS[::-1], tolerance) == alpha
+
+
+def test_a_tolerance_that_none_keeps_is_refused():
+    with pytest.raises(ValueError, match=r"at most 0.02 at the largest alpha, got 0.2: 0.05, 0.7: 0.03"):
+        smallest_alpha([POINTS[0], POINTS[2]], 0.02)
+
+
+def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
+    budget = TokenBudget("release", 0.5, "action_error", 0.03, POINTS, {"keep_share": 0.95})
+    budget.save(tmp_path / "budget.json")
+    again = TokenBudget.load(tmp_path / "budget.json")
+    assert again == budget
+    assert again.pruner().options == SpecPrune("release", alpha=0.5, keep_share=0.95).options
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"preset": "mine"}, "preset: expected 'paper' or 'release', got 'mine'"),
+        ({"points": 3}, "expected a token budget with preset, alpha"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_wrong_files_are_named(tmp_path, change, message):
+    path = tmp_path / "budget.json"
+    TokenBudget("paper", 0.5, "action_error", 0.03, POINTS).save(path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(ValueError, match=message) as error:
+        TokenBudget.load(path)
+    assert str(path) in str(error.value)
+    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+        TokenBudget.load(tmp_path / "none.json")
+
+
+def test_queries_of_demonstrations_begin_with_each_episode():
+    data = {
+        camera: torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 3, 56, 56)
+        for camera in CONFIG.cameras
+    }
+    data |= {keys.STATE: torch.zeros(7, 8), keys.ACTION: torch.zeros(7, 7)}
+    episodes = Demonstrations(TensorDict(data, [7]), torch.tensor([0, 3, 7]))
+    found = [
+        *demonstrated_queries(make_policy(), InstructedDemonstrations(episodes, ["up", "down"]), every=2)
+    ]
+    assert [[int(td[keys.IMAGE][0, 0, 0]) for td in queries] for queries in found] == [[0, 2], [3, 5]]
+    assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False]] * 2
+    assert [queries[1][keys.INSTRUCTION] for queries in found] == ["up", "down"]
+    assert measure_errors(make_policy(), found, [pruner(0.2)], 1)[0].kept < CONFIG.num_visual
+
+
+def toy_env(seeds):
+    sizes = {"action_dim": 7, "state_dim": 14, "image_shape": (3, 28, 28), "success_steps": 9}
+    env = TransformedEnv(ToyVLAEnv(**sizes, device="cpu", seed=seeds[0]), InitTracker())
+    env.append_transform(StepCounter(5))
+    return env
+
+
+def toy_policy():
+    torch.manual_seed(0)
+    sizes = {"cameras": (keys.IMAGE,), "llm": TransformerSize(32, LAYERS, 2, 64), "state_dim": 14}
+    return VLAPolicy(VLANetwork(VLAConfig.tiny(**sizes)))
+
+
+def test_recorded_queries_are_those_that_the_executor_made():
+    policy = toy_policy()
+    found = [*recorded_queries(policy, ChunkExecutor(policy, 2), toy_env, [0, 1])]
+    assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False, False]] * 2
+    answers = replay(policy, found[0], None)
+    steps = toy_env([0]).rollout(9, ChunkExecutor(policy, 2))
+    assert torch.equal(answers[keys.CHUNK], steps[keys.CHUNK][steps[keys.QUERIED].squeeze(-1)])
+
+
+def test_success_is_compared_with_dense_on_the_same_seeds():
+    def make_actor(policy):
+        made.append(policy.pruner)
+        return ChunkExecutor(policy, 2)
+
+    made, pruners = [], [SpecPrune(alpha=0.25, budget=4), SpecPrune(budget=4)]
+    points = measure_success(toy_policy(), make_actor, toy_env, [0, 1], pruners)
+    assert made == [None, *pruners]
+    assert [(point.alpha, point.loss) for point in points] == [(0.25, 0), (1.0, 0)]  # none ever succeeds
+    assert points[0].kept < points[1].kept <= 4
+
+
+def test_the_recipe_calibrates_from_a_demonstration_file(tmp_path):
+    torch.manual_seed(0)
+    sizes = {"image_size": 56, "state_dim": 9, "action_dim": 10, "llm": TransformerSize(32, LAYERS, 2, 64)}
+    policy = VLAPolicy(VLANetwork(VLAConfig.tiny(**sizes)), tokenizer=WordTokenizer(["red"]))
+    policy.save_pretrained(tmp_path / "policy")
+    demos = write_demos(tmp_path / "images.h5", image_size=56)
+    options = (
+        "alphas=[0.1,0.3]",
+        "tolerance=2",
+        "episodes=2",
+        "n_action_steps=2",
+        f"policy={tmp_path}/policy",
+    )
+    command = [sys.executable, str(RECIPE), f"demos={demos}", *options]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-3000:]
+    budget = TokenBudget.load(tmp_path / "policy" / "specprune.json")
+    assert budget.alpha == 0.1
+    assert [point.alpha for point in budget.points] == [0.1, 0.3]
+    assert budget.points[0].kept < budget.points[1].kept
+    policy.pruner = budget.pruner()
+    assert iio.imread(tmp_path / "policy" / "specprune.png").std() > 5

@@ -1,0 +1,245 @@
+"""The native engine: one call of compiled code for each action chunk, on the CPU.
+
+``native.cpp`` holds the loop, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the weights and tables that
+it reads, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads the mask as it goes: unlike
+the PyTorch engine's, its program is the mask.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from ctypes import byref, c_float, c_void_p
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.engine.native.library import (
+    INSTRUCTION_SETS,
+    instruction_level,
+    library,
+    native_available,
+)
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork
+from torchrl_sparse.blocks.engine.reference import check_query
+from torchrl_sparse.blocks.engine.weights import WeightWatch
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
+
+if TYPE_CHECKING:
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["NativeEngine", "native_supports"]
+
+_WEIGHTS = ("float32", "float16", "bfloat16")
+_MAX_OBS_STEPS = 63
+
+
+def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
+    """Whether the native engine can run ``network`` on this machine, and if not, why.
+
+    It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0,
+    as all published models have), a noise vector as large as an action, and at most 63 observation steps.
+    """
+    available, reason = native_available()
+    if not available:
+        return False, reason
+    parameters = list(network.parameters())
+    if any(parameter.device.type != "cpu" for parameter in parameters):
+        return False, f"it runs on the CPU, the network is on {parameters[0].device}"
+    if any(parameter.dtype != torch.float32 for parameter in parameters):
+        return False, "it reads float32 weights"
+    if network.n_cond_layers > 0:
+        return False, f"it needs n_cond_layers = 0, the network has {network.n_cond_layers}"
+    if network.output_dim != network.input_dim:
+        return False, f"it needs output_dim = input_dim, got {network.output_dim} and {network.input_dim}"
+    if network.n_obs_steps > _MAX_OBS_STEPS:
+        return False, f"it needs n_obs_steps <= {_MAX_OBS_STEPS}, the network has {network.n_obs_steps}"
+    return True, ""
+
+
+class _NativeWatch(WeightWatch):
+    """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
+
+    def locate(self, samples: list[Tensor]) -> ctypes.Array:
+        elsewhere = next((sample.device for sample in samples if not sample.is_cpu), None)
+        if elsewhere is not None:
+            raise ValueError(f"native engine: it runs on the CPU, the network was moved to {elsewhere}")
+        places = [value.data_ptr() for sample in samples for value in sample]
+        return (c_void_p * len(places))(*places)
+
+    def read(self, places: ctypes.Array) -> bytes:
+        values = (c_float * len(places))()
+        library().sparse_gather(len(places), places, values)
+        return bytes(values)
+
+
+class NativeEngine:
+    """Runs queries in compiled code. Not differentiable.
+
+    The weights are packed when the engine is made, and again when the network's have changed (see
+    :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). A row of a batch is computed exactly as it would be
+    alone. Rows are spread over ``threads`` threads, of which the caller's is one; a query is never split, so that more
+    threads than rows change nothing. Calls from several threads may overlap.
+
+    Args:
+        network: the denoiser, in eval mode; see :func:`native_supports`.
+        sampler: the sampler.
+        weights: ``"float32"``; ``"float16"`` for half the memory; ``"bfloat16"`` for half the memory and, on a CPU
+            with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well.
+        instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
+        threads: for the rows of a batch; None takes ``torch.get_num_threads()`` at each call.
+
+    Attributes:
+        name: ``"native"``.
+        detail: instruction set and weight type.
+
+    Raises:
+        ValueError: if the engine cannot run the network or the instruction set, with the reason.
+
+    Examples:
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+        >>> network = TransformerForDiffusion(
+        ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
+        ... ).eval()
+        >>> if native_available()[0]:
+        ...     engine = NativeEngine(network, Sampler("ddim", 10))
+        ...     actions = engine.denoise(torch.randn(3, 10, 4, 7), torch.randn(3, 2, 5))
+        ...     assert actions.shape == (3, 4, 7)
+    """
+
+    name = "native"
+
+    def __init__(
+        self,
+        network: TransformerForDiffusion,
+        sampler: Sampler,
+        *,
+        weights: str = "float32",
+        instruction_set: str | None = None,
+        threads: int | None = None,
+    ) -> None:
+        supported, reason = native_supports(network)
+        if not supported:
+            raise ValueError(f"native engine: {reason}")
+        if weights not in _WEIGHTS:
+            raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {weights!r}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads: expected at least 1, got {threads}")
+        self.network, self.sampler, self.weights, self.threads = network, sampler, weights, threads
+        self._level = instruction_level(instruction_set)
+        self._dense = torch.zeros(sampler.num_inference_steps, network.num_blocks, dtype=torch.bool)
+        self._stock: list[Tensor] = []
+        self._watch = _NativeWatch(network)
+        self._packed = (None, None)
+        self._current()
+
+    @property
+    def detail(self) -> str:
+        return f"{INSTRUCTION_SETS[self._level]}, {self.weights} weights"
+
+    def denoise(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+    ) -> Tensor:
+        """Normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
+
+        Raises:
+            ValueError: also if the inputs are no float32 tensors on the CPU, or if the network is in training mode.
+        """
+        check_query(self.network, self.sampler, noise, cond, mask, reuse)
+        if mask is None:
+            mask = self._dense.expand(len(cond), -1, -1)
+        self._check(noise, cond, mask)
+        query = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
+        actions = torch.empty(len(cond), self.network.horizon, self.network.input_dim)
+        packed, slots = self._current(), num_buffers(reuse, self.network.num_blocks)
+        rows = iter(range(len(cond)))
+
+        def work() -> None:
+            with self._scratch(packed) as scratch:
+                for row in rows:  # each thread takes the next: one that is held up holds up nothing else
+                    self._run(packed, slots, row, *query, actions, scratch)
+
+        _run_in_threads(work, min(self.threads or torch.get_num_threads(), len(cond)))
+        return actions
+
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """Seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``.
+
+        The best of ``repeats`` walks over all layers, so that weights come from where they do in a query.
+        """
+        packed = self._current()
+        scratch = self._new_scratch(packed).zero_()
+        return {
+            name: self._time_block(packed, kind, repeats, scratch) for kind, name in enumerate(BLOCK_TYPES)
+        }
+
+    def _time_block(self, packed: PackedNetwork, kind: int, repeats: int, scratch: Tensor) -> float:
+        best = float("inf")
+        for _ in range(repeats):
+            start = time.perf_counter()
+            library().sparse_blocks(self._level, byref(packed.model), kind, scratch.data_ptr())
+            best = min(best, time.perf_counter() - start)
+        return best / self.network.n_layer
+
+    def _run(self, packed, slots: int, row: int, mask, noise, cond, actions, scratch) -> None:
+        mask, noise, cond, actions = (
+            tensor.data_ptr() + row * tensor.stride(0) * tensor.element_size()
+            for tensor in (mask, noise, cond, actions)
+        )
+        library().sparse_denoise(
+            self._level, byref(packed.model), mask, slots, noise, cond, actions, scratch.data_ptr()
+        )
+
+    @contextmanager
+    def _scratch(self, packed: PackedNetwork) -> Iterator[Tensor]:
+        """Memory for one call at a time, from a stock that grows to as many as there are calls at a time."""
+        try:
+            scratch = self._stock.pop()
+        except IndexError:
+            scratch = self._new_scratch(packed)
+        yield scratch
+        self._stock.append(scratch)
+
+    def _new_scratch(self, packed: PackedNetwork) -> Tensor:
+        """On a cache line, as all of PyTorch's memory; with a slot for each block, which is enough for every reuse rule."""
+        return torch.empty(library().sparse_scratch(byref(packed.model), self.network.num_blocks))
+
+    def _current(self) -> PackedNetwork:
+        """The packed weights, packed anew if the network has changed."""
+        version = self._watch.state()
+        known, packed = self._packed  # read and replaced in one go: other threads may do the same
+        if known != version:
+            packed = PackedNetwork(self.network, self.sampler, getattr(torch, self.weights))
+            self._packed = (version, packed)
+        return packed
+
+    def _check(self, noise: Tensor, cond: Tensor, mask: Tensor) -> None:
+        if self.network.training:
+            raise ValueError("network: expected eval mode, got training mode (call network.eval())")
+        for name, tensor, dtype in (
+            ("noise", noise, torch.float32),
+            ("cond", cond, torch.float32),
+            ("mask", mask, torch.bool),
+        ):
+            if tensor.dtype != dtype or not tensor.is_cpu:
+                raise ValueError(
+                    f"{name}: expected {dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
+                )
+
+
+def _run_in_threads(work: Callable[[], None], threads: int) -> None:
+    """Run ``work`` as often at the same time; one of the threads is the caller's."""
+    if threads == 1:
+        work()
+        return
+    with ThreadPoolExecutor(threads - 1) as pool:
+        tasks = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+    for task in tasks:
+        task.result()

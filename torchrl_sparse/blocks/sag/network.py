@@ -1,0 +1,186 @@
+"""The network of SAG's pruner: from an observation to a logit for every block of every denoising step.
+
+What does not depend on the observation is computed once in evaluation mode, and what remains then runs in the
+compiled code of :mod:`torchrl_sparse.blocks.engine.native.pruner` where that can be had.
+:mod:`torchrl_sparse.blocks.sag.planner` turns logits into masks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from torchrl_sparse.blocks.engine.native.library import native_available
+from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativeGates
+from torchrl_sparse.networks.diffusion.transformer import SinusoidalPosEmb
+
+__all__ = ["PrunerNetwork"]
+
+
+class PrunerNetwork(nn.Module):
+    """Logits of every block of every denoising step from an encoded observation.
+
+    In evaluation mode, what follows from the weights alone is kept until ``train()``, ``eval()``, ``load_state_dict()`` or a
+    move: call ``eval()`` after writing to a weight by hand.
+
+    Args:
+        timesteps: diffusion timesteps of the sampler in execution order, K of them.
+        num_blocks: blocks 3L of a denoising step.
+        cond_shape: (To, D) of the encoded observations.
+        width: of a coordinate's token z, a multiple of ``n_head`` and at least 4.
+        obs_width: of the observation's embedding.
+        hidden: of the MLP.
+        n_layer, n_head: of the transformer encoder over the coordinates.
+        rate_input: whether the target prune rate is an input.
+
+    Examples:
+        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
+        >>> network(torch.zeros(7, 2, 5)).shape
+        torch.Size([7, 4, 6, 2])
+    """
+
+    def __init__(
+        self,
+        timesteps: Sequence[int],
+        num_blocks: int,
+        cond_shape: tuple[int, int],
+        *,
+        width: int = 64,
+        obs_width: int = 64,
+        hidden: int = 64,
+        n_layer: int = 1,
+        n_head: int = 4,
+        rate_input: bool = False,
+    ) -> None:
+        super().__init__()
+        self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
+        self.rate_input = rate_input
+        self.config: dict[str, Any] = {
+            "timesteps": self.timesteps,
+            "num_blocks": num_blocks,
+            "cond_shape": list(cond_shape),
+            "width": width,
+            "obs_width": obs_width,
+            "hidden": hidden,
+            "n_layer": n_layer,
+            "n_head": n_head,
+            "rate_input": rate_input,
+        }
+        self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
+        self.token = nn.Linear(2 * width, width)
+        layer = nn.TransformerEncoderLayer(
+            width, n_head, 2 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
+        )
+        self.encoder = nn.TransformerEncoder(layer, n_layer, enable_nested_tensor=False)
+        self.obs = nn.Linear(cond_shape[0] * cond_shape[1] + rate_input, obs_width)
+        # The first layer of the MLP on [obs ; z], as its two halves.
+        self.fuse_obs = nn.Linear(obs_width, hidden)
+        self.fuse_z = nn.Linear(width, hidden, bias=False)
+        self.mlp = nn.Sequential(
+            nn.ReLU(inplace=True), nn.Linear(hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 2)
+        )
+        self._forget()
+
+    def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Logits (keep, prune) f32 [B, K, 3L, 2].
+
+        Args:
+            cond: encoded observations f32 [B, To, D].
+            rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
+        """
+        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, 2)
+
+    def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, at less cost than both logits.
+
+        In evaluation mode and without gradients, compiled code computes it for float32 on the CPU.
+        """
+        if (native := self._native_gates(cond)) is not None:
+            return native.logits(self._features(cond, rate))
+        _, middle, _, last = self.mlp
+        hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
+        logits = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
+        return logits.view(len(cond), len(self.timesteps), self.num_blocks)
+
+    def prune_masks(self, cond: Tensor) -> Tensor:
+        """bool [B, K, 3L]: where pruning is preferred, which it never is in the first step; without a rate as input."""
+        if (native := self._native_gates(cond)) is not None:
+            return native.masks(cond.flatten(1))
+        masks = self.prune_logits(cond) > 0
+        masks[:, 0] = False
+        return masks
+
+    def _native_gates(self, cond: Tensor) -> NativeGates | None:
+        """The compiled MLP, or None where PyTorch has to compute."""
+        if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):
+            return None
+        if self._native is None and self._can_be_native():
+            self._native = NativeGates(self)
+        return self._native
+
+    def _can_be_native(self) -> bool:
+        small = self.fuse_obs.out_features <= MAX_HIDDEN
+        return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
+
+    def _features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+        return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
+
+    def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+        """The first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
+        obs = self.fuse_obs(self.obs(self._features(cond, rate)))
+        return (obs[:, None] + self.cells()).flatten(0, 1)
+
+    def cells(self) -> Tensor:
+        """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
+        if self.training or torch.is_grad_enabled():
+            return self._encode()
+        if self._cells is None:
+            self._cells = self._encode()
+        return self._cells
+
+    # What is kept follows from the weights: training changes them, as do files and devices, and a copy makes its own.
+
+    def _forget(self) -> None:
+        self._cells: Tensor | None = None
+        self._native: NativeGates | None = None
+
+    def train(self, mode: bool = True) -> PrunerNetwork:
+        self._forget()
+        return super().train(mode)
+
+    def _apply(self, fn, recurse: bool = True) -> PrunerNetwork:
+        self._forget()
+        return super()._apply(fn, recurse)
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        self._forget()
+        super()._load_from_state_dict(*args)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cells": None, "_native": None}
+
+    @property
+    def macs_per_query(self) -> int:
+        """Multiply-accumulates of one query in evaluation mode, where ``z`` is there already."""
+        hidden, obs = self.fuse_obs.out_features, self.obs
+        return (
+            obs.in_features * obs.out_features
+            + obs.out_features * hidden
+            + len(self.coordinates) * (hidden * hidden + 2 * hidden)
+        )
+
+    def _encode(self) -> Tensor:
+        return self.fuse_z(self.encoder(self.token(self.coordinates)[None])[0])
+
+    def _coordinates(self, code: SinusoidalPosEmb) -> Tensor:
+        """[K * 3L, 2 * width]: step and block codes, concatenated as in the paper, not added."""
+        steps = code(torch.tensor(self.timesteps)).repeat_interleave(self.num_blocks, dim=0)
+        return torch.cat([steps, code(torch.arange(self.num_blocks)).repeat(len(self.timesteps), 1)], dim=-1)
+
+
+def _is_f32_on_cpu(tensor: Tensor) -> bool:
+    return tensor.is_cpu and tensor.dtype == torch.float32

@@ -1,0 +1,248 @@
+"""Sparse ActionGen (SAG, arXiv:2601.12894): a pruner that looks at the observation, then decides what to skip.
+
+One small network reads the encoded observation and the coordinates of all K x 3L blocks, and predicts the whole
+mask of a query before its first denoising step (Section 3.2 of the paper)::
+
+    z = Encoder([sin(timestep k) ; sin(block b)])         one token per block of every step
+    I = MLP([W_o obs ; z])                                two logits per block: keep, prune
+    M = argmax I                                          the first step is always kept
+
+``z`` does not depend on the observation: in evaluation mode it is computed once and kept, already multiplied by
+its half of the first MLP layer, so that a query costs the rest of the MLP alone. Pruned blocks reuse the latest
+output of their type ("one-for-all"). The paper does not publish sizes; those here keep the pruner below 0.3 % of
+the dense FLOPs. :mod:`torchrl_sparse.training.pruner.trainer` trains it.
+
+Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
+query through ``("diffusion", "prune_rate")``, and keeps each of them exactly, because the logits are then compared
+with that one of them that leaves so many above it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
+from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.keys import COND, PRUNE_RATE
+from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.storage.tensors import check_finite, check_shapes
+
+__all__ = ["PrunerInfo", "SAGPruner", "check_rates", "rate_threshold"]
+
+FORMAT = "torchrl_sparse.sag/1"
+_FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
+
+
+def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
+    """The value, f32 [B, 1, 1], that ``rate`` of each row's logits are above, the first step's not among them.
+
+    Gradients run through it: logits that all move together change nothing, and must not be drawn anywhere.
+
+    Args:
+        logits: f32 [B, K, 3L].
+        rate: f32 [B, 1], of all K x 3L; at least one block is kept and one pruned after the first step.
+
+    Examples:
+        >>> logits = torch.tensor([[[9.0, 9.0], [1.0, 4.0], [2.0, 3.0]]])
+        >>> rate_threshold(logits, torch.tensor([[0.5]])).item()
+        1.5
+    """
+    ordered = logits[:, 1:].flatten(1).sort(descending=True).values
+    count = (rate * logits[0].numel()).round().long().clamp(1, ordered.shape[1] - 1)
+    return ordered.gather(1, torch.cat([count - 1, count], dim=1)).mean(dim=1)[:, None, None]
+
+
+@dataclass(frozen=True)
+class PrunerInfo:
+    """What a pruner was trained for.
+
+    Attributes:
+        policy: fingerprint of the policy.
+        sampler: name of its denoising schedule, see `Sampler.name`.
+        rate: prune rate that it is asked for where the TensorDict says nothing, in (0, 1).
+        rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
+        reuse: what pruned blocks reuse.
+        settings: how it was trained, for people and reports.
+
+    Raises:
+        ValueError: if a field does not hold what is described here.
+    """
+
+    policy: str
+    sampler: str
+    rate: float
+    rate_range: tuple[float, float] | None = None
+    reuse: Reuse = "type"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_reuse(self.reuse)
+        check_rates(self.rate, self.rate_range)
+        if self.rate_range is not None:  # JSON brings a list
+            object.__setattr__(self, "rate_range", tuple(self.rate_range))
+
+
+def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
+    """Raise ValueError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
+    if not 0 < rate < 1:
+        raise ValueError(f"rate: expected a prune rate in (0, 1), got {rate}")
+    if rate_range is not None:
+        low, high = rate_range
+        if not 0 < low <= rate <= high < 1:
+            raise ValueError(f"rate_range: expected 0 < low <= rate={rate} <= high < 1, got {low}, {high}")
+
+
+class SAGPruner(Planner):
+    """Predicts the mask of every query from its observation; serves only the policy that it was trained for.
+
+    Reads ``("diffusion", "cond")`` and, if the rate is an input, ``("diffusion", "prune_rate")`` f32 [*B, 1] where
+    it is there; ``rate`` stands in for it where it is not.
+
+    Args:
+        network: the trained network.
+        info: what it was trained for.
+
+    Attributes:
+        rate: prune rate of the queries that do not bring their own. Assign another within ``info.rate_range``.
+
+    Examples:
+        >>> from torchrl_sparse.blocks.sag.network import PrunerNetwork
+        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
+        >>> pruner = SAGPruner(network, PrunerInfo(policy="a policy", sampler="ddim", rate=0.7))
+        >>> pruner.bind(PlanSpec(4, 2, "a policy", sampler="ddim"))
+        >>> pruner.masks(torch.zeros(3, 2, 5)).shape
+        torch.Size([3, 4, 6])
+    """
+
+    def __init__(self, network: PrunerNetwork, info: PrunerInfo) -> None:
+        super().__init__()
+        if network.rate_input != (info.rate_range is not None):
+            raise ValueError(
+                f"rate_range: expected one if and only if the network reads the rate, "
+                f"got {info.rate_range} and rate_input={network.rate_input}"
+            )
+        self.network, self.info, self.reuse = network.eval(), info, info.reuse
+        self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
+        self._rate = info.rate
+
+    @property
+    def rate(self) -> float:
+        return self._rate
+
+    @rate.setter
+    def rate(self, value: float) -> None:
+        self._check_rates(torch.tensor(value), "rate")
+        self._rate = value
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the weights and the rate."""
+        return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
+
+    def bind(self, spec: PlanSpec) -> None:
+        """See :meth:`Planner.bind`.
+
+        Raises:
+            ValueError: if the pruner was trained for another policy or another sampler.
+        """
+        trained_for = PlanSpec(
+            len(self.network.timesteps),
+            self.network.num_blocks // len(BLOCK_TYPES),
+            self.info.policy,
+            self.info.sampler,
+        )
+        for name, expected in asdict(trained_for).items():
+            if (asked := getattr(spec, name)) != expected:
+                label = "policy fingerprint" if name == "policy" else name
+                raise ValueError(f"SAG pruner: trained for {label} {expected!r}, got {asked!r}")
+        super().bind(spec)
+
+    def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
+        """The rate of every query, if it is an input.
+
+        Raises:
+            ValueError: if a rate is out of the range that the pruner was trained for.
+        """
+        if not self.network.rate_input:
+            return {}
+        rate = tensordict.get(PRUNE_RATE, None)
+        if rate is None:
+            return {"rate": torch.full((rows, 1), self.rate, device=tensordict.get(COND).device)}
+        self._check_rates(rate, PRUNE_RATE)
+        return {"rate": rate.reshape(rows, 1)}
+
+    def masks(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Masks bool [B, K, 3L].
+
+        Args:
+            cond: encoded observations f32 [B, To, D].
+            rate: prune rates f32 [B, 1], if they are an input.
+
+        Raises:
+            ValueError: if the observations do not have the shape that the pruner was trained on.
+        """
+        if cond.shape[1:] != self.network.cond_shape:
+            raise ValueError(
+                f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
+                f"got {list(cond.shape)}"
+            )
+        if not torch.is_grad_enabled():  # as in every collector: entering no_grad again takes time
+            return self._decide(cond, rate)
+        with torch.no_grad():
+            return self._decide(cond, rate)
+
+    def _decide(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+        if rate is None:
+            return self.network.prune_masks(cond)
+        logits = self.network.prune_logits(cond, rate)
+        masks = logits > rate_threshold(logits, rate)
+        masks[:, 0] = False
+        return masks
+
+    def save_pretrained(self, path: str | os.PathLike) -> None:
+        """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""
+        path = Path(path)
+        write_tensors(path / "pruner.safetensors", self.network.state_dict())
+        write_config(
+            path / "config.json", {"format": FORMAT, **asdict(self.info), "network": self.network.config}
+        )
+
+    @classmethod
+    def from_pretrained(cls, path: str | os.PathLike) -> SAGPruner:
+        """Read what :meth:`save_pretrained` wrote. Nothing in the files is executed.
+
+        Raises:
+            FileNotFoundError: if a file is not there.
+            ValueError: naming the file, what was expected in it and what came.
+        """
+        path = Path(path)
+        config = read_config(path / "config.json", FORMAT, _FIELDS)
+        del config["format"]
+        try:
+            network = PrunerNetwork(**config.pop("network"))
+            info = PrunerInfo(**config)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path / 'config.json'}: {error}") from error
+        where, expected = path / "pruner.safetensors", network.state_dict()
+        tensors = read_tensors(where)
+        check_shapes(str(where), tensors, {name: tuple(value.shape) for name, value in expected.items()})
+        check_finite(str(where), tensors)
+        network.load_state_dict(tensors)
+        return cls(network, info)
+
+    def _check_rates(self, rates: Tensor, name: Any) -> None:
+        if self.info.rate_range is None:
+            raise ValueError(f"{name}: this pruner was trained for the rate {self.info.rate} alone")
+        low, high = self.info.rate_range
+        if not ((rates >= low) & (rates <= high)).all():
+            raise ValueError(
+                f"{name}: expected prune rates in [{low}, {high}], got {rates.min():.3g} to {rates.max():.3g}"
+            )

@@ -1,0 +1,181 @@
+"""Pictures of visual-token pruning: what a policy went on looking at, how deep, and how that followed the hand's speed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.figures.plots import method_colors
+
+if TYPE_CHECKING:
+    from torchrl_sparse.training.vla.token_budget import TokenBudget
+
+__all__ = ["draw_tokens", "plot_control", "plot_token_budget", "plot_token_strip", "plot_tokens_per_layer"]
+
+_GONE = np.array((24, 24, 28), np.float32)
+_DIMMEST = 0.18  # of the image still shows through a token that was dropped before the decoder
+_SPEED, _FINE, _QUERY = "#0072B2", "#F2C14E", "#D55E00"
+
+
+def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: int = 1) -> np.ndarray:
+    """The cameras side by side, each patch the darker, the earlier its token was dropped; those never dropped as they are.
+
+    Args:
+        images: u8 [V, 3, h, w], a query's images.
+        depth: [N], decoder layers that each visual token reached (``("tokens", "depth")``), camera by camera.
+        num_layers: decoder layers; the depth of tokens that were never dropped.
+        scale: pixels of the picture for one of the image.
+
+    Returns:
+        u8 [h * scale, V * w * scale, 3].
+
+    Raises:
+        ValueError: if the tokens of a camera form no square grid that divides the image.
+
+    Examples:
+        >>> images = np.full((2, 3, 4, 4), 200, np.uint8)
+        >>> picture = draw_tokens(images, np.array([4, 0, 2, 4, 4, 4, 4, 4]), num_layers=4)
+        >>> picture.shape, picture[0, :, 0].tolist()
+        ((4, 8, 3), [200, 200, 56, 56, 200, 200, 200, 200])
+    """
+    cameras, _, height, width = images.shape
+    side = round((len(depth) / cameras) ** 0.5)
+    if cameras * side**2 != len(depth) or height % side or width % side:
+        raise ValueError(
+            f"depth: expected a square grid of tokens for each of {cameras} images of {height} x {width} that divides "
+            f"them, got {len(depth)} tokens"
+        )
+    light = _DIMMEST + (1 - _DIMMEST) * np.clip(np.asarray(depth, np.float32) / num_layers, 0, 1)
+    pictures = []
+    for image, grid in zip(images, light.reshape(cameras, side, side), strict=True):
+        mask = grid.repeat(height // side, 0).repeat(width // side, 1)[..., None]
+        pictures.append(np.moveaxis(image, 0, -1) * mask + _GONE * (1 - mask))
+    picture = np.concatenate(pictures, 1).round().astype(np.uint8)
+    return picture.repeat(scale, 0).repeat(scale, 1)
+
+
+def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path: str | os.PathLike) -> Path:
+    """Pictures of `draw_tokens` along a rollout, from left to right, each camera in a row of its own.
+
+    Args:
+        pictures: u8 [h, V * w, 3], one per query that is shown; the V images of each are square.
+        labels: what to write above each.
+        path: of the PNG.
+
+    Raises:
+        ValueError: if there is nothing to show, or labels do not match.
+    """
+    if not len(pictures) or len(pictures) != len(labels):
+        raise ValueError(
+            f"expected at least one picture and a label for each, got {len(pictures)} and {len(labels)}"
+        )
+    cameras = pictures[0].shape[1] // pictures[0].shape[0]
+    size = 9 / len(pictures)
+    figure, grid = make_figure(9, cameras * size + 0.6, rows=cameras, columns=len(pictures))
+    grid = np.reshape(grid, (cameras, len(pictures)))
+    for column, (picture, label) in enumerate(zip(pictures, labels, strict=True)):
+        grid[0, column].set_title(label, fontsize=9)
+        for row, image in enumerate(np.split(picture, cameras, axis=1)):
+            grid[row, column].imshow(image)
+            grid[row, column].set_axis_off()
+    return save_figure(figure, path)
+
+
+def plot_control(
+    speed: np.ndarray,
+    fine: np.ndarray,
+    queried: np.ndarray,
+    path: str | os.PathLike,
+    *,
+    kept: np.ndarray | None = None,
+) -> Path:
+    """When the controller held the motion for fine, over the hand's speed, with the queries marked.
+
+    Args:
+        speed: [T] m/s at each step.
+        fine, queried: bool [T].
+        path: of the PNG.
+        kept: [T] visual tokens of the latest query, drawn below.
+
+    Raises:
+        ValueError: if lengths differ.
+    """
+    series = {"fine": fine, "queried": queried, **({} if kept is None else {"kept": kept})}
+    for name, values in series.items():
+        if len(values) != len(speed):
+            raise ValueError(f"{name}: expected {len(speed)} steps like speed, got {len(values)}")
+    rows = 1 if kept is None else 2
+    figure, grid = make_figure(9, 2.2 + 1.6 * rows, rows=rows, columns=1, sharex=True)
+    axes = [grid] if kept is None else grid[:, 0]
+    steps = np.arange(len(speed))
+    axes[0].plot(steps, speed, color=_SPEED, linewidth=1.8, label="speed of the hand")
+    axes[0].plot(steps[queried], speed[queried], "o", color=_QUERY, markersize=5, label="query")
+    axes[0].set_ylabel("m/s")
+    if kept is not None:
+        axes[1].step(steps, kept, where="post", color="#333333", linewidth=1.6)
+        axes[1].set_ylabel("visual tokens kept")
+    for index, panel in enumerate(axes):
+        panel.fill_between(
+            steps, 0, 1, where=fine, transform=panel.get_xaxis_transform(), color=_FINE, alpha=0.35, step="post",
+            linewidth=0, label="fine mode" if index == 0 else None,
+        )  # fmt: skip
+        panel.set_ylim(bottom=0)
+    axes[0].legend(frameon=False, ncols=3, loc="upper right")
+    axes[-1].set_xlabel("environment step")
+    axes[-1].locator_params(axis="x", integer=True)
+    return save_figure(figure, path)
+
+
+def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: str | os.PathLike) -> Path:
+    """Visual tokens in each decoder layer, mean over queries, of several methods.
+
+    Args:
+        depth: method -> [queries, N] layers that each token reached (``("tokens", "depth")``).
+        num_layers: decoder layers.
+        path: of the PNG.
+
+    Raises:
+        ValueError: if there is no method, or one without queries.
+    """
+    if not depth or any(np.ndim(values) != 2 or not np.size(values) for values in depth.values()):
+        shapes = {name: list(np.shape(values)) for name, values in depth.items()}
+        raise ValueError(f"depth: expected [queries, N] for at least one method, got {shapes}")
+    figure, axes = make_figure(9, 3.8)
+    colors = method_colors(depth)
+    for place, (name, values) in enumerate(depth.items()):
+        per_layer = [(np.asarray(values) > layer).sum(1).mean() for layer in range(num_layers)]
+        # Methods that keep the same lie on top of each other, so each line is thinner than those below it.
+        width = 1.5 + 4.5 * (len(depth) - 1 - place) / len(depth)
+        axes.step(range(num_layers), per_layer, where="mid", linewidth=width, color=colors[name], label=name)
+    axes.set_xlabel("decoder layer")
+    axes.set_ylabel("visual tokens, mean")
+    axes.set_ylim(bottom=0)
+    figure.legend(frameon=False, loc="outside right center")
+    return save_figure(figure, path)
+
+
+def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
+    """What every alpha loses over the tokens that it keeps, with the tolerance and the choice.
+
+    Args:
+        budget: calibrated.
+        path: of the PNG.
+    """
+    points = sorted(budget.points, key=lambda point: point.kept)
+    figure, axes = make_figure(9, 4.2)
+    axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=_SPEED, linewidth=1.8)
+    for point in points:
+        place = (point.kept, point.loss)
+        axes.annotate(f"{point.alpha:g}", place, (4, 6), textcoords="offset points", fontsize=9)
+        if point.alpha == budget.alpha:
+            axes.plot(*place, "o", color=_QUERY, markersize=11, label=f"chosen: alpha {point.alpha:g}")
+    axes.axhline(budget.tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
+    axes.set_xlabel("visual tokens in a decoder layer, mean")
+    axes.set_ylabel("action error" if budget.measure == "action_error" else "success lost")
+    axes.legend(frameon=False)
+    return save_figure(figure, path)

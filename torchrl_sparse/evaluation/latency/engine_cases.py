@@ -1,0 +1,216 @@
+"""What a benchmark of the engines runs: shapes, queries of different sparsity, and every way of answering them.
+
+A *query kind* is a sampler and a mask (``"dense"``, ``"random91"``, ``"ddim10"`` ...); a *variant* is one way of answering
+one kind of query, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, be it that
+diffusers' sampler draws the noise itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.bac import bac_schedule
+from torchrl_sparse.blocks.calibration import calibrate
+from torchrl_sparse.blocks.engine import Engine, NativeEngine, ReferenceEngine, TorchEngine
+from torchrl_sparse.blocks.engine.eager import EagerBaseline
+from torchrl_sparse.blocks.engine.native.engine import native_supports
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.training.diffusion.published import published_network
+
+__all__ = ["QUICK", "SHAPES", "EngineCase", "Query", "Variant", "make_network"]
+
+# The published networks by task, and what differs; the robomimic image tasks differ from low_dim in their condition.
+SHAPES = {"low_dim": ("lift", {}), "image": ("lift", {"cond_dim": 137}), "kitchen": ("kitchen", {})}
+QUICK = {"n_layer": 2, "n_emb": 32}
+
+_PRUNE_RATE = 0.91
+_SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
+_NUM_UPDATES = 10
+_HALF_RUNNERS = {"native-fp16": "float16", "native-bf16": "bfloat16"}
+_HALF_KINDS = ("dense", "random91", "bac10")
+_DRAWN_SEED = 1
+
+
+def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
+    """An untrained network of a published shape; ``quick`` makes it small.
+
+    Raises:
+        ValueError: on an unknown shape.
+    """
+    if shape not in SHAPES:
+        raise ValueError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")
+    torch.manual_seed(0)
+    task, changes = SHAPES[shape]
+    return published_network(task, **changes, **(QUICK if quick else {})).eval().requires_grad_(False)
+
+
+@dataclass(frozen=True)
+class Query:
+    """One kind of query.
+
+    Attributes:
+        sampler: the sampler, K steps.
+        mask: bool [B, K, 3L]; None prunes nothing.
+    """
+
+    sampler: Sampler
+    mask: Tensor | None = None
+
+    def evaluations(self) -> Tensor | None:
+        """How often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
+        return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0)
+
+    def row_evaluations(self, batch: int) -> int | Tensor:
+        """How often each block is computed, counting every row by itself, i64 [3L]; one number if all are as often."""
+        if self.mask is None:
+            return batch * self.sampler.num_inference_steps
+        return (~self.mask).sum(dim=(0, 1))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way of answering one kind of query.
+
+    Attributes:
+        call: answers it once, with normalised actions [B, H, A].
+        kind: of the query.
+        dense: name of the variant that runs ``"dense"`` in the same runner.
+        weight_bytes: size of a weight as the runner reads it.
+        in_f32: whether the runner multiplies and adds in f32.
+    """
+
+    call: Callable[[], Tensor]
+    kind: str
+    dense: str
+    weight_bytes: int = 4
+    in_f32: bool = True
+
+
+class EngineCase:
+    """One network, one batch, all kinds of queries.
+
+    Args:
+        network: the denoiser, in eval mode.
+        batch: rows B; each has a random mask of its own where masks are random.
+        num_steps: denoising steps K of the dense query.
+        compiled: also run the eager baseline through ``torch.compile``.
+        bac_mask: of a sampler of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
+            first of the case's own queries, whose observation is noise.
+    """
+
+    def __init__(
+        self,
+        network: TransformerForDiffusion,
+        batch: int,
+        *,
+        num_steps: int = 100,
+        compiled: bool = False,
+        bac_mask: Tensor | None = None,
+    ) -> None:
+        self.network, self.batch, self._compiled = network, batch, compiled
+        self._ddpm = Sampler("ddpm", num_steps, num_steps)
+        generator = torch.Generator().manual_seed(0)
+        self.cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)
+        shape = (batch, network.horizon, network.input_dim)
+        initial = torch.randn(shape, generator=generator)
+        # The eager baseline's sampler draws the steps' noise from a generator with this seed, in this order.
+        drawn = torch.Generator().manual_seed(_DRAWN_SEED)
+        steps = [torch.randn(shape, generator=drawn) for _ in range(num_steps - 1)]
+        self.noise = torch.stack([initial, *steps], dim=1)
+        mask = self._calibrate_bac() if bac_mask is None else bac_mask
+        self.queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
+
+    def reference(self, kind: str) -> Tensor:
+        """The right answer to a query."""
+        query = self.queries[kind]
+        return self._call(ReferenceEngine(self.network, query.sampler), query)()
+
+    def variants(self) -> dict[str, Variant]:
+        """Everything to time, by name."""
+        variants = self._eager_variants()
+        variants["reference dense"] = Variant(partial(self.reference, "dense"), "dense", "reference dense")
+        runners = {"torch": TorchEngine}
+        if native_supports(self.network)[0]:
+            runners["native"] = NativeEngine
+            runners |= {name: partial(NativeEngine, weights=dtype) for name, dtype in _HALF_RUNNERS.items()}
+        for runner, make in runners.items():
+            engines = {}
+            for kind, query in self.queries.items():
+                if runner in _HALF_RUNNERS and kind not in _HALF_KINDS:
+                    continue
+                if query.sampler not in engines:
+                    engines[query.sampler] = make(self.network, query.sampler)
+                call = self._call(engines[query.sampler], query)
+                weight_bytes = 2 if runner in _HALF_RUNNERS else 4
+                in_f32 = _HALF_RUNNERS.get(runner) != "bfloat16"
+                variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
+        return variants
+
+    def _call(self, engine: Engine, query: Query) -> Callable[[], Tensor]:
+        noise = self.noise[:, : query.sampler.num_inference_steps].contiguous()
+        return partial(engine.denoise, noise, self.cond, query.mask)
+
+    def _eager_variants(self) -> dict[str, Variant]:
+        kinds = [kind for kind, query in self.queries.items() if query.mask is None]
+        calls = {f"eager {kind}": (kind, self._eager_call(kind)) for kind in kinds}
+        if self._compiled:
+            calls["eager-compiled dense"] = ("dense", self._eager_call("dense", compiled=True))
+        if self.batch == 1:  # an `if` around a block skips it for all rows
+            calls["eager-ifs random91"] = ("random91", self._eager_call("random91"))
+        return {name: Variant(call, kind, "eager dense") for name, (kind, call) in calls.items()}
+
+    def _eager_call(self, kind: str, compiled: bool = False) -> Callable[[], Tensor]:
+        query = self.queries[kind]
+        eager = EagerBaseline(self.network, query.sampler, compiled=compiled)
+        mask = None if query.mask is None else query.mask[0]
+
+        def call() -> Tensor:
+            generator = torch.Generator().manual_seed(_DRAWN_SEED)
+            return eager.denoise(self.noise[:, 0], self.cond, mask, generator=generator)
+
+        return call
+
+    def _make_queries(self, generator: torch.Generator, bac_masks: Tensor) -> dict[str, Query]:
+        ddpm, steps = self._ddpm, self._ddpm.num_inference_steps
+        full = torch.linspace(0, steps - 1, round((1 - _PRUNE_RATE) * steps)).round().long()
+        full_steps = torch.ones(self.batch, steps, self.network.num_blocks, dtype=torch.bool)
+        full_steps[:, full] = False
+        all_pruned = torch.ones_like(full_steps)
+        all_pruned[:, 0] = False
+        queries = {
+            "dense": Query(ddpm),
+            "random91": Query(ddpm, self._random_mask(steps, _PRUNE_RATE, generator)),
+            "bac10": Query(ddpm, bac_masks),
+            f"full{len(full)}": Query(ddpm, full_steps),
+            "all-pruned": Query(ddpm, all_pruned),
+        }
+        for count in (16, 10, 8):
+            count = min(count, steps)
+            queries[f"ddim{count}"] = Query(self._ddim(count))
+            mask = self._random_mask(count, _SHORT_PRUNE_RATE, generator)
+            queries[f"ddim{count}-random50"] = Query(self._ddim(count), mask)
+        # One step, and what a query takes besides its steps.
+        queries["ddim1"] = Query(self._ddim(1))
+        return queries
+
+    def _ddim(self, num_steps: int) -> Sampler:
+        return Sampler("ddim", num_steps, self._ddpm.num_train_timesteps)
+
+    def _random_mask(self, steps: int, rate: float, generator: torch.Generator) -> Tensor:
+        """Each row a mask of its own that prunes ``rate`` of all blocks, of which the first step prunes none."""
+        blocks = self.network.num_blocks
+        order = torch.rand(self.batch, (steps - 1) * blocks, generator=generator).argsort(dim=1)
+        later = order < min(round(rate * steps * blocks), order.shape[1])
+        first = torch.zeros(self.batch, 1, blocks, dtype=torch.bool)
+        return torch.cat([first, later.view(self.batch, steps - 1, blocks)], dim=1)
+
+    def _calibrate_bac(self) -> Tensor:
+        calibration = calibrate(self.network, self._ddpm, self.noise[:1], self.cond[:1])
+        num_updates = min(_NUM_UPDATES, self._ddpm.num_inference_steps)
+        return bac_schedule(calibration, num_updates, policy="untrained").mask()

@@ -1,0 +1,210 @@
+"""What a latency benchmark of vision-language-action models runs: shapes, queries, the parts of a query, and what pruning adds.
+
+Weights are random: they change which tokens go, not what arithmetic costs. Every method answers the second query of an episode,
+in which a tenth of all patches has changed, with what it remembers of the first. Parts and helpers are replayed on tensors of
+such a query, so that nothing is timed from within.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.decoder import pack, visual_scores
+from torchrl_sparse.networks.vla.network import make_network
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner
+from torchrl_sparse.networks.vla.text import WordTokenizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
+
+__all__ = ["SHAPES", "VLACase", "make_policy"]
+
+SHAPES = {
+    "published": VLAConfig(crop_area=0.9),
+    # The published tokens, and about the published share of the decoder, in a model that a CPU answers in seconds.
+    "reduced": VLAConfig(
+        dino=TransformerSize(256, 8, 4, 1024),
+        siglip=TransformerSize(288, 9, 4, 1152),
+        llm=TransformerSize(1024, 12, 16, 2816),
+        crop_area=0.9,
+    ),
+    "toy": VLAConfig.tiny(llm=TransformerSize(32, 8, 2, 64), image_size=112, crop_area=0.9),
+}
+
+# One of LIBERO's.
+_INSTRUCTION = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+_CHANGED = 0.1
+
+
+def make_policy(
+    shape: str, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> VLAPolicy:
+    """An untrained policy of one of `SHAPES`.
+
+    Args:
+        dtype, device: of the network's weights.
+
+    Raises:
+        ValueError: on an unknown shape.
+    """
+    if shape not in SHAPES:
+        raise ValueError(f"shape: expected one of {', '.join(SHAPES)}, got {shape!r}")
+    config = SHAPES[shape]
+    torch.manual_seed(0)
+    network = make_network(config, dtype=dtype, device=device).requires_grad_(False)
+    normalizer = QuantileNormalizer.identity(config.state_dim, config.action_dim).to(device)
+    return VLAPolicy(network, normalizer, WordTokenizer(_INSTRUCTION.split()))
+
+
+class VLACase:
+    """One network and every way of answering the same query, batch 1.
+
+    Args:
+        policy: whose network, normaliser and tokenizer all methods share.
+        pruners: name -> pruner; None for dense.
+
+    Attributes:
+        policies: name -> its policy.
+        queries: name -> the second query, with what the first left it.
+    """
+
+    def __init__(self, policy: VLAPolicy, pruners: dict[str, TokenPruner | None]):
+        self.network = policy.network
+        first, second = _queries(policy)
+        self._dense = with_pruner(policy, None), second
+        self.policies, self.queries = {}, {}
+        for name, pruner in pruners.items():
+            self.policies[name] = with_pruner(policy, pruner)
+            answered = self.policies[name](first.clone(recurse=False))
+            remembered = answered.select(*self.policies[name].in_keys, strict=False)
+            self.queries[name] = remembered.update(second)
+
+    def answer(self, name: str) -> TensorDictBase:
+        """What a method answers to its query."""
+        return self.policies[name](self.queries[name].clone(recurse=False))
+
+    def sequence(self) -> LayerState:
+        """The decoder's input, [1, S], of a dense query."""
+        policy, query = self._dense
+        return _watched(policy, _FirstLayer(), query).scored[0][0]
+
+    def parts(self) -> dict[str, Callable[[], Any]]:
+        """What makes up a dense query, but for reading and laying out its inputs: name -> call."""
+        network, sequence = self.network, self.sequence()
+        images = torch.cat([self._dense[1][camera] for camera in network.config.cameras])
+        features = network.vision(images)
+        readout = sequence.hidden[:, : network.config.num_slots].contiguous()
+        return {
+            "vision towers": lambda: network.vision(images),
+            "projector": lambda: network.projector(features),
+            "decoder layers": lambda: network.decoder(sequence, TokenPruner()),
+            "action head": lambda: network.head(readout),
+        }
+
+    def watch(self, name: str) -> _Watch:
+        """What a method's pruner worked on in its query."""
+        return _watched(self.policies[name], self.policies[name].pruner, self.queries[name])
+
+    def helpers(self, name: str) -> dict[str, Callable[[], Any]]:
+        """What a pruner adds to its query: name -> call. ``choosing`` is all that it does itself, ``comparing`` included."""
+        watch = self.watch(name)
+        calls = {"choosing": watch.choose}
+        if set(FRAME_KEYS) <= set(watch.in_keys):
+            spec = self.network.config.visual_spec
+            calls["comparing"] = lambda: compare_frames(watch.start.clone(recurse=False), spec)
+        if watch.scored:
+            calls["scoring"] = partial(watch.score, self.network.config.llm.heads)
+        if any(keep is not None for _, keep in watch.answered):
+            calls["gathering"] = watch.gather
+        return calls
+
+
+class _FirstLayer(TokenPruner):
+    """Prunes nothing and has its first layer scored, which shows the decoder's input."""
+
+    def layers_scored(self, num_layers: int) -> set[int]:
+        return {0}
+
+
+class _Watch(TokenPruner):
+    """Does what another pruner does, notes what it worked on, and does it again."""
+
+    def __init__(self, inner: TokenPruner):
+        self.inner = inner
+        self.in_keys, self.out_keys = inner.in_keys, inner.out_keys
+        for name in ("bind", "layers_scored", "layers_skipped", "end"):
+            setattr(self, name, getattr(inner, name))
+        self.start: TensorDictBase
+        self.scored: list[tuple[LayerState, Tensor]] = []
+        self.answered: list[tuple[LayerState, Tensor | None]] = []
+
+    def begin(self, td: TensorDictBase) -> None:
+        self.start = td.clone(recurse=False)
+        self.inner.begin(td)
+
+    def score_rows(self, state: LayerState) -> Tensor:
+        rows = self.inner.score_rows(state)
+        self.scored.append((replace(state), rows))
+        return rows
+
+    def after_layer(self, index: int, state: LayerState) -> Tensor | None:
+        before = replace(state)
+        keep = self.inner.after_layer(index, state)
+        self.answered.append((before, keep))
+        return keep
+
+    def choose(self) -> None:
+        """All of the pruner's own work."""
+        td = self.start.clone(recurse=False)
+        self.inner.begin(td)
+        for state, _ in self.scored:
+            self.inner.score_rows(replace(state, td=td))
+        for state, _ in self.answered:
+            self.inner.after_layer(state.layer, replace(state, td=td))
+        self.inner.end(td)
+
+    def score(self, heads: int) -> None:
+        """The scores of all scored layers, on numbers that are as good as queries and keys."""
+        for state, rows in self.scored:
+            projected = state.hidden.unflatten(-1, (heads, -1)).transpose(1, 2)
+            visual_scores(state, projected, projected, rows)
+
+    def gather(self) -> None:
+        """The shorter sequences of all layers that dropped tokens."""
+        for state, keep in self.answered:
+            if keep is not None:
+                pack(state, state.alive & (keep | ~state.is_visual))
+
+
+def _watched(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Watch:
+    """What ``pruner`` did in a query of this model."""
+    watch = _Watch(pruner)
+    with_pruner(policy, watch)(query.clone(recurse=False))
+    return watch
+
+
+def _queries(policy: VLAPolicy) -> tuple[TensorDict, TensorDict]:
+    """The first two queries of an episode, [1]: noise for images, and the same with some patches drawn anew."""
+    config, generator = policy.network.config, torch.Generator().manual_seed(0)
+    size, rows = (1, 3, config.image_size, config.image_size), config.grid[0]
+    first = TensorDict({keys.INSTRUCTION: [_INSTRUCTION]}, [1])
+    first[keys.STATE] = torch.rand(1, config.state_dim, generator=generator)
+    first[keys.IS_INIT] = torch.ones(1, 1, dtype=torch.bool)
+    second = first.clone()
+    second[keys.IS_INIT] = torch.zeros(1, 1, dtype=torch.bool)
+    for camera in config.cameras:
+        before, after = (torch.randint(256, size, generator=generator, dtype=torch.uint8) for _ in range(2))
+        changed = torch.rand(rows, rows, generator=generator) < _CHANGED
+        changed = changed.repeat_interleave(config.patch_size, 0).repeat_interleave(config.patch_size, 1)
+        first[camera], second[camera] = before, torch.where(changed, after, before)
+    device = next(policy.network.parameters()).device
+    return first.to(device), second.to(device)

@@ -1,0 +1,280 @@
+"""The methods of a benchmark by name, and the queries on which they are compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.bac import SCHEDULES
+from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.blocks.planner import Dense, Planner
+from torchrl_sparse.blocks.sag.planner import SAGPruner
+from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.uniform import Uniform
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency, num_threads, summarize_latency
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.clock import synchronised_clock
+
+_CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
+# Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
+EVALUATION_SEED = 100_000
+CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
+_FEWER_STEPS = re.compile(r"ddim([1-9]\d*|(?:_\d+)+)")
+METHODS = "dense, ddim<N>, ddim_<t>_<t>..., uniform, " + ", ".join(SCHEDULES)
+
+
+@dataclass(frozen=True)
+class MethodName:
+    """A method as it is written: ``PLAN`` or ``PLAN@RATE`` or ``PLAN@COARSE-FINE``.
+
+    Attributes:
+        plan: dense, ddim<N> (at diffusers' timesteps), ddim_90_50_10 (at those), uniform, a BAC schedule, or the name of a
+            planner's file or folder.
+        rates: prune rates for a pruner that takes them: none, one for every query, or two, the one of coarse and the one of
+            fine motion, between which an `ActionAwareController` switches.
+    """
+
+    plan: str
+    rates: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, text: str) -> MethodName:
+        """Raises ValueError unless ``text`` is written as above.
+
+        >>> MethodName.parse("sag_rates@0.95-0.7")
+        MethodName(plan='sag_rates', rates=(0.95, 0.7))
+        """
+        match = re.fullmatch(r"(\w+)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        if match is None:
+            raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
+        plan, *rates = match.groups()
+        return cls(plan, tuple(float(rate) for rate in rates if rate is not None))
+
+    def gate(self) -> ActionAwareController | None:
+        """What re-plans and moves the rate while an episode runs."""
+        if len(self.rates) < 2:
+            return None
+        coarse, fine = self.rates
+        return ActionAwareController(coarse=coarse, fine=fine, budget_key=keys.PRUNE_RATE)
+
+
+def check_method(name: str, plans: Path) -> None:
+    """Raises ValueError unless ``name`` is one of `METHODS` or there is a file or folder of that name in ``plans``."""
+    plan = MethodName.parse(name).plan
+    known = plan in ("dense", "uniform", *SCHEDULES) or _FEWER_STEPS.fullmatch(plan)
+    if not known and _planner_path(plans, plan) is None:
+        raise ValueError(
+            f"methods: expected {METHODS}, or a schedule or pruner in {plans} ({plan}.json or {plan}/), got {name!r}"
+        )
+
+
+def make_method(
+    name: str,
+    policy: DiffusionPolicy,
+    *,
+    num_updates: int,
+    schedules: Path,
+    calibration: Callable[[], Calibration],
+) -> DiffusionPolicy:
+    """The policy under one method; it shares the network with ``policy``.
+
+    Args:
+        name: see `check_method`.
+        policy: the trained policy with its own sampler.
+        num_updates: M of the BAC schedules, and updates of ``uniform``.
+        schedules: folder of schedules, ``<name>.json``, and pruners, ``<name>/``. A BAC schedule that is not there, or was made
+            with another M, is computed.
+        calibration: called where a schedule has to be computed.
+
+    Raises:
+        ValueError: for an unknown name, a planner that was made for another policy, or a rate that it does not take.
+    """
+    check_method(name, schedules)
+    method = MethodName.parse(name)
+    sampler, plan = policy.sampler, Dense()
+    if _FEWER_STEPS.fullmatch(method.plan):
+        sampler = _fewer_steps(method.plan, policy.sampler.num_train_timesteps)
+    elif method.plan == "uniform":
+        plan = Uniform(interval=-(-policy.num_inference_steps // num_updates))
+    elif method.plan in SCHEDULES:
+        plan = _bac(method.plan, policy, num_updates, schedules, calibration)
+    elif method.plan != "dense":
+        plan, sampler = _saved_planner(_planner_path(schedules, method.plan), policy)
+    if method.rates:
+        _set_rates(name, plan, method.rates)
+    return DiffusionPolicy(
+        policy.network,
+        policy.normalizer,
+        vision=policy.vision,
+        sampler=sampler,
+        plan=plan,
+        engine=policy.engine,
+    )
+
+
+def _fewer_steps(name: str, num_train_timesteps: int) -> Sampler:
+    if name.startswith("ddim_"):
+        return Sampler.from_name(name, num_train_timesteps=num_train_timesteps)
+    return Sampler("ddim", int(name.removeprefix("ddim")), num_train_timesteps)
+
+
+def _planner_path(plans: Path, name: str) -> Path | None:
+    candidates = (plans / f"{name}.json", plans / name / "config.json")
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _saved_planner(path: Path, policy: DiffusionPolicy) -> tuple[Planner, Sampler]:
+    """A schedule or a pruner, and the sampler that it was made for."""
+    if path.name == "config.json":
+        planner = SAGPruner.from_pretrained(path.parent)
+        sampler, num_steps = planner.info.sampler, len(planner.network.timesteps)
+    else:
+        planner = StaticSchedule(path)
+        sampler, num_steps = planner.schedule.sampler, planner.schedule.num_inference_steps
+    return planner, Sampler.from_name(sampler, num_steps, policy.sampler.num_train_timesteps)
+
+
+def _set_rates(name: str, plan: Planner, rates: tuple[float, ...]) -> None:
+    """Sets the rate of queries that bring none; a wrong one is found now and not in mid-episode."""
+    if not isinstance(plan, SAGPruner):
+        raise ValueError(f"methods: {name}: only a pruner takes a rate, got {type(plan).__name__}")
+    for rate in reversed(rates):
+        plan.rate = rate
+
+
+def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
+    path = schedules / f"{name}.json"
+    if path.exists():
+        found = Schedule.load(path)
+        if found.settings.get("num_updates") == num_updates:
+            return StaticSchedule(found)
+    return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
+
+
+def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
+    """Arguments of `make_env` for an environment that shows what ``policy`` observes.
+
+    Raises:
+        ValueError: if the policy has cameras and its ``source`` does not say which.
+    """
+    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
+    if policy.vision is None:
+        return options
+    named = policy.source.get("cameras", {})
+    cameras = {name: named.get(name, "") for name in policy.vision.cameras}
+    if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
+        raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
+    return (
+        options | camera_options(cameras) | {"image_size": policy.vision.image_size[0], "object_state": False}
+    )
+
+
+def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
+    """Arguments of `make_env` for images by their names here and in demonstrations.
+
+    >>> camera_options({"image": "agentview_image"})
+    {'camera': 'agentview'}
+    """
+    return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}
+
+
+def calibrate_policy(
+    policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
+) -> Calibration:
+    """Calibrates on the first observation of one episode per seed, as BAC's release does with a single one."""
+    env = make_env(seeds=list(seeds))
+    first = torch.stack([env.reset() for _ in seeds])
+    env.close()
+    encoded = policy.module["encode"](first)
+    noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
+    return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
+
+
+def record_queries(
+    actor: ChunkExecutor, make_env: Callable[..., EnvBase], seeds: Sequence[int]
+) -> TensorDictBase:
+    """Every query of one episode per seed: [number of queries], with what the policy read and what it answered."""
+    env = make_env(seeds=list(seeds))
+    episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
+    env.close()
+    wanted = [*actor.policy.in_keys, *actor.policy.out_keys]
+    return torch.cat([steps[steps[keys.QUERIED].squeeze(-1)].select(*wanted) for steps in episodes])
+
+
+def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:
+    """Asks another method the same: same observations, same noise."""
+    with torch.no_grad():
+        return policy(queries.select(*policy.in_keys, strict=False))
+
+
+def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:
+    """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
+    return {
+        "method": name,
+        "policy": policy.fingerprint,
+        "engine": policy.engine,
+        "sampler": policy.sampler.config,
+        "planner": policy.plan.fingerprint,
+    }
+
+
+def time_queries(
+    methods: Mapping[str, DiffusionPolicy],
+    queries: TensorDictBase,
+    *,
+    repeats: int,
+    threads: int,
+    on_round: Callable[[int, int], None] | None = None,
+) -> dict[str, Latency]:
+    """Latency of recorded queries [N] under each method, interleaved; see `measure_latency`.
+
+    Every round asks all methods the next query: asked the same again, an engine would know the mask already.
+    """
+    calls = {
+        name: partial(_answer_next, method, cycle(queries.unbind(0))) for name, method in methods.items()
+    }
+    return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)
+
+
+def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> None:
+    answer(policy, next(queries))
+
+
+def time_planning(
+    methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
+) -> dict[str, Latency]:
+    """Latency of the planners alone, within recorded queries [N]: from their encoding to their denoising, interleaved.
+
+    In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
+    """
+    seconds = {name: [] for name in methods}
+    with num_threads(threads), torch.no_grad():
+        for policy in methods.values():
+            answer(policy, queries[0])  # the first takes longer
+        for query in queries.unbind(0):
+            for name, policy in methods.items():
+                seconds[name].append(_planning_seconds(policy, query))
+    return {name: summarize_latency(samples) for name, samples in seconds.items()}
+
+
+def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
+    device = next(policy.network.parameters()).device
+    encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
+    start = synchronised_clock(device)
+    planned = policy.module["plan"](encoded)
+    seconds = synchronised_clock(device) - start
+    policy.module["denoise"](planned)
+    return seconds

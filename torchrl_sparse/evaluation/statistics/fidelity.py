@@ -1,0 +1,97 @@
+"""How far a sparse query is from the dense one on the same observation and the same noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
+
+if TYPE_CHECKING:
+    from torchrl_sparse.networks.diffusion.sampler import Sampler
+    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["action_error", "block_errors", "relative_error"]
+
+
+def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
+    """Mean and maximum absolute difference of action entries, in the units of the chunks.
+
+    Args:
+        chunks: of the method, [..., H, A].
+        dense_chunks: of the dense policy on the same observations and noise, same shape.
+
+    Raises:
+        ValueError: if the shapes differ.
+
+    >>> mean, largest = action_error(torch.tensor([[[0.0, 0.5]]]), torch.tensor([[[0.0, 0.0]]]))
+    >>> mean, largest
+    (0.25, 0.5)
+    """
+    if chunks.shape != dense_chunks.shape:
+        raise ValueError(f"chunks: expected shape {tuple(dense_chunks.shape)}, got {tuple(chunks.shape)}")
+    difference = (chunks - dense_chunks).abs()
+    return float(difference.mean()), float(difference.max())
+
+
+def relative_error(features: Tensor, dense_features: Tensor) -> Tensor:
+    """``‖x − dense‖₂ / ‖dense‖₂`` of every block's output at every denoising step, averaged over samples.
+
+    Args:
+        features: [3L, K, B, ...] outputs as :class:`FeatureRecorder` returns them.
+        dense_features: of the dense run on the same noise, same shape.
+
+    Returns:
+        f64 [K, 3L].
+
+    Raises:
+        ValueError: if the shapes differ.
+
+    >>> relative_error(torch.full((3, 2, 1, 4), 1.5), torch.ones(3, 2, 1, 4)).shape
+    torch.Size([2, 3])
+    """
+    if features.shape != dense_features.shape:
+        expected, got = tuple(dense_features.shape), tuple(features.shape)
+        raise ValueError(f"features: expected shape {expected}, got {got}")
+    dense = dense_features.double().flatten(3)
+    difference = features.double().flatten(3) - dense
+    norm = dense.norm(dim=-1).clamp_min(torch.finfo(torch.float64).tiny)
+    return (difference.norm(dim=-1) / norm).mean(dim=-1).T
+
+
+@torch.no_grad()
+def block_errors(
+    network: TransformerForDiffusion,
+    sampler: Sampler,
+    noise: Tensor,
+    cond: Tensor,
+    masks: Mapping[str, Tensor],
+) -> dict[str, Tensor]:
+    """The error surge (figure 3 of BAC, arXiv:2506.13456): relative errors of the blocks under several
+    schedules.
+
+    Args:
+        network: the denoiser, in eval mode.
+        sampler: the denoising steps, K of them.
+        noise: f32 [N, K, H, A], as :func:`~torchrl_sparse.blocks.engine.reference.denoise` takes it.
+        cond: encoded observations f32 [N, To, D].
+        masks: name -> sampler, bool [K, 3L], True = pruned.
+
+    Returns:
+        name -> f64 [K, 3L], see :func:`relative_error`.
+
+    Raises:
+        ValueError: if shapes do not fit or a mask prunes its first row.
+    """
+
+    def features(mask: Tensor | None) -> Tensor:
+        recorder = FeatureRecorder()
+        batched = None if mask is None else mask.expand(len(cond), -1, -1)
+        denoise(network, sampler, noise, cond, batched, record=recorder)
+        return recorder.features()
+
+    dense = features(None)
+    return {name: relative_error(features(mask), dense) for name, mask in masks.items()}

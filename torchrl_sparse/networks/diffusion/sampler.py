@@ -1,0 +1,230 @@
+"""Denoising schedules: diffusers' DDPM and DDIM schedulers with every noise tensor handed in from outside.
+
+Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta
+schedule (arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0)
+samples the same network in any smaller number of steps, by default at diffusers' ``"leading"`` timesteps, as Diffusion
+Policy does. Those lie evenly, end at 0 and, in few steps, begin far below the noise that the sample starts with (three of
+a hundred: 66, 33, 0); ``timesteps`` puts them elsewhere, and `torchrl_sparse.training.diffusion.timesteps` finds where.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from numbers import Integral
+from typing import Any, Literal
+
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler
+from torch import Tensor
+
+__all__ = ["Sampler", "split_sampler", "timesteps_fall"]
+
+
+class Sampler:
+    """The denoising steps of one query, in execution order, and the noising of training.
+
+    Scheduler steps of diffusers draw their own noise; here the caller passes it, so that two methods can
+    share all noise of a query. The arithmetic is the scheduler's own.
+
+    Args:
+        kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
+        num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
+            ``timesteps``, or without those for all training steps.
+        num_train_timesteps: diffusion steps that the network was trained with.
+        timesteps: of DDIM's steps where they are not to be diffusers' own: K falling diffusion timesteps.
+
+    Attributes:
+        timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
+        previous_timesteps: the timestep that each of them leads to; -1, the clean sample, in the end.
+        scheduler: the diffusers scheduler.
+
+    Raises:
+        ValueError: on an unknown ``kind``, a number of steps out of range, or ``timesteps`` that do not fall or are not DDIM's.
+
+    Examples:
+        >>> sampler = Sampler("ddim", num_inference_steps=10)
+        >>> sampler.timesteps.tolist()
+        [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]
+        >>> import torch
+        >>> sample = torch.zeros(1, 10, 7)
+        >>> sampler.step(torch.zeros_like(sample), 0, sample).shape
+        torch.Size([1, 10, 7])
+        >>> Sampler("ddim", timesteps=[90, 50, 10]).name
+        'ddim_90_50_10'
+    """
+
+    def __init__(
+        self,
+        kind: Literal["ddpm", "ddim"] = "ddpm",
+        num_inference_steps: int | None = None,
+        num_train_timesteps: int = 100,
+        *,
+        timesteps: Sequence[int] | None = None,
+    ) -> None:
+        if kind not in ("ddpm", "ddim"):
+            raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
+        if num_inference_steps is None:
+            num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
+        if not 1 <= num_inference_steps <= num_train_timesteps:
+            raise ValueError(
+                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
+                f"got {num_inference_steps}"
+            )
+        self.kind = kind
+        self.num_inference_steps = num_inference_steps
+        self.num_train_timesteps = num_train_timesteps
+        common = {
+            "num_train_timesteps": num_train_timesteps,
+            "beta_schedule": "squaredcos_cap_v2",
+            "clip_sample": True,
+            "prediction_type": "epsilon",
+        }
+        if kind == "ddpm":
+            self.scheduler = DDPMScheduler(variance_type="fixed_small", **common)
+        else:
+            self.scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
+        self.scheduler.set_timesteps(num_inference_steps)
+        self._chosen = None if timesteps is None else self._checked(timesteps)
+        self.timesteps: Tensor = (
+            self.scheduler.timesteps.clone() if timesteps is None else torch.tensor(self._chosen)
+        )
+        self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
+
+    @classmethod
+    def from_name(
+        cls, name: str, num_inference_steps: int | None = None, num_train_timesteps: int = 100
+    ) -> Sampler:
+        """The sampler of that `name`; without ``num_inference_steps`` that of the constructor without it.
+
+        Raises:
+            ValueError: if no sampler is called that, or not with so many steps.
+        """
+        kind, timesteps = split_sampler(name)
+        return cls(kind, num_inference_steps, num_train_timesteps, timesteps=timesteps)
+
+    @property
+    def name(self) -> str:
+        """``"ddpm"``, ``"ddim"``, or with its timesteps, where they were chosen, ``"ddim_90_50_10"``."""
+        return "_".join([self.kind, *map(str, self._chosen or [])])
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The constructor's arguments: ``Sampler(**sampler.config)`` is an equal sampler."""
+        config = {
+            "kind": self.kind,
+            "num_inference_steps": self.num_inference_steps,
+            "num_train_timesteps": self.num_train_timesteps,
+        }
+        return config if self._chosen is None else config | {"timesteps": self._chosen}
+
+    def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
+        """The sample after denoising step ``k``.
+
+        Args:
+            eps: predicted noise [B, H, A].
+            k: index of the denoising step in execution order, 0 .. K-1.
+            sample: the sample that ``eps`` was predicted for, [B, H, A].
+            noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by
+                DDIM nor by the last step.
+
+        Raises:
+            IndexError: if ``k`` is not in 0..K-1.
+            ValueError: if DDPM needs ``noise_k`` and it is None.
+        """
+        if not 0 <= k < self.num_inference_steps:
+            raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
+        timestep = int(self.timesteps[k])
+        if self.kind == "ddim":
+            return _ddim_step(self.scheduler, eps, timestep, self.previous_timesteps[k], sample)
+        if timestep == 0:
+            # diffusers adds no noise at timestep 0, so the step is a pure function of its inputs.
+            return self.scheduler.step(eps, timestep, sample).prev_sample
+        if noise_k is None:
+            raise ValueError(f"DDPM step k={k} (timestep {timestep}) needs noise_k, got None")
+        return _ddpm_step(self.scheduler, eps, timestep, sample, noise_k)
+
+    def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
+        """Noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
+
+        Args:
+            clean: normalised actions [B, H, A].
+            noise: standard normal [B, H, A].
+            timestep: i64 [B], 0 .. num_train_timesteps - 1.
+        """
+        return self.scheduler.add_noise(clean, noise, timestep)
+
+    def _checked(self, timesteps: Sequence[int]) -> list[int]:
+        chosen = list(timesteps)
+        whole = all(isinstance(timestep, Integral) for timestep in chosen)
+        falls = whole and timesteps_fall(chosen, self.num_train_timesteps)
+        if self.kind != "ddim" or not falls or len(chosen) != self.num_inference_steps:
+            raise ValueError(
+                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
+                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {chosen} of kind "{self.kind}"'
+            )
+        return [int(timestep) for timestep in chosen]
+
+    def __repr__(self) -> str:
+        return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+    """Whether a sampler may take them in this order: each below the last, from under ``num_train_timesteps`` to at least 0.
+
+    >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
+    (True, False, False)
+    """
+    return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
+
+
+def split_sampler(name: str) -> tuple[str, list[int] | None]:
+    """Kind and chosen timesteps of a `Sampler.name`.
+
+    Raises:
+        ValueError: if it is none.
+
+    Examples:
+        >>> split_sampler("ddim_90_50_10"), split_sampler("ddpm")
+        (('ddim', [90, 50, 10]), ('ddpm', None))
+    """
+    match = re.fullmatch(r"(ddpm|ddim)((?:_\d+)*)", name) if isinstance(name, str) else None
+    if match is None:
+        raise ValueError(f"sampler: expected 'ddpm', 'ddim' or 'ddim_<t>_<t>...', got {name!r}")
+    return match[1], [int(digits) for digits in match[2].split("_")[1:]] or None
+
+
+def _ddim_step(scheduler: DDIMScheduler, eps: Tensor, timestep: int, previous: int, sample: Tensor) -> Tensor:
+    """``DDIMScheduler.step`` (arXiv:2010.02502, Eq. 12, eta = 0) to any earlier timestep.
+
+    diffusers steps by a fixed stride; its expressions are repeated in their order, so that at that stride results are
+    equal to the last bit.
+    """
+    alpha_prod = scheduler.alphas_cumprod[timestep]
+    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.final_alpha_cumprod
+    clean = (sample - (1 - alpha_prod) ** (0.5) * eps) / alpha_prod ** (0.5)
+    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
+    return alpha_prod_prev ** (0.5) * clean + (1 - alpha_prod_prev) ** (0.5) * eps
+
+
+def _ddpm_step(scheduler: DDPMScheduler, eps: Tensor, timestep: int, sample: Tensor, noise: Tensor) -> Tensor:
+    """``DDPMScheduler.step`` (arXiv:2006.11239, Eq. 7) with the variance noise handed in.
+
+    diffusers draws the noise inside its step and offers no way to pass it; its expressions are repeated in
+    their order, so that results are equal to the last bit.
+    """
+    previous = scheduler.previous_timestep(timestep)
+    alpha_prod = scheduler.alphas_cumprod[timestep]
+    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.one
+    beta_prod = 1 - alpha_prod
+    beta_prod_prev = 1 - alpha_prod_prev
+    alpha = alpha_prod / alpha_prod_prev
+    beta = 1 - alpha
+
+    clean = (sample - beta_prod ** (0.5) * eps) / alpha_prod ** (0.5)
+    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
+    clean_coeff = (alpha_prod_prev ** (0.5) * beta) / beta_prod
+    sample_coeff = alpha ** (0.5) * beta_prod_prev / beta_prod
+    mean = clean_coeff * clean + sample_coeff * sample
+    return mean + (scheduler._get_variance(timestep) ** 0.5) * noise

@@ -1,0 +1,172 @@
+"""The sizes of a vision-language-action model: everything that fixes its architecture, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import NestedKey
+
+from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.pruning import VisualSpec
+
+__all__ = ["TransformerSize", "VLAConfig"]
+
+
+def _check_count(name: str, value: Any) -> None:
+    if not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name}: expected a positive whole number, got {value!r}")
+
+
+@dataclass(frozen=True)
+class TransformerSize:
+    """Size of a transformer.
+
+    Attributes:
+        dim: width of the residual stream.
+        layers: published number of layers. A vision tower has one fewer, since the features are those of its second-to-last.
+        heads: attention heads.
+        mlp: width of the feed-forward network.
+
+    Raises:
+        ValueError: if a size is not positive, or the width is no multiple of the heads with an even quotient.
+    """
+
+    dim: int
+    layers: int
+    heads: int
+    mlp: int
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            _check_count(field.name, getattr(self, field.name))
+        if self.dim % (2 * self.heads):
+            raise ValueError(
+                f"dim: expected a multiple of 2 * heads = {2 * self.heads} (rotary embeddings), got {self.dim}"
+            )
+
+
+@dataclass(frozen=True)
+class VLAConfig:
+    """Architecture of OpenVLA-OFT (arXiv:2502.19645) at any size; the defaults are the published 7B model for LIBERO.
+
+    Attributes:
+        dino: the DINOv2 tower (with registers).
+        siglip: the SigLIP tower.
+        llm: the Llama decoder.
+        vocab_size: rows of the decoder's embedding.
+        image_size: height and width of the images in pixels.
+        patch_size: of both towers, pixels.
+        registers: register tokens of the DINOv2 tower.
+        cameras: keys of the images, primary first.
+        state_dim: numbers of ``("observation", "state")``.
+        action_dim: numbers of an action A.
+        chunk_size: actions of a chunk H.
+        crop_area: share of the image's area that is kept, centred, and scaled back; 0.9 for the published checkpoints.
+
+    Raises:
+        ValueError: if sizes do not fit together.
+
+    Examples:
+        >>> VLAConfig().num_visual, VLAConfig().num_slots, VLAConfig.tiny().num_visual
+        (512, 56, 8)
+        >>> VLAConfig.from_dict(VLAConfig.tiny().to_dict()) == VLAConfig.tiny()
+        True
+    """
+
+    dino: TransformerSize = TransformerSize(1024, 24, 16, 4096)
+    siglip: TransformerSize = TransformerSize(1152, 27, 16, 4304)
+    llm: TransformerSize = TransformerSize(4096, 32, 32, 11008)
+    vocab_size: int = 32064
+    image_size: int = 224
+    patch_size: int = 14
+    registers: int = 4
+    cameras: tuple[NestedKey, ...] = (keys.IMAGE, keys.WRIST_IMAGE)
+    state_dim: int = 8
+    action_dim: int = 7
+    chunk_size: int = 8
+    crop_area: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("vocab_size", "image_size", "patch_size", "state_dim", "action_dim", "chunk_size"):
+            _check_count(name, getattr(self, name))
+        if self.image_size % self.patch_size:
+            raise ValueError(
+                f"image_size: expected a multiple of patch_size={self.patch_size}, got {self.image_size}"
+            )
+        if min(self.dino.layers, self.siglip.layers) < 2:
+            raise ValueError(
+                f"expected towers of at least 2 layers, got dino {self.dino.layers}, siglip {self.siglip.layers}"
+            )
+        if self.dino.mlp % self.dino.dim:
+            raise ValueError(
+                f"dino.mlp: expected a multiple of dino.dim={self.dino.dim}, got {self.dino.mlp}"
+            )
+        if not 1 <= len(self.cameras) <= 2:
+            raise ValueError(f"cameras: expected one or two keys, got {list(self.cameras)}")
+        if not 0 < self.crop_area <= 1:
+            raise ValueError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
+
+    @classmethod
+    def tiny(cls, **changes: Any) -> VLAConfig:
+        """For tests: runs in milliseconds. ``changes`` are other attributes."""
+        tower = TransformerSize(16, 2, 2, 32)
+        sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(32, 4, 2, 64), "vocab_size": 320}
+        return cls(**{**sizes, "image_size": 28, "chunk_size": 2, **changes})
+
+    @classmethod
+    def small(cls, **changes: Any) -> VLAConfig:
+        """About 3 million parameters, 2 x 36 visual tokens: trainable on a CPU core. ``changes`` are other attributes."""
+        tower = TransformerSize(96, 4, 4, 384)
+        sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(128, 8, 4, 384), "vocab_size": 512}
+        return cls(**{**sizes, "image_size": 84, **changes})
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of patches of an image."""
+        return (self.image_size // self.patch_size,) * 2
+
+    @property
+    def num_visual(self) -> int:
+        """Visual tokens N of all cameras."""
+        return self.visual_spec.num_visual
+
+    @property
+    def num_slots(self) -> int:
+        """Action tokens of the decoder: one for each number of a chunk."""
+        return self.chunk_size * self.action_dim
+
+    @property
+    def visual_spec(self) -> VisualSpec:
+        """What a token pruner has to know."""
+        return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        fields = dataclasses.asdict(self)
+        fields["cameras"] = [list(key) if isinstance(key, tuple) else key for key in self.cameras]
+        return fields
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> VLAConfig:
+        """What `to_dict` gave, all of it.
+
+        Raises:
+            ValueError: if a field is missing, unknown or wrong.
+        """
+        names = {field.name for field in dataclasses.fields(cls)}
+        if not isinstance(fields, Mapping) or set(fields) != names:
+            found = sorted(fields) if isinstance(fields, Mapping) else type(fields).__name__
+            raise ValueError(f"expected the fields {sorted(names)}, got {found}")
+        towers = {name: _size(name, fields[name]) for name in ("dino", "siglip", "llm")}
+        cameras = tuple(tuple(key) if isinstance(key, list) else key for key in fields["cameras"])
+        return cls(**{**fields, **towers, "cameras": cameras})
+
+
+def _size(name: str, fields: Any) -> TransformerSize:
+    try:
+        return TransformerSize(**fields)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error

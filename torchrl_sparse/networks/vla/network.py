@@ -1,0 +1,147 @@
+"""The network of OpenVLA-OFT (arXiv:2502.19645): images, state and prompt in, a normalised action chunk out, in one pass.
+
+Sequence: ``BOS | primary patches | wrist patches | proprio | prompt | action slots | stop``. The embedding of a slot is zero,
+only its position tells it from the others. As in next-token prediction, a slot is read out from the token *before* it: the
+last prompt token and all slots but the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, Decoded
+from torchrl_sparse.networks.vla.heads import L1ActionHead, ProprioProjector
+from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner
+from torchrl_sparse.networks.vla.text import BOS_ID, STOP_ID, Prompts
+from torchrl_sparse.networks.vla.vision import FusedProjector, VisionTowers
+
+__all__ = ["VLANetwork", "make_network"]
+
+
+class VLANetwork(nn.Module):
+    """Images, state and prompts to a chunk of normalised actions.
+
+    Args:
+        config: its sizes.
+
+    Examples:
+        >>> from torchrl_sparse.networks.vla.text import WordTokenizer
+        >>> network = VLANetwork(VLAConfig.tiny())
+        >>> prompts = WordTokenizer(["lift", "the", "cube"]).encode(["lift the cube", "lift"])
+        >>> images = torch.zeros(2, 2, 3, 28, 28, dtype=torch.uint8)
+        >>> actions, decoded = network(images, torch.zeros(2, 8), prompts)
+        >>> actions.shape, decoded.tokens.shape
+        (torch.Size([2, 2, 7]), torch.Size([2, 4]))
+    """
+
+    def __init__(self, config: VLAConfig):
+        super().__init__()
+        self.config = config
+        self.vision = VisionTowers(config)
+        self.projector = FusedProjector(config)
+        self.proprio = ProprioProjector(config)
+        self.decoder = BidirectionalLlama(config)
+        self.head = L1ActionHead(config)
+
+    def forward(
+        self,
+        images: Tensor,
+        state: Tensor,
+        prompts: Prompts,
+        *,
+        keep_mask: Tensor | None = None,
+        pruner: TokenPruner | None = None,
+        td: TensorDictBase | None = None,
+    ) -> tuple[Tensor, Decoded]:
+        """Actions [B, H, A], f32, and what the decoder did.
+
+        Args:
+            images: u8 [B, cameras, 3, h, w], cropped where the model was trained so.
+            state: f32 [B, state_dim], normalised.
+            prompts: tokenised prompts of the B samples.
+            keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
+            pruner: drops visual tokens between the layers; nothing by default.
+            td: the query that ``pruner`` sees, [B].
+        """
+        td = TensorDict({}, [len(images)], device=images.device) if td is None else td
+        visual = self.visual_tokens(images)
+        sequence = self._sequence(visual, state, prompts, keep_mask, td)
+        decoded = replace(self.decoder(sequence, TokenPruner() if pruner is None else pruner), visual=visual)
+        return self.head(self.readout(decoded)).float(), decoded
+
+    def visual_tokens(self, images: Tensor) -> Tensor:
+        """[B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
+        return self.projector(self.vision(images.flatten(0, 1))).unflatten(0, images.shape[:2]).flatten(1, 2)
+
+    def _sequence(
+        self, visual: Tensor, state: Tensor, prompts: Prompts, keep_mask: Tensor | None, td: TensorDictBase
+    ) -> LayerState:
+        """The decoder's input; tokens that are pruned already or pad a prompt are in it, but not alive."""
+        batch, num_visual, width = visual.shape
+        slots, text, device = self.config.num_slots, prompts.mask, visual.device
+        ends = self.decoder.embed(torch.tensor([BOS_ID, STOP_ID], device=device)).expand(batch, 2, width)
+        proprio = self.proprio(state.to(visual.dtype))[:, None]
+        words = self.decoder.embed(prompts.ids)
+        blank = visual.new_zeros(batch, slots, width)
+        hidden = torch.cat([ends[:, :1], visual, proprio, words, blank, ends[:, 1:]], dim=1)
+
+        def ones(count: int) -> Tensor:
+            return text.new_ones(batch, count)
+
+        keep = ones(num_visual) if keep_mask is None else keep_mask
+        alive = torch.cat([ones(1), keep, ones(1), text, ones(slots + 1)], dim=1)
+        front = torch.arange(num_visual + 2 + text.shape[1], device=device).expand(batch, -1)
+        after_text = num_visual + 2 + text.sum(1, keepdim=True)
+        back = after_text + torch.arange(slots + 1, device=device)
+        positions = torch.cat([front, back], dim=1)
+        task = torch.cat([~ones(num_visual + 2), prompts.task, ~ones(slots + 1)], dim=1)
+        kind = self._kinds(text.shape[1], device).expand(batch, -1)
+        return LayerState(0, hidden, alive, positions, kind, task, num_visual, td)
+
+    def _kinds(self, text: int, device: torch.device) -> Tensor:
+        """i64 [S], `TokenKind` of a sequence with ``text`` prompt tokens."""
+        views = list(zip((TokenKind.PRIMARY, TokenKind.WRIST), self.config.visual_spec.views, strict=False))
+        counts = [(TokenKind.BOS, 1), *((kind, view.stop - view.start) for kind, view in views)]
+        counts += [(TokenKind.PROPRIO, 1), (TokenKind.TEXT, text)]
+        counts += [(TokenKind.ACTION, self.config.num_slots), (TokenKind.STOP, 1)]
+        kinds, repeats = (torch.tensor(column, device=device) for column in zip(*counts, strict=True))
+        return kinds.repeat_interleave(repeats)
+
+    def readout(self, decoded: Decoded) -> Tensor:
+        """What actions are read from, [B, H * A, d].
+
+        A row ends with last prompt token, slots, stop; all of these but the last two are read.
+        """
+        slots = self.config.num_slots
+        first = decoded.lengths[:, None] - slots - 2
+        index = first + torch.arange(slots, device=first.device)
+        return decoded.hidden.gather(1, index[..., None].expand(-1, -1, decoded.hidden.shape[-1]))
+
+
+def make_network(
+    config: VLAConfig, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> VLANetwork:
+    """An untrained network whose weights are made as ``dtype`` on ``device``: the published size takes no room elsewhere.
+
+    >>> make_network(VLAConfig.tiny(), dtype=torch.bfloat16).head.fc2.weight.dtype
+    torch.bfloat16
+    """
+    with torch.device(device), _default_dtype(dtype):
+        return VLANetwork(config)
+
+
+@contextmanager
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)

@@ -1,0 +1,127 @@
+"""The configuration in a published checkpoint: OmegaConf objects in a pickle, read as data.
+
+References to other entries (``${task.obs_dim}``) are followed. Expressions (``${eval:'...'}``,
+``${now:...}``) are text that is never evaluated.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from typing import Any
+
+from torchrl_sparse.storage.published.inert_pickle import PLAIN, Name, Record
+
+__all__ = ["KNOWN_NAMES", "PublishedConfig"]
+
+_NODES = ("AnyNode", "StringNode", "IntegerNode", "FloatNode", "BooleanNode")
+_CONTAINERS = {"omegaconf.dictconfig.DictConfig": dict, "omegaconf.listconfig.ListConfig": list}
+_RECORDS = [
+    *_CONTAINERS,
+    *(f"omegaconf.nodes.{node}" for node in _NODES),
+    *("omegaconf.base.Metadata", "omegaconf.base.ContainerMetadata"),
+]
+_TYPES = [f"builtins.{name}" for name in ("dict", "list", "tuple", "str", "int", "float", "bool", "object")]
+
+KNOWN_NAMES = {
+    **PLAIN,
+    **{name: partial(Record, name) for name in _RECORDS},
+    # Types appear where OmegaConf notes what an entry may hold.
+    **dict.fromkeys(["typing.Any", *_TYPES]),
+    **{f"dill.{module}._load_type": Name for module in ("_dill", "dill")},
+}
+"""What a pickled configuration mentions, for `read_pickle`."""
+
+_REFERENCE = re.compile(r"\$\{([\w.]+)\}")
+_MAX_DEPTH = 32
+_REQUIRED = object()
+
+
+class PublishedConfig:
+    """Entries by dotted path.
+
+    Args:
+        tree: what `read_pickle` found: records of OmegaConf objects, or plain containers.
+
+    Raises:
+        ValueError: if it is no configuration.
+
+    Examples:
+        >>> config = PublishedConfig({"n_obs_steps": 2, "policy": {"steps": "${n_obs_steps}"}})
+        >>> config.get("policy.steps", int)
+        2
+    """
+
+    def __init__(self, tree: Any) -> None:
+        self._tree = _plain(tree, {}, _MAX_DEPTH)
+        if not isinstance(self._tree, dict):
+            raise ValueError(f"cfg: expected a configuration, got {type(tree).__name__}")
+
+    def get(self, path: str, kind: type, default: Any = _REQUIRED) -> Any:
+        """The entry at ``path``, references followed.
+
+        Args:
+            path: keys joined by dots.
+            kind: type of the entry; float also takes integers.
+            default: what to return if there is none, or None is there; required without.
+
+        Raises:
+            ValueError: if the entry is missing, of another type, or an expression.
+        """
+        value = self._find(path, _MAX_DEPTH)
+        if value is None:
+            if default is _REQUIRED:
+                raise ValueError(f"cfg: expected an entry {path}, got none")
+            return default
+        if isinstance(value, str) and "${" in value:
+            raise ValueError(
+                f"cfg: {path}: expected a value, got the expression {value[:80]!r}: none is evaluated"
+            )
+        accepted = (int, float) if kind is float else kind
+        if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+            raise ValueError(f"cfg: {path}: expected {kind.__name__}, got {type(value).__name__}")
+        return value
+
+    def _find(self, path: str, depth: int) -> Any:
+        node: Any = self._tree
+        for key in path.split("."):
+            node = self._follow(node.get(key) if isinstance(node, dict) else None, path, depth)
+        return node
+
+    def _follow(self, node: Any, path: str, depth: int) -> Any:
+        reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
+        if reference is None:
+            return node
+        if depth == 0:
+            raise ValueError(f"cfg: {path}: expected a value, got references that go round in a circle")
+        return self._find(reference.group(1), depth - 1)
+
+
+def _plain(node: Any, done: dict[int, Any], depth: int) -> Any:
+    """Dicts, lists and values; ``done`` keeps a node that is mentioned many times from being unfolded each time."""
+    if depth == 0:
+        raise ValueError(f"cfg: expected a configuration of at most {_MAX_DEPTH} levels")
+    if id(node) not in done:
+        if isinstance(node, Record):
+            inner = _content(node)
+            done[id(node)] = _plain(inner, done, depth - 1)
+        elif isinstance(node, dict):
+            done[id(node)] = {key: _plain(value, done, depth - 1) for key, value in node.items()}
+        elif isinstance(node, list):
+            done[id(node)] = [_plain(value, done, depth - 1) for value in node]
+        elif isinstance(node, (str, int, float, type(None))):
+            return node
+        else:
+            raise ValueError(f"cfg: expected plain values, got {type(node).__name__}")
+    return done[id(node)]
+
+
+def _content(record: Record) -> Any:
+    if record.name.startswith("omegaconf.nodes."):
+        return record.state.get("_val")
+    kind = _CONTAINERS.get(record.name)
+    content = record.state.get("_content")
+    # A container can also be None or, as a whole, a reference.
+    if kind is None or not isinstance(content, (kind, str, type(None))):
+        raise ValueError(f"cfg: expected containers and values of OmegaConf, got {record.name}")
+    return content

@@ -1,0 +1,242 @@
+"""Published OpenVLA-OFT checkpoints (arXiv:2502.19645), a folder as on the Hugging Face hub, as a `VLAPolicy`.
+
+Read are ``config.json``, the safetensors shards, ``action_head--*_checkpoint.pt`` and ``proprio_projector--*_checkpoint.pt``
+(tensors only), ``dataset_statistics.json`` and ``tokenizer.json``. The Python files in such a folder are neither imported nor
+looked at.
+
+The towers carry timm's names there (``featurizer`` is DINOv2, ``fused_featurizer`` SigLIP), with LayerScale's ``gamma`` renamed
+to ``scale_factor``, and the two ``.pt`` files the prefix ``module.``. The towers' last blocks and final norms, SigLIP's pooling
+head and the vocabulary projection take no part in OpenVLA-OFT and are left out.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
+from torchrl_sparse.networks.vla.network import make_network
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.text import LlamaTokenizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.files import read_json, read_tensors
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+
+__all__ = ["load_openvla_oft"]
+
+_DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
+_LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
+_FIXED_TEXT = {"rms_norm_eps": 1e-6, "rope_theta": 10000.0, "hidden_act": "silu"}
+
+_DINO_NAMES = {
+    "cls_token": "embeddings.cls_token",
+    "reg_token": "embeddings.register_tokens",
+    "patch_embed.proj": "embeddings.patch_embeddings.projection",
+    "blocks": "encoder.layer",
+    "attn.proj": "attention.o_proj",
+    "attn.qkv": "attention.qkv",
+    "ls1.scale_factor": "layer_scale1.lambda1",
+    "ls2.scale_factor": "layer_scale2.lambda1",
+}
+_SIGLIP_NAMES = {
+    "patch_embed.proj": "embeddings.patch_embedding",
+    "blocks": "encoder.layers",
+    "attn.proj": "self_attn.out_proj",
+    "attn.qkv": "self_attn.qkv",
+    "norm1": "layer_norm1",
+    "norm2": "layer_norm2",
+}
+_HEAD_NAMES = {"mlp_resnet_blocks": "blocks", ".ffn.": ".", "model.": ""}
+
+
+def load_openvla_oft(
+    path: str | Path,
+    *,
+    unnorm_key: str | None = None,
+    cameras: int = 2,
+    heads: tuple[int, int, int] = (16, 16, 32),
+    dtype: torch.dtype = torch.bfloat16,
+) -> VLAPolicy:
+    """The policy in the folder ``path``. Nothing in its files is executed.
+
+    The policy reads upright images of the published size and crops them itself. What the published evaluation did to LIBERO's
+    images before that belongs to the environment: a turn by 180 degrees, and JPEG and Lanczos on the way to 224 pixels. The
+    state is position, axis-angle and both fingers of the gripper.
+
+    Args:
+        path: the folder.
+        unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where the
+            file has it so); not needed where the file has one only.
+        cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
+        heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
+        dtype: of the network.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+    """
+    path = Path(path)
+    if list(path.glob("vision_backbone*checkpoint*")):
+        raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
+    image_size = _image_size(path / "config.json")
+    tensors = _read_shards(path) | _read_part(path, _HEAD) | _read_part(path, _PROPRIO)
+    config = _config(path, tensors, heads, image_size, VLAConfig().cameras[:cameras])
+    statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
+    normalizer = _normalizer(path / "dataset_statistics.json", statistics, config)
+    network = make_network(config, dtype=dtype)
+    weights = _rename(tensors, config)
+    check_shapes(str(path), weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
+    check_finite(str(path), weights)
+    network.load_state_dict(weights)
+    return VLAPolicy(network, normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def _image_size(path: Path) -> int:
+    config = read_json(path)
+    if not isinstance(config, dict) or config.get("model_type") != "openvla":
+        found = config.get("model_type") if isinstance(config, dict) else type(config).__name__
+        raise ValueError(f"{path}: model_type: expected 'openvla', got {found!r}")
+    text = config.get("text_config", {})
+    for name, value in _FIXED_TEXT.items():
+        if text.get(name, value) != value:
+            raise ValueError(f"{path}: text_config.{name}: expected {value}, got {text[name]}")
+    sizes = config.get("image_sizes")
+    if not isinstance(sizes, list) or len({*sizes}) != 1:
+        raise ValueError(f"{path}: image_sizes: expected one size for both towers, got {sizes}")
+    return sizes[0]
+
+
+def _read_shards(path: Path) -> dict[str, Tensor]:
+    index = path / "model.safetensors.index.json"
+    weight_map = read_json(index).get("weight_map") or {}
+    shards = sorted({*weight_map.values()})
+    if not shards or any(Path(name).name != name for name in shards):
+        raise ValueError(f"{index}: weight_map: expected file names in this folder, got {shards}")
+    tensors: dict[str, Tensor] = {}
+    for name in shards:
+        tensors |= read_tensors(path / name)
+    missing = sorted(weight_map.keys() - tensors.keys())
+    if missing:
+        raise ValueError(f"{index}: expected tensors in {shards} that are not there: {missing}")
+    return tensors
+
+
+def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
+    """Tensors of the one file ``action_head--*`` or ``proprio_projector--*``, under ``prefix``."""
+    pattern = f"{prefix.rstrip('.')}*checkpoint*"
+    files = sorted(path.glob(pattern))
+    if len(files) != 1:
+        found = [file.name for file in files]
+        raise ValueError(f"{path}: expected exactly one file {pattern}, got {found}")
+    try:
+        tensors = torch.load(files[0], map_location="cpu", weights_only=True)
+    except Exception as error:  # torch reports damaged and unsafe files through many exception types
+        raise ValueError(f"{files[0]}: expected a file of tensors, got: {error}") from error
+    return {prefix + name.removeprefix("module."): value for name, value in tensors.items()}
+
+
+def _statistics(path: Path, unnorm_key: str | None) -> dict[str, Any]:
+    every = read_json(path)
+    wanted = [unnorm_key, f"{unnorm_key}_no_noops"] if unnorm_key is not None else list(every)
+    found = [name for name in wanted if name in every]
+    if not found or (unnorm_key is None and len(found) > 1):
+        raise ValueError(f"{path}: unnorm_key: expected one of {sorted(every)}, got {unnorm_key!r}")
+    return every[found[0]]
+
+
+def _normalizer(path: Path, statistics: dict[str, Any], config: VLAConfig) -> QuantileNormalizer:
+    action, proprio = statistics.get("action", {}), statistics.get("proprio", {})
+    mask = torch.tensor(action.get("mask", [True] * config.action_dim))
+    try:
+        ranges = [torch.tensor(part[q]) for part in (proprio, action) for q in ("q01", "q99")]
+        normalizer = QuantileNormalizer(*ranges, ~mask)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected q01 and q99 of action and proprio: {error}") from error
+    found = len(normalizer.state_low), len(normalizer.action_low)
+    if found != (config.state_dim, config.action_dim):
+        raise ValueError(
+            f"{path}: expected {config.state_dim} proprio and {config.action_dim} action numbers, got {found}"
+        )
+    return normalizer
+
+
+# -- sizes and names ---------------------------------------------------------------------------------------------------
+
+
+def _config(
+    path: Path, tensors: dict[str, Tensor], heads: tuple[int, int, int], image_size: int, cameras: tuple
+) -> VLAConfig:
+    """Sizes as the shapes of the weights say."""
+
+    def shape(name: str) -> tuple[int, ...]:
+        if name not in tensors:
+            raise ValueError(f"{path}: expected a tensor {name}, got none of that name")
+        return tuple(tensors[name].shape)
+
+    def size(prefix: str, blocks: str, mlp: str, dim: int, heads: int) -> TransformerSize:
+        pattern = re.compile(re.escape(prefix + blocks) + r"\.(\d+)\.")
+        layers = {match[1] for match in map(pattern.match, tensors) if match}
+        return TransformerSize(dim, len(layers), heads, shape(f"{prefix}{blocks}.0.{mlp}.weight")[0])
+
+    vocab_size, width = shape(_LLM + "embed_tokens.weight")
+    patch = shape(_DINO + "patch_embed.proj.weight")
+    action_dim = shape(_HEAD + "model.fc2.weight")[0]
+    return VLAConfig(
+        dino=size(_DINO, "blocks", "mlp.fc1", patch[0], heads[0]),
+        siglip=size(_SIGLIP, "blocks", "mlp.fc1", shape(_SIGLIP + "pos_embed")[2], heads[1]),
+        llm=size(_LLM, "layers", "mlp.gate_proj", width, heads[2]),
+        vocab_size=vocab_size,
+        image_size=image_size,
+        patch_size=patch[2],
+        registers=shape(_DINO + "reg_token")[1],
+        cameras=cameras,
+        state_dim=shape(_PROPRIO + "fc1.weight")[1],
+        action_dim=action_dim,
+        crop_area=0.9,
+    )
+
+
+def _rename(tensors: dict[str, Tensor], config: VLAConfig) -> dict[str, Tensor]:
+    """The weights under the names of `VLANetwork`; ``tensors`` is used up."""
+    dino, siglip = take(tensors, _DINO), take(tensors, _SIGLIP)
+    # there, the class token has no position
+    positions = torch.cat([torch.zeros_like(dino["pos_embed"][:, :1]), dino.pop("pos_embed")], dim=1)
+    dino_weights = _tower(dino, _DINO_NAMES, "encoder.layer", config.dino.layers)
+    dino_weights["embeddings.position_embeddings"] = positions
+    dino_weights["embeddings.mask_token"] = torch.zeros(1, config.dino.dim)
+    positions = siglip.pop("pos_embed")[0]
+    siglip_weights = _tower(siglip, _SIGLIP_NAMES, "encoder.layers", config.siglip.layers)
+    siglip_weights["embeddings.position_embedding.weight"] = positions
+    parts = {
+        "vision.dino.": dino_weights,
+        "vision.siglip.": siglip_weights,
+        "projector.": take(tensors, "projector."),
+        "proprio.": take(tensors, _PROPRIO),
+        "decoder.llama.": take(tensors, _LLM),
+        "head.": {_replace(name, _HEAD_NAMES): value for name, value in take(tensors, _HEAD).items()},
+    }
+    take(tensors, "language_model.lm_head.")
+    return {prefix + name: v for prefix, part in parts.items() for name, v in part.items()} | tensors
+
+
+def _tower(tensors: dict[str, Tensor], names: dict[str, str], blocks: str, layers: int) -> dict[str, Tensor]:
+    """A tower's weights without those that nothing reads, with query, key and value apart."""
+    unused = (f"{blocks}.{layers - 1}.", "norm.", "attn_pool.")
+    renamed = {_replace(name, names): value for name, value in tensors.items()}
+    renamed = {name: value for name, value in renamed.items() if not name.startswith(unused)}
+    for name in [name for name in renamed if ".qkv." in name]:
+        parts = renamed.pop(name).chunk(3)
+        renamed |= {name.replace("qkv", f"{c}_proj"): v for c, v in zip("qkv", parts, strict=True)}
+    return renamed
+
+
+def _replace(name: str, names: dict[str, str]) -> str:
+    for old, new in names.items():
+        name = name.replace(old, new)
+    return name

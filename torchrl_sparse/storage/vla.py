@@ -1,0 +1,88 @@
+"""A vision-language-action policy as two files: ``config.json`` and ``model.safetensors``. Neither can hold code.
+
+::
+
+    {"format": "torchrl_sparse.vla_policy/1",
+     "network": {fields of VLAConfig},
+     "tokenizer": {"kind": "words", "words": [...]} or {"kind": "llama", "definition": {content of a tokenizer.json}}}
+
+Network weights are fp16, normalisation constants as they are.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
+from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+
+__all__ = ["read_vla", "write_vla"]
+
+FORMAT = "torchrl_sparse.vla_policy/1"
+_FIELDS = {"format", "network", "tokenizer"}
+_NETWORK, _NORMALIZER = "network.", "normalizer."
+
+
+def write_vla(
+    path: Path, *, network: VLANetwork, normalizer: QuantileNormalizer, tokenizer: InstructionTokenizer
+) -> None:
+    """Writes both files into the folder ``path``, each in one piece or not at all."""
+    tensors = {_NETWORK + name: value.half() for name, value in network.state_dict().items()}
+    tensors |= {_NORMALIZER + name: value for name, value in normalizer.state_dict().items()}
+    write_tensors(path / "model.safetensors", tensors)
+    config = {"format": FORMAT, "network": network.config.to_dict(), "tokenizer": tokenizer.to_config()}
+    write_config(path / "config.json", config)
+
+
+def read_vla(
+    path: Path, expected: VLAConfig | None = None
+) -> tuple[VLANetwork, QuantileNormalizer, InstructionTokenizer]:
+    """Network (f32, eval mode), normaliser and tokenizer from the folder ``path``.
+
+    Args:
+        path: the folder.
+        expected: the architecture that it must hold; any by default.
+
+    Raises:
+        FileNotFoundError: if a file is not there.
+        ValueError: naming the file, what was expected and what came.
+    """
+    where = path / "config.json"
+    fields = read_config(where, FORMAT, _FIELDS)
+    try:
+        config = VLAConfig.from_dict(fields["network"])
+        tokenizer = tokenizer_from_config(fields["tokenizer"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from error
+    _check_architecture(where, expected, config)
+    network, where = VLANetwork(config), path / "model.safetensors"
+    tensors = read_tensors(where)
+    weights, constants = take(tensors, _NETWORK), take(tensors, _NORMALIZER)
+    if tensors:
+        raise ValueError(
+            f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
+        )
+    identity = QuantileNormalizer.identity(config.state_dim, config.action_dim)
+    for prefix, found, module in ((_NETWORK, weights, network), (_NORMALIZER, constants, identity)):
+        check_shapes(f"{where}: {prefix}", found, _shapes(module.state_dict()))
+        check_finite(f"{where}: {prefix}", found)
+    network.load_state_dict({name: value.float() for name, value in weights.items()})
+    return network.eval(), QuantileNormalizer(**constants), tokenizer
+
+
+def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig) -> None:
+    if expected is None or found == expected:
+        return
+    want, have = expected.to_dict(), found.to_dict()
+    parts = [f"{name}: expected {want[name]}, got {have[name]}" for name in want if want[name] != have[name]]
+    raise ValueError(f"{path}: {'; '.join(parts)}")
+
+
+def _shapes(tensors: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in tensors.items()}

@@ -1,0 +1,73 @@
+"""The published shapes of Diffusion Policy's transformer on states (arXiv:2303.04137, Table VII), by task."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from torchrl_sparse.envs.benchmarks import Benchmark, find_task
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.rotations import ABSOLUTE_DIM
+
+__all__ = ["PublishedShape", "published_network", "published_shape"]
+
+
+@dataclass(frozen=True)
+class PublishedShape:
+    """What differs between tasks; all have 8 layers and 4 heads.
+
+    Attributes:
+        horizon: actions of a chunk (Tp).
+        n_obs_steps: observations of a query (To).
+        n_action_steps: actions executed of a chunk (Ta).
+        n_emb: width.
+        p_drop_attn: dropout in and after every block.
+        weight_decay: of training.
+    """
+
+    horizon: int = 10
+    n_obs_steps: int = 2
+    n_action_steps: int = 8
+    n_emb: int = 256
+    p_drop_attn: float = 0.3
+    weight_decay: float = 1e-3
+
+
+_SHAPES = {
+    "pusht": PublishedShape(horizon=16, p_drop_attn=0.01, weight_decay=1e-1),
+    "block_push": PublishedShape(horizon=5, n_obs_steps=3, n_action_steps=1),
+    "kitchen": PublishedShape(horizon=16, n_obs_steps=4, n_emb=768, p_drop_attn=0.1),
+}
+
+
+def published_shape(task: str) -> PublishedShape:
+    """The shape for a task; the robosuite tasks share one, which those without a published policy get too.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    >>> published_shape("kitchen").n_emb, published_shape("lift").n_emb
+    (768, 256)
+    """
+    return _SHAPES.get(find_task(task).alias, PublishedShape())
+
+
+def published_network(task: str, **changes: Any) -> TransformerForDiffusion:
+    """An untrained network of the published shape for a task.
+
+    Args:
+        task: a name or alias.
+        changes: arguments of `TransformerForDiffusion` that shall differ.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    >>> network = published_network("pusht")
+    >>> network.horizon, network.cond_dim, sum(p.numel() for p in network.parameters())
+    (16, 20, 8965122)
+    """
+    found, sizes = find_task(task), asdict(published_shape(task))
+    del sizes["n_action_steps"], sizes["weight_decay"]
+    action_dim = found.action_dim if isinstance(found, Benchmark) else ABSOLUTE_DIM * found.arms
+    dims = {"input_dim": action_dim, "output_dim": action_dim, "cond_dim": found.state_dim}
+    return TransformerForDiffusion(**(dims | sizes | changes))

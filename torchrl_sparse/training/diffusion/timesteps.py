@@ -1,0 +1,96 @@
+"""Where few denoising steps do best.
+
+DDIM (arXiv:2010.02502) may stop at any timesteps. diffusers spaces them evenly, which in a few steps begins too low for
+a sample of pure noise and spends the last step at timestep 0, where hardly any noise is left. Which timesteps suit a
+trained policy can be measured without training: the error of its actions against demonstrated ones says it, and a
+descent over single timesteps finds a minimum (for the same idea with a likelihood instead, see arXiv:2106.03802).
+
+The error ranks chains of one length only: an average of several good answers also has a small error, and the shorter a
+chain, the more it averages. Episodes have the last word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from tensordict import TensorDict
+
+from torchrl_sparse.networks.diffusion.sampler import Sampler, timesteps_fall
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.pruner.reference import dense_answers
+
+__all__ = ["demonstration_error", "search_timesteps"]
+
+
+def search_timesteps(
+    error: Callable[[tuple[int, ...]], float],
+    start: Sequence[int],
+    *,
+    num_train_timesteps: int = 100,
+    strides: Sequence[int] = (10, 5, 2),
+) -> tuple[tuple[int, ...], dict[tuple[int, ...], float]]:
+    """Moves one timestep at a time, always where it helps most, until no move of any stride helps.
+
+    Args:
+        error: of a chain with these timesteps, falling; asked once for each.
+        start: timesteps to begin with, e.g. diffusers' own.
+        num_train_timesteps: timesteps lie below it.
+        strides: by how much a timestep moves; the first until it does not help any more, then the next.
+
+    Returns:
+        The timesteps of least error and the error of all that were tried.
+
+    Raises:
+        ValueError: if ``start`` does not fall, or not from below ``num_train_timesteps`` to at least 0.
+
+    Examples:
+        >>> best, tried = search_timesteps(lambda steps: abs(steps[0] - 88) + abs(steps[1] - 12), [50, 0])
+        >>> best
+        (88, 12)
+    """
+    best = tuple(start)
+    if not timesteps_fall(best, num_train_timesteps):
+        raise ValueError(
+            f"start: expected timesteps that fall from below {num_train_timesteps} to at least 0, got {list(start)}"
+        )
+    tried = {best: error(best)}
+    for stride in strides:
+        while True:
+            moves = [move for move in _moves(best, stride) if timesteps_fall(move, num_train_timesteps)]
+            tried |= {move: error(move) for move in moves if move not in tried}
+            winner = min([best, *moves], key=tried.__getitem__)
+            if winner == best:
+                break
+            best = winner
+    return best, tried
+
+
+def demonstration_error(
+    policy: DiffusionPolicy, reference: TensorDict, timesteps: Sequence[int], *, n_action_steps: int = 8
+) -> float:
+    """Mean absolute error, normalised, of the executed actions of a DDIM chain against demonstrated ones.
+
+    Args:
+        policy: the trained policy; its own sampler and planner do not matter.
+        reference: [N] with targets from data, see :func:`torchrl_sparse.training.pruner.reference.make_reference`.
+        timesteps: of the chain.
+        n_action_steps: actions executed of a chunk.
+    """
+    chain = DiffusionPolicy(
+        policy.network,
+        policy.normalizer,
+        vision=policy.vision,
+        sampler=Sampler("ddim", num_train_timesteps=policy.sampler.num_train_timesteps, timesteps=timesteps),
+        engine=policy.engine,
+    )
+    first = policy.n_obs_steps - 1
+    executed = slice(first, first + n_action_steps)
+    return (dense_answers(chain, reference) - reference["target"])[:, executed].abs().mean().item()
+
+
+def _moves(timesteps: tuple[int, ...], stride: int) -> list[tuple[int, ...]]:
+    return [
+        (*timesteps[:i], timestep + move, *timesteps[i + 1 :])
+        for i, timestep in enumerate(timesteps)
+        for move in (stride, -stride)
+    ]

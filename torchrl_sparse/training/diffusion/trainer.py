@@ -1,0 +1,85 @@
+"""Training a diffusion policy on demonstrations, see `torchrl_sparse.training.trainer`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.loss import DiffusionLoss
+from torchrl_sparse.training.trainer import TrainConfig, Trainer, checksum, split_windows
+
+__all__ = ["PolicyTrainer"]
+
+_VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
+
+
+class PolicyTrainer(Trainer):
+    """Trains a denoiser on demonstrations.
+
+    Args:
+        network: the network, trained in place.
+        normalizer: of states and actions.
+        demos: demonstrations.
+        config: how to train.
+        vision: encoder of the cameras that the demonstrations have images of, trained in place.
+
+    Attributes:
+        step: optimiser steps taken.
+        lr: the learning rate of the next step.
+
+    Raises:
+        ValueError: if ``val_ratio`` leaves no episode to train on.
+    """
+
+    def __init__(
+        self,
+        network: TransformerForDiffusion,
+        normalizer: Normalizer,
+        demos: Demonstrations,
+        config: TrainConfig,
+        vision: VisionEncoder | None = None,
+    ) -> None:
+        self.network, self.normalizer, self.demos, self.vision = network, normalizer, demos, vision
+        self.loss = DiffusionLoss(network, normalizer, Sampler(), vision)
+        self._data_checksum = sum(_checksum(value) for value in demos.data.values(True, True))
+        sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
+        groups, trained = optimizer_groups(network, config.weight_decay), network
+        if vision is not None:
+            groups.append({"params": [*vision.parameters()], "weight_decay": _VISION_WEIGHT_DECAY})
+            trained = nn.ModuleDict({"network": network, "vision": vision})
+        super().__init__(trained, config, groups, *split_windows(demos, sizes, config.val_ratio))
+
+    def ema_policy(self, sampler: Sampler | None = None) -> DiffusionPolicy:
+        """The policy with copies of the networks and the averaged weights in them; ``sampler`` is its sampler."""
+        averaged = self.averaged()
+        network, vision = (
+            (averaged, None) if self.vision is None else (averaged["network"], averaged["vision"])
+        )
+        return DiffusionPolicy(network, self.normalizer, vision=vision, sampler=sampler)
+
+    def batch_loss(self, rows: Tensor) -> Tensor:
+        batch = self.demos.windows(rows, self.network.n_obs_steps)
+        device = next(self.network.parameters()).device
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
+            return self.loss(batch.to(device)).get("loss")
+
+    def header(self) -> dict[str, dict]:
+        header = {
+            "config": asdict(self.config),
+            "network_config": dict(self.network.config),
+            "data": {"windows": len(self.train_rows), "checksum": self._data_checksum},
+        }
+        return header if self.vision is None else header | {"vision_config": dict(self.vision.config)}
+
+
+def _checksum(value: Tensor) -> float:
+    """Sum of all entries; images are summed without a copy of them in another type."""
+    return checksum(value) if value.is_floating_point() else float(value.sum(dtype=torch.int64))

@@ -1,0 +1,178 @@
+"""Training a vision-language-action policy on demonstrations, see `torchrl_sparse.training.trainer`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from tensordict import NonTensorStack, TensorDict
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.optim.lr_scheduler import LambdaLR
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.training.trainer import TrainConfig, Trainer, checksum, split_windows
+from torchrl_sparse.training.vla.grounding import Grounding, GroundingConfig, ObjectPositions
+from torchrl_sparse.training.vla.loss import VLALoss
+
+__all__ = ["InstructedDemonstrations", "VLATrainer"]
+
+
+@dataclass(frozen=True)
+class InstructedDemonstrations:
+    """Demonstrations, each with the instruction that it follows.
+
+    Attributes:
+        episodes: with the policy's cameras, u8 [N, 3, h, w], the state f32 [N, Ds] and the action f32 [N, A] of each step.
+        instructions: one for each episode.
+        objects: where things are in each step, for `Grounding`; None if that is not known.
+
+    Raises:
+        ValueError: if there are not as many instructions as episodes.
+    """
+
+    episodes: Demonstrations
+    instructions: Sequence[str]
+    objects: ObjectPositions | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.instructions) != len(self.episodes):
+            raise ValueError(
+                f"instructions: expected one for each of {len(self.episodes)} episodes, got {len(self.instructions)}"
+            )
+
+    def windows(self, rows: Tensor, observed: Sequence) -> TensorDict:
+        """Training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
+
+        Args:
+            rows: as from `Demonstrations.window_rows`; a row that repeats the one before is beyond the end.
+            observed: keys to take from the present step.
+
+        Returns:
+            ``observed``, the instruction, ``("vla_action", "chunk")`` [B, H, A] and ``"action_is_pad"`` [B, H].
+        """
+        present, data = rows[:, 0].contiguous(), self.episodes.data
+        sample = data.select(*observed)[present]
+        sample[keys.CHUNK] = data.get(keys.ACTION)[rows]
+        sample[keys.IS_PAD] = torch.cat(
+            [torch.zeros(len(rows), 1).bool(), rows[:, 1:] == rows[:, :-1]], dim=1
+        )
+        episode = torch.searchsorted(self.episodes.starts, present, right=True) - 1
+        sample[keys.INSTRUCTION] = NonTensorStack(*[self.instructions[i] for i in episode.tolist()])
+        return sample
+
+
+class VLATrainer(Trainer):
+    """Trains a vision-language-action policy with the L1 loss on normalised action chunks.
+
+    Args:
+        policy: the policy, trained in place; its normaliser and tokenizer stay as they are.
+        demos: demonstrations with images and instructions.
+        config: how to train; ``n_action_steps`` is not read: windows may begin at every step of an episode.
+        grounding: lessons that come before the actions; none by default.
+
+    Raises:
+        ValueError: if ``val_ratio`` leaves no episode to train on, or there are lessons but no ``demos.objects``.
+    """
+
+    def __init__(
+        self,
+        policy: VLAPolicy,
+        demos: InstructedDemonstrations,
+        config: TrainConfig,
+        grounding: GroundingConfig | None = None,
+    ):
+        self.policy, self.demos = policy, demos
+        self.lessons = GroundingConfig() if grounding is None else grounding
+        self.loss = VLALoss(policy)
+        parts = {"network": policy.network}
+        if self.lessons != GroundingConfig():
+            if demos.objects is None:
+                raise ValueError("grounding: expected the objects' positions in the demonstrations, got none")
+            device = next(policy.network.parameters()).device
+            parts["grounding"] = Grounding(policy, len(demos.objects.instructions)).to(device)
+        trained = nn.ModuleDict(parts)
+        sizes = (policy.chunk_size, 1, policy.chunk_size)
+        rows = split_windows(demos.episodes, sizes, config.val_ratio)
+        super().__init__(trained, config, decay_groups(trained, config.weight_decay), *rows)
+
+    def batch_loss(self, rows: Tensor) -> Tensor:
+        observed = [*self.policy.network.config.cameras, keys.STATE]
+        device = next(self.trained.parameters()).device
+        batch = self.demos.windows(rows, observed).to(device)
+        with _precision(device, self.config.precision == "bf16"):
+            if self.step >= self.lessons.look_steps + self.lessons.answer_steps:
+                return self.loss(batch).get("loss")
+            return self._lesson(batch, rows[:, 0])
+
+    def _lesson(self, batch: TensorDict, present: Tensor) -> Tensor:
+        objects, grounding = self.demos.objects, self.trained["grounding"]
+        positions = objects.positions[present].to(batch[keys.STATE].device)
+        if self.step < self.lessons.look_steps:
+            return grounding.look(self.policy, batch, positions)
+        return grounding.answer(self.policy, batch, positions, objects.instructions)
+
+    def _set_schedule(self) -> None:
+        """A cosine, with a warm-up wherever parts begin to learn that did not before."""
+        config, lessons = self.config, self.lessons
+        begins = (0, lessons.look_steps, lessons.look_steps + lessons.answer_steps)
+
+        def factor(step: int) -> float:
+            since = step - max(begin for begin in begins if begin <= step)
+            warm = since / config.lr_warmup_steps if since < config.lr_warmup_steps else 1.0
+            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.max_steps)))
+
+        for group in self._optimizer.param_groups:
+            group["initial_lr"] = config.lr
+        self._schedule = LambdaLR(self._optimizer, factor, last_epoch=self.step - 1)
+
+    def averaged(self) -> VLANetwork:
+        """A copy of the network with the averaged weights, in evaluation mode."""
+        return super().averaged()["network"]
+
+    def header(self) -> dict[str, dict]:
+        return {
+            "config": asdict(self.config) | asdict(self.lessons),
+            "network_config": self.policy.network.config.to_dict(),
+            "data": {
+                "windows": len(self.train_rows),
+                "instructions": list(self.demos.instructions),
+                **self._data_sums,
+            },
+        }
+
+    @cached_property
+    def _data_sums(self) -> dict[str, float]:
+        """Tell one set of demonstrations from another. All pictures are read once, not at every checkpoint."""
+        data, objects = self.demos.episodes.data, self.demos.objects
+        sums = {
+            "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.policy.network.config.cameras
+        }
+        sums[keys.ACTION] = checksum(data[keys.ACTION])
+        if self.lessons != GroundingConfig():
+            sums["objects"] = checksum(objects.positions.abs())
+        return sums
+
+
+@contextmanager
+def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
+    """Autocast to bf16 if asked for. There the gradient of the fused attention is slower than plain products on a CPU."""
+    plain = sdpa_kernel(SDPBackend.MATH) if bf16 and device.type == "cpu" else nullcontext()
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16), plain:
+        yield
+
+
+def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
+    parameters = [*network.parameters()]
+    matrices = [parameter for parameter in parameters if parameter.ndim > 1]
+    vectors = [parameter for parameter in parameters if parameter.ndim <= 1]
+    return [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
