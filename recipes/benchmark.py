@@ -21,7 +21,7 @@ from tqdm import tqdm
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.plots import (

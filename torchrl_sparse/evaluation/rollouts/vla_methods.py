@@ -16,7 +16,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.rollouts.methods import camera_options
 from torchrl_sparse.networks.vla.pruning import TokenPruner
@@ -137,7 +137,7 @@ def instructed_env(
     """
     return partial(
         make_env,
-        get_task(task).name,
+        find_robosuite_task(task).name,
         n_obs_steps=1,
         image_size=policy.network.config.image_size,
         object_state=False,
