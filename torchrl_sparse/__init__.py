@@ -18,8 +18,7 @@ _HOME = {
     "Sampler": "networks.diffusion.sampler",
     "VLAPolicy": "policies.vla.policy",
     "VLAConfig": "networks.vla.config",
-    "TokenPruner": "networks.vla.pruning",
-    "load_openvla_oft": "storage.published.openvla_oft",
+    "TokenPruner": "tokens.base",
     "Normalizer": "networks.normalize",
     "Planner": "blocks.planner",
     "StaticPlanner": "blocks.planner",
@@ -58,10 +57,9 @@ if TYPE_CHECKING:
     from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
     from torchrl_sparse.networks.normalize import Normalizer
     from torchrl_sparse.networks.vla.config import VLAConfig
-    from torchrl_sparse.networks.vla.pruning import TokenPruner
     from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
     from torchrl_sparse.policies.vla.policy import VLAPolicy
-    from torchrl_sparse.storage.published.openvla_oft import load_openvla_oft
+    from torchrl_sparse.tokens.base import TokenPruner
     from torchrl_sparse.tokens.specprune import SpecPrune
 
 

@@ -19,7 +19,6 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.rollouts.methods import camera_options
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens import (
@@ -31,6 +30,7 @@ from torchrl_sparse.tokens import (
     SpecPrune,
     VLACachePruner,
 )
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import replay
 
 __all__ = ["TokenMethod", "instructed_env", "matching_share", "mid_episode_query", "seen_images"]
