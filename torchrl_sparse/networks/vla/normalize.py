@@ -59,7 +59,7 @@ class QuantileNormalizer(nn.Module):
 
     @classmethod
     def fit(cls, state: Tensor, action: Tensor, *, gripper: Sequence[int] = (6,)) -> QuantileNormalizer:
-        """Fit a normaliser to states [N, Ds] and actions [N, A]; their ``gripper`` dimensions go from -1 (open) to 1 (close)."""
+        """Fit a normaliser to states [N, Ds] and actions [N, A], whose ``gripper`` dimensions are -1 (open) to 1 (close)."""
         ranges = [torch.quantile(x.double(), q, dim=0) for x in (state, action) for q in (0.01, 0.99)]
         is_gripper = torch.zeros(action.shape[1], dtype=torch.bool)
         is_gripper[list(gripper)] = True
