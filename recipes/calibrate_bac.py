@@ -32,7 +32,7 @@ def main(config: DictConfig) -> None:
             calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
         )
         path = Path(config.out) / f"{name}.json"
-        schedule.save(path)
+        schedule.save_pretrained(path)
         mask = schedule.mask()
         ratio = query_flops(policy.network, mask) / dense
         print(f"{path}: prune rate {prune_rate(mask):.3f}, {ratio:.3f} of the dense FLOPs")

@@ -25,8 +25,8 @@ _HOME = {
     "StaticPlanner": "blocks.planner",
     "Dense": "blocks.planner",
     "Uniform": "blocks.uniform",
-    "Schedule": "blocks.static",
-    "StaticSchedule": "blocks.static",
+    "CacheSchedule": "blocks.schedule",
+    "SchedulePlanner": "blocks.schedule",
     "BAC": "blocks.bac",
     "SAGPruner": "blocks.sag.planner",
     "make_engine": "blocks.engine.factory",
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from torchrl_sparse.blocks.engine.factory import make_engine
     from torchrl_sparse.blocks.planner import Dense, Planner, StaticPlanner
     from torchrl_sparse.blocks.sag.planner import SAGPruner
-    from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+    from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
     from torchrl_sparse.blocks.uniform import Uniform
     from torchrl_sparse.control.action_aware import ActionAwareController
     from torchrl_sparse.control.chunk_executor import ChunkExecutor

@@ -3,7 +3,7 @@
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 
 __all__ = [
@@ -11,9 +11,9 @@ __all__ = [
     "Dense",
     "PlanSpec",
     "Planner",
-    "Schedule",
+    "CacheSchedule",
     "StaticPlanner",
-    "StaticSchedule",
+    "SchedulePlanner",
     "Uniform",
     "denoise",
 ]

@@ -29,7 +29,7 @@ class PlanSpec:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
-        sampler: name of its denoising schedule, see `Sampler.name`.
+        sampler: name of its sampler, see `Sampler.name`.
     """
 
     num_inference_steps: int

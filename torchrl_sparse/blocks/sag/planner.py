@@ -66,7 +66,7 @@ class PrunerInfo:
 
     Attributes:
         policy: fingerprint of the policy.
-        sampler: name of its denoising schedule, see `Sampler.name`.
+        sampler: name of its sampler, see `Sampler.name`.
         rate: prune rate that it is asked for where the TensorDict says nothing, in (0, 1).
         rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
         reuse: what pruned blocks reuse.

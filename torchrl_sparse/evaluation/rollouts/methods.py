@@ -19,7 +19,7 @@ from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.blocks.planner import Dense, Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
@@ -142,7 +142,7 @@ def _saved_planner(path: Path, policy: DiffusionPolicy) -> tuple[Planner, Sample
         planner = SAGPruner.from_pretrained(path.parent)
         sampler, num_steps = planner.info.sampler, len(planner.network.timesteps)
     else:
-        planner = StaticSchedule(path)
+        planner = SchedulePlanner.from_pretrained(path)
         sampler, num_steps = planner.schedule.sampler, planner.schedule.num_inference_steps
     return planner, Sampler.from_name(sampler, num_steps, policy.sampler.num_train_timesteps)
 
@@ -158,10 +158,10 @@ def _set_rates(name: str, plan: Planner, rates: tuple[float, ...]) -> None:
 def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
     path = schedules / f"{name}.json"
     if path.exists():
-        found = Schedule.load(path)
+        found = CacheSchedule.from_pretrained(path)
         if found.settings.get("num_updates") == num_updates:
-            return StaticSchedule(found)
-    return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
+            return SchedulePlanner(found)
+    return SchedulePlanner(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
 
 
 def env_options(policy: DiffusionPolicy) -> dict[str, Any]:

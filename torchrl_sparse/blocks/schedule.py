@@ -1,4 +1,4 @@
-"""Static schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
+"""Cache schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
 read.
 
 ::
@@ -47,7 +47,7 @@ from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
 from torchrl_sparse.networks.diffusion.sampler import split_sampler
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["Schedule", "StaticSchedule"]
+__all__ = ["CacheSchedule", "SchedulePlanner"]
 
 FORMAT = "torchrl_sparse.schedule/1"
 _FIELDS = (
@@ -64,7 +64,7 @@ _FIELDS = (
 
 
 @dataclass(frozen=True)
-class Schedule:
+class CacheSchedule:
     """Which blocks are computed at which denoising steps, and for which policy that was decided.
 
     Attributes:
@@ -74,7 +74,7 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
-        sampler: name of the denoising schedule that it was made for, see `Sampler.name`.
+        sampler: name of the sampler that it was made for, see `Sampler.name`.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
@@ -82,7 +82,7 @@ class Schedule:
         ValueError: if a field does not hold what is described here.
 
     Examples:
-        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> schedule = CacheSchedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
         >>> schedule.mask().int().tolist()
         [[0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 1, 0]]
     """
@@ -128,7 +128,7 @@ class Schedule:
         sampler: str = "ddpm",
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
-    ) -> Schedule:
+    ) -> CacheSchedule:
         """The schedule of a mask bool [K, 3L].
 
         Raises:
@@ -145,7 +145,7 @@ class Schedule:
         """The prune mask bool [K, 3L]."""
         return mask_from_steps(self.computed_steps, self.num_inference_steps)
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write the file under a temporary name and move it into place: no reader ever sees half of it.
 
         Raises:
@@ -156,7 +156,7 @@ class Schedule:
             temporary.write_text(text, encoding="utf-8")
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> Schedule:
+    def from_pretrained(cls, path: str | os.PathLike) -> CacheSchedule:
         """Read and check a file; nothing in it is executed.
 
         Raises:
@@ -192,27 +192,28 @@ class Schedule:
         return "\n".join(["{", *lines, '  "computed_steps": {', ",\n".join(blocks), "  }", "}", ""])
 
 
-class StaticSchedule(StaticPlanner):
+class SchedulePlanner(StaticPlanner):
     """Writes the mask of a schedule for every observation; serves only the policy that it was made for.
 
     Args:
-        schedule: the schedule, or the path of its file.
-
-    Raises:
-        ValueError, FileNotFoundError: if the file cannot be used, see :meth:`Schedule.load`.
+        schedule: the schedule.
 
     Examples:
-        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
-        >>> StaticSchedule(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
+        >>> schedule = CacheSchedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> SchedulePlanner(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
         Traceback (most recent call last):
         ...
         ValueError: schedule 'by hand': made for policy fingerprint 'a policy', got 'another'
     """
 
-    def __init__(self, schedule: Schedule | str | os.PathLike) -> None:
+    def __init__(self, schedule: CacheSchedule) -> None:
         super().__init__()
-        self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.load(schedule)
-        self.reuse = self.schedule.reuse
+        self.schedule, self.reuse = schedule, schedule.reuse
+
+    @classmethod
+    def from_pretrained(cls, path: str | os.PathLike) -> SchedulePlanner:
+        """Return the planner of a schedule's file; errors as in :meth:`CacheSchedule.from_pretrained`."""
+        return cls(CacheSchedule.from_pretrained(path))
 
     def mask(self, spec: PlanSpec) -> Tensor:
         """The schedule's mask [K, 3L].
@@ -231,7 +232,7 @@ class StaticSchedule(StaticPlanner):
 
 
 def _checked_fields(data: Any) -> dict[str, Any]:
-    """Arguments of :class:`Schedule` from decoded JSON; the values themselves are checked by the class."""
+    """Arguments of :class:`CacheSchedule` from decoded JSON; the values themselves are checked by the class."""
     if not isinstance(data, dict):
         raise ValueError(f"expected a JSON object, got {type(data).__name__}")
     if data.get("format") != FORMAT:
