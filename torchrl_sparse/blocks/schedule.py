@@ -129,7 +129,7 @@ class CacheSchedule:
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
     ) -> CacheSchedule:
-        """The schedule of a mask bool [K, 3L].
+        """Make the schedule of a mask bool [K, 3L].
 
         Raises:
             ValueError: if ``mask`` is no prune mask.
@@ -141,8 +141,13 @@ class CacheSchedule:
             method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
         )
 
+    @property
+    def spec(self) -> PlanSpec:
+        """The policy and the sampler that it was made for."""
+        return PlanSpec(self.num_inference_steps, self.num_layers, self.policy, self.sampler)
+
     def mask(self) -> Tensor:
-        """The prune mask bool [K, 3L]."""
+        """Return the prune mask bool [K, 3L]."""
         return mask_from_steps(self.computed_steps, self.num_inference_steps)
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
@@ -173,7 +178,7 @@ class CacheSchedule:
             raise ValueError(f"schedule {path}: {error}") from error
 
     def _to_json(self) -> str:
-        """JSON with one line per block, which the standard library's indentation cannot do."""
+        """Return JSON with one line per block, which the standard library's indentation cannot do."""
         head = {
             "format": FORMAT,
             "method": self.method,
@@ -203,36 +208,29 @@ class SchedulePlanner(StaticPlanner):
         >>> SchedulePlanner(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
         Traceback (most recent call last):
         ...
-        ValueError: schedule 'by hand': made for policy fingerprint 'a policy', got 'another'
+        ValueError: SchedulePlanner: made for policy fingerprint 'a policy', got 'another'
     """
 
     def __init__(self, schedule: CacheSchedule) -> None:
         super().__init__()
-        self.schedule, self.reuse = schedule, schedule.reuse
+        self.schedule, self.reuse, self.made_for = schedule, schedule.reuse, schedule.spec
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> SchedulePlanner:
-        """Return the planner of a schedule's file; errors as in :meth:`CacheSchedule.from_pretrained`."""
+        """Read a schedule's file; errors are those of :meth:`CacheSchedule.from_pretrained`."""
         return cls(CacheSchedule.from_pretrained(path))
 
-    def mask(self, spec: PlanSpec) -> Tensor:
-        """The schedule's mask [K, 3L].
+    def save_pretrained(self, path: str | os.PathLike) -> None:
+        """Write the schedule's file, see :meth:`CacheSchedule.save_pretrained`."""
+        self.schedule.save_pretrained(path)
 
-        Raises:
-            ValueError: if the schedule was made for another policy or sampler, or for other numbers of steps or layers.
-        """
-        for name in ("num_inference_steps", "num_layers", "policy", "sampler"):
-            made_for, asked = getattr(self.schedule, name), getattr(spec, name)
-            if made_for != asked:
-                label = "policy fingerprint" if name == "policy" else name
-                raise ValueError(
-                    f"schedule {self.schedule.method!r}: made for {label} {made_for!r}, got {asked!r}"
-                )
+    def mask(self, spec: PlanSpec) -> Tensor:
+        """Return the schedule's mask [K, 3L]."""
         return self.schedule.mask()
 
 
 def _checked_fields(data: Any) -> dict[str, Any]:
-    """Arguments of :class:`CacheSchedule` from decoded JSON; the values themselves are checked by the class."""
+    """Return the arguments of :class:`CacheSchedule` from decoded JSON; the values themselves are checked by the class."""
     if not isinstance(data, dict):
         raise ValueError(f"expected a JSON object, got {type(data).__name__}")
     if data.get("format") != FORMAT:
