@@ -136,7 +136,7 @@ def main(config: DictConfig) -> None:
 
 
 def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, gate=MethodName.parse(name).gate())
+    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, controller=MethodName.parse(name).controller())
 
 
 def evaluate(

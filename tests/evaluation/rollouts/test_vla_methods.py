@@ -51,7 +51,7 @@ def test_names_make_pruners():
     assert TokenMethod.parse("random@0.25").pruner().share == 0.25
     assert TokenMethod.parse("fastv@specprune").pruner(0.125).share == 0.125
     gates = [
-        TokenMethod.parse(name).executor(make_policy(), 2).gate for name in ("specprune", "specprune_static")
+        TokenMethod.parse(name).executor(make_policy(), 2).controller for name in ("specprune", "specprune_static")
     ]
     assert gates[0] is not None
     assert gates[1] is None

@@ -63,7 +63,7 @@ class MethodName:
         plan, *rates = match.groups()
         return cls(plan, tuple(float(rate) for rate in rates if rate is not None))
 
-    def gate(self) -> ActionAwareController | None:
+    def controller(self) -> ActionAwareController | None:
         """What re-plans and moves the rate while an episode runs."""
         if len(self.rates) < 2:
             return None

@@ -112,8 +112,8 @@ class TokenMethod:
 
     def executor(self, policy: VLAPolicy, n_action_steps: int) -> ChunkExecutor:
         """``policy`` under this method's controller, if it has one."""
-        gate = ActionAwareController() if self.name == "specprune" else None
-        return ChunkExecutor(policy, n_action_steps, gate)
+        controller = ActionAwareController() if self.name == "specprune" else None
+        return ChunkExecutor(policy, n_action_steps, controller)
 
 
 def method_identity(
