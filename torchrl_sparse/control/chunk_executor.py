@@ -54,13 +54,19 @@ class ChunkExecutor(TensorDictModuleBase):
     @property
     def in_keys(self):
         return _unique(
-            [keys.IS_INIT, *(self.controller.in_keys if self.controller is not None else ()), *self.policy.in_keys]
+            [
+                keys.IS_INIT,
+                *(self.controller.in_keys if self.controller is not None else ()),
+                *self.policy.in_keys,
+            ]
         )
 
     @property
     def out_keys(self):
         own = [keys.ACTION, keys.AGE, keys.QUERIED]
-        return _unique([*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys])
+        return _unique(
+            [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
+        )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
