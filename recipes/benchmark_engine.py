@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
-from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency, num_threads
+from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
     format_engine_table,
     plot_engine_times,
@@ -25,6 +25,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
 )
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.threads import num_threads
 
 QUICK_STEPS = 20
 

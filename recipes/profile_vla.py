@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.evaluation.latency.measure import describe_machine, num_threads
+from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.vla_report import (
     DENSE,
@@ -25,6 +25,7 @@ from torchrl_sparse.evaluation.results.vla_report import (
     save_vla_results,
 )
 from torchrl_sparse.networks.vla.pruning import TokenPruner
+from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
 
 

@@ -13,7 +13,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import hydra
@@ -39,8 +38,6 @@ from torchrl_sparse.training.diffusion.published import published_shape
 from torchrl_sparse.training.loop import make_logger
 from torchrl_sparse.training.pruner.reference import make_reference, with_queries
 from torchrl_sparse.training.pruner.trainer import PrunerConfig, PrunerTrainer, imitate
-
-ROLLOUT_SEED = 2_000_000  # of the first episode; no demonstration, calibration or evaluation has it
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -98,8 +95,9 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
             f"got {config.reference.target}"
         )
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.rollouts.methods import env_options, record_queries
+    from torchrl_sparse.control.queries import record_queries
+    from torchrl_sparse.envs.for_policy import diffusion_env
+    from torchrl_sparse.envs.seeds import PRUNER_ROLLOUT_SEED
 
     task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
@@ -110,9 +108,9 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
         plan=SchedulePlanner.from_pretrained(schedules[0]) if schedules else None,
         engine=policy.engine,
     )
-    environment = partial(make_env, task.name, **env_options(policy))
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
-    return record_queries(actor, environment, range(ROLLOUT_SEED, ROLLOUT_SEED + config.rollouts))
+    seeds = range(PRUNER_ROLLOUT_SEED, PRUNER_ROLLOUT_SEED + config.rollouts)
+    return record_queries(actor, diffusion_env(task.name, policy), seeds)
 
 
 @contextmanager
