@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.evaluation.latency.measure import describe_machine, num_threads
+from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.vla_report import (
     DENSE,
@@ -24,6 +24,7 @@ from torchrl_sparse.evaluation.results.vla_report import (
     plot_vla_times,
     save_vla_results,
 )
+from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
 from torchrl_sparse.tokens.base import TokenPruner
 
