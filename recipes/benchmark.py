@@ -8,7 +8,7 @@ Kill it and run it again to go on: finished episodes are read from OUT/episodes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import hydra
@@ -21,8 +21,10 @@ from tqdm import tqdm
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.queries import answer, record_queries
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.plots import (
     plot_error_surge,
@@ -32,6 +34,7 @@ from torchrl_sparse.evaluation.figures.plots import (
 )
 from torchrl_sparse.evaluation.figures.video import Caption, write_video
 from torchrl_sparse.evaluation.latency.measure import describe_machine
+from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 from torchrl_sparse.evaluation.results.report import (
     MethodRun,
     build_results,
@@ -42,18 +45,11 @@ from torchrl_sparse.evaluation.results.report import (
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.methods import (
-    CALIBRATION_SEED,
-    EVALUATION_SEED,
     MethodName,
-    answer,
     calibrate_policy,
     check_method,
-    env_options,
     make_method,
     method_identity,
-    record_queries,
-    time_planning,
-    time_queries,
 )
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
@@ -72,7 +68,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
-    environment = partial(make_env, task.name, **env_options(policy), horizon=config.horizon)
+    environment = diffusion_env(task.name, policy, config.horizon)
 
     @cache
     def calibration():
@@ -136,7 +132,9 @@ def main(config: DictConfig) -> None:
 
 
 def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, gate=MethodName.parse(name).gate())
+    return ChunkExecutor(
+        policy, n_action_steps=config.n_action_steps, controller=MethodName.parse(name).controller()
+    )
 
 
 def evaluate(

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
-from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency, num_threads
+from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
     format_engine_table,
     plot_engine_times,
@@ -25,6 +25,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
 )
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.threads import num_threads
 
 QUICK_STEPS = 20
 
@@ -75,7 +76,7 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
 def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
     """A policy's network and the mask of its BAC schedule, which is refused if it was made for another policy."""
     policy = DiffusionPolicy.from_pretrained(folder)
-    policy.plan = BAC(folder / "bac.json")
+    policy.plan = BAC.from_pretrained(folder / "bac.json")
     return policy.network, policy.plan.schedule.mask()
 
 

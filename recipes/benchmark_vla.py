@@ -20,7 +20,10 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.images import chosen_cameras
+from torchrl_sparse.envs.for_policy import instructed_env
+from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.figures.plots import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import (
     draw_tokens,
@@ -39,12 +42,9 @@ from torchrl_sparse.evaluation.results.report import (
 )
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
-from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
     TokenMethod,
-    answer,
-    instructed_env,
     matching_share,
     method_identity,
     mid_episode_query,

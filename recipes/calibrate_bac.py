@@ -5,7 +5,6 @@ python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import hydra
@@ -13,16 +12,15 @@ from omegaconf import DictConfig
 
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
-from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.rollouts.methods import calibrate_policy, env_options
+from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.evaluation.rollouts.methods import calibrate_policy
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")
 def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy)
-    environment = partial(make_env, find_task(config.task).name, **env_options(policy))
+    environment = diffusion_env(config.task, policy)
     seeds = range(config.seed, config.seed + config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
@@ -32,7 +30,7 @@ def main(config: DictConfig) -> None:
             calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
         )
         path = Path(config.out) / f"{name}.json"
-        schedule.save(path)
+        schedule.save_pretrained(path)
         mask = schedule.mask()
         ratio = query_flops(policy.network, mask) / dense
         print(f"{path}: prune rate {prune_rate(mask):.3f}, {ratio:.3f} of the dense FLOPs")

@@ -103,7 +103,7 @@ def seeds(config: DictConfig) -> range:
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
     # Here, since queries of demonstrations need no simulator.
-    from torchrl_sparse.evaluation.rollouts.vla_methods import instructed_env
+    from torchrl_sparse.envs.for_policy import instructed_env
 
     return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from torchrl_sparse.evaluation.latency.measure import describe_machine, num_threads
+from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.vla_report import (
     DENSE,
@@ -24,8 +24,9 @@ from torchrl_sparse.evaluation.results.vla_report import (
     plot_vla_times,
     save_vla_results,
 )
-from torchrl_sparse.networks.vla.pruning import TokenPruner
+from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
+from torchrl_sparse.tokens.base import TokenPruner
 
 
 @hydra.main(version_base=None, config_path=".", config_name="profile_vla")

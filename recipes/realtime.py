@@ -16,10 +16,13 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
+from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.latency.measure import describe_machine
+from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
@@ -29,14 +32,10 @@ from torchrl_sparse.evaluation.results.realtime import (
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.methods import (
-    CALIBRATION_SEED,
-    EVALUATION_SEED,
     calibrate_policy,
     check_method,
     make_method,
     method_identity,
-    record_queries,
-    time_queries,
 )
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -49,7 +48,7 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
-    environment = partial(make_env, task.name, n_obs_steps=policy.n_obs_steps, horizon=config.horizon)
+    environment = diffusion_env(task.name, policy, config.horizon)
     first = EVALUATION_SEED + config.seed
     seeds = range(first, first + config.episodes)
 

@@ -38,7 +38,12 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
     settings = OmegaConf.to_container(config, resolve=True)
-    train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
+    train(
+        trainer,
+        settings,
+        save=partial(save, trainer, config),
+        evaluate=partial(closed_loop_success, trainer, config),
+    )
 
 
 def as_published(config: DictConfig) -> None:
@@ -118,25 +123,25 @@ def averaged_policy(
     return policy
 
 
-def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
+def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | None:
     """Success rate of the averaged weights on episodes that no demonstration was made from; None without robosuite."""
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.rollouts.methods import env_options
-    from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+    from torchrl_sparse.envs.for_policy import diffusion_env
+    from torchrl_sparse.evaluation.rollouts.evaluate import evaluate, success_rate
 
     sampler = Sampler("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else Sampler()
     policy = averaged_policy(trainer, config, sampler)
-    episodes = rollout_episodes(
+    episodes = evaluate(
+        "dense",
         ChunkExecutor(policy, trainer.config.n_action_steps),
-        partial(make_env, find_task(config.task).name, **env_options(policy)),
+        diffusion_env(config.task, policy),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )
-    return sum(episode.success for episode in episodes) / len(episodes)
+    return success_rate(episodes)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Stop it at any moment; the same command goes on, equal to the last bit. ``out/pruner`` is for
 `SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the ablation; ``out/l2c.json`` is for
-`StaticSchedule`; ``out/curves.png`` shows how it went.
+`SchedulePlanner`; ``out/curves.png`` shows how it went.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import hydra
@@ -27,7 +26,7 @@ from tqdm import tqdm
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
@@ -39,8 +38,6 @@ from torchrl_sparse.training.diffusion.published import published_shape
 from torchrl_sparse.training.loop import make_logger
 from torchrl_sparse.training.pruner.reference import make_reference, with_queries
 from torchrl_sparse.training.pruner.trainer import PrunerConfig, PrunerTrainer, imitate
-
-ROLLOUT_SEED = 2_000_000  # of the first episode; no demonstration, calibration or evaluation has it
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -98,8 +95,9 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
             f"got {config.reference.target}"
         )
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.rollouts.methods import env_options, record_queries
+    from torchrl_sparse.control.queries import record_queries
+    from torchrl_sparse.envs.for_policy import diffusion_env
+    from torchrl_sparse.envs.seeds import PRUNER_ROLLOUT_SEED
 
     task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
@@ -107,12 +105,12 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
         policy.normalizer,
         vision=policy.vision,
         sampler=policy.sampler,
-        plan=StaticSchedule(schedules[0]) if schedules else None,
+        plan=SchedulePlanner.from_pretrained(schedules[0]) if schedules else None,
         engine=policy.engine,
     )
-    environment = partial(make_env, task.name, **env_options(policy))
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
-    return record_queries(actor, environment, range(ROLLOUT_SEED, ROLLOUT_SEED + config.rollouts))
+    seeds = range(PRUNER_ROLLOUT_SEED, PRUNER_ROLLOUT_SEED + config.rollouts)
+    return record_queries(actor, diffusion_env(task.name, policy), seeds)
 
 
 @contextmanager
@@ -161,7 +159,7 @@ def initial_schedules(config: DictConfig) -> list[str]:
 
 
 def learn_schedules(trainer: PrunerTrainer, paths: list[str]) -> None:
-    masks = [Schedule.load(path).mask() for path in paths]
+    masks = [CacheSchedule.from_pretrained(path).mask() for path in paths]
     with progress("update", "learning the schedules") as show:
         imitate(trainer.gates, masks, trainer.train_set, seed=trainer.config.seed, on_progress=show)
     print(f"{', '.join(paths)}: learned, {trainer.validate()}")
@@ -195,7 +193,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         "rollouts": config.rollouts,
         "updates": trainer.step,
     }
-    fixed = Schedule.from_mask(
+    fixed = CacheSchedule.from_mask(
         trainer.fixed_mask(),
         method="l2c" if config.method == "l2c" else "sag_fixed",
         policy=policy.fingerprint,
@@ -204,7 +202,7 @@ def save(trainer: PrunerTrainer, config: DictConfig) -> Path:
         settings=settings,
     )
     path = out / ("l2c.json" if config.method == "l2c" else "fixed.json")
-    fixed.save(path)
+    fixed.save_pretrained(path)
     if config.method == "l2c":
         return path
     info = PrunerInfo(

@@ -43,7 +43,12 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
     settings = OmegaConf.to_container(config, resolve=True)
-    train(trainer, settings, save=partial(save, trainer, config), evaluate=partial(evaluate, trainer, config))
+    train(
+        trainer,
+        settings,
+        save=partial(save, trainer, config),
+        evaluate=partial(closed_loop_success, trainer, config),
+    )
 
 
 def make_trainer(config: DictConfig) -> VLATrainer:
@@ -115,23 +120,24 @@ def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
     return VLAPolicy(trainer.averaged(), trainer.policy.normalizer, trainer.policy.tokenizer)
 
 
-def evaluate(trainer: VLATrainer, config: DictConfig) -> float | None:
+def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None:
     """Success rate of the averaged weights on episodes that no demonstration was made from; None without robosuite."""
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
-    from torchrl_sparse.evaluation.rollouts.vla_methods import instructed_env
+    from torchrl_sparse.envs.for_policy import instructed_env
+    from torchrl_sparse.evaluation.rollouts.evaluate import evaluate, success_rate
 
     policy = averaged_policy(trainer)
-    episodes = rollout_episodes(
+    episodes = evaluate(
+        "dense",
         ChunkExecutor(policy, config.n_action_steps),
         instructed_env(config.task, policy, chosen_cameras(config.cameras)),
         range(config.eval_seed, config.eval_seed + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )
-    return sum(episode.success for episode in episodes) / len(episodes)
+    return success_rate(episodes)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,21 @@
 """What importing costs, and what works without a simulator."""
 
+import importlib
+import pkgutil
 import subprocess
 import sys
+from typing import Literal, get_origin
+
+import pytest
 
 import torchrl_sparse
 
 HEAVY = ("robosuite", "mujoco", "wandb", "transformers", "matplotlib", "torch")
+PACKAGES = ["torchrl_sparse"] + [
+    module.name
+    for module in pkgutil.walk_packages(torchrl_sparse.__path__, "torchrl_sparse.")
+    if module.ispkg
+]
 
 
 def python(code):
@@ -45,7 +55,10 @@ except ImportError as error:
     assert "torchrl-sparse[vla]" in python(code)
 
 
-def test_every_public_name_is_there():
-    for name in torchrl_sparse.__all__:
-        assert getattr(torchrl_sparse, name).__doc__, name
-    assert set(torchrl_sparse.__all__) <= set(dir(torchrl_sparse))
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_is_there(name):
+    package = importlib.import_module(name)
+    assert package.__doc__
+    assert set(package.__all__) <= set(dir(package))
+    for public in (getattr(package, name) for name in package.__all__):
+        assert public.__doc__ or get_origin(public) is Literal, public

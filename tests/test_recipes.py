@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse import DiffusionPolicy, SAGPruner
 from torchrl_sparse.blocks.mask import prune_rate
-from torchrl_sparse.blocks.static import Schedule
+from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results, save_results
@@ -264,7 +264,9 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
     assert "fixed.json: learned" in output
     windows, joined = (load_file(work / out / "reference.safetensors")["target"] for out in ("sag", "l2c"))
     assert len(joined) > len(windows)
-    taught = [Schedule.load(work / name).mask() for name in ("sag/fixed.json", "l2c/l2c.json")]
+    taught = [
+        CacheSchedule.from_pretrained(work / name).mask() for name in ("sag/fixed.json", "l2c/l2c.json")
+    ]
     output = run(
         "train_pruner", *training, f"out={work}/taught", "train.rate_range=[0.1,0.7]", "train.max_updates=0",
         f"init=[{work}/sag/fixed.json,{work}/l2c/l2c.json]",

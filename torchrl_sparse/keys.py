@@ -33,7 +33,7 @@ constant                          shape, dtype           meaning
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
 ``ACTION``                        f32 [*B, A]            the action of this step
-``REPLAN``                        bool [*B, 1]           a gate asks for a new query now
+``REPLAN``                        bool [*B, 1]           a controller asks for a new query now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query

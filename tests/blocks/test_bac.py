@@ -17,7 +17,7 @@ from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.static import Schedule
+from torchrl_sparse.blocks.schedule import CacheSchedule
 
 
 def random_similarity(num_steps, seed):
@@ -226,8 +226,8 @@ def test_schedules_carry_what_they_were_made_for(name, tmp_path):
     schedule = SCHEDULES[name](calibration(), 4, policy="8d1f")
     assert (schedule.method, schedule.policy) == (name, "8d1f")
     assert (schedule.num_inference_steps, schedule.num_layers) == (12, 3)
-    schedule.save(tmp_path / "schedule.json")
-    planner = BAC(tmp_path / "schedule.json")
+    schedule.save_pretrained(tmp_path / "schedule.json")
+    planner = BAC.from_pretrained(tmp_path / "schedule.json")
     planner.bind(PlanSpec(12, 3, "8d1f"))
     assert torch.equal(planner.mask(planner.spec), schedule.mask())
 
@@ -249,6 +249,6 @@ def test_fewer_updates_prune_more():
 
 
 def test_a_schedule_of_another_method_is_refused():
-    uniform = Schedule("uniform", "p", 4, 1, ((0, 2),) * 3)
+    uniform = CacheSchedule("uniform", "p", 4, 1, ((0, 2),) * 3)
     with pytest.raises(ValueError, match=r"BAC: expected a schedule of \['bac', .*got one of 'uniform'"):
         BAC(uniform)

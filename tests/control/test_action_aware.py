@@ -148,7 +148,7 @@ class Deltas(CountingPolicy):
 def test_commanded_reads_the_action_served_last():
     controller = ActionAwareController("commanded", thresholds=LIMITS, warmup_steps=1)
     policy = Deltas([9.0, 9.0, 0.5, 9.0, 9.0])
-    executor, td = ChunkExecutor(policy, n_action_steps=5, gate=controller), TensorDict(batch_size=[2])
+    executor, td = ChunkExecutor(policy, n_action_steps=5, controller=controller), TensorDict(batch_size=[2])
     ages, fine = [], []
     for step in range(6):
         td["input"] = torch.zeros(2, 1)
@@ -175,7 +175,7 @@ def test_commanded_wants_deltas():
 @pytest.mark.parametrize("on", ["measured", "commanded"])
 def test_samples_at_their_first_step_may_be_stacked_with_others(on):
     controller = ActionAwareController(on, thresholds=LIMITS, warmup_steps=1)
-    executor = ChunkExecutor(Deltas([0.5, 0.5, 0.5, 0.5]), n_action_steps=4, gate=controller)
+    executor = ChunkExecutor(Deltas([0.5, 0.5, 0.5, 0.5]), n_action_steps=4, controller=controller)
     fresh = TensorDict({"input": torch.zeros(1), keys.EEF_VEL: torch.zeros(6)}, [])
     fresh[keys.IS_INIT] = torch.tensor([True])
     later = executor(fresh.clone())
@@ -209,7 +209,7 @@ def test_mistakes_are_named():
 def lift_actor():
     policy = DiffusionPolicy.from_pretrained("assets/lift")
     policy.sampler = Sampler("ddim", 10)
-    return ChunkExecutor(policy, n_action_steps=8, gate=ActionAwareController())
+    return ChunkExecutor(policy, n_action_steps=8, controller=ActionAwareController())
 
 
 def lift(seed):

@@ -77,9 +77,9 @@ def test_costs_count_queries_only():
 
 
 def test_gate_replans_single_samples_in_the_middle_of_a_chunk():
-    gate = TensorDictModule(lambda x: x > 100, in_keys=["input"], out_keys=[keys.REPLAN])
+    controller = TensorDictModule(lambda x: x > 100, in_keys=["input"], out_keys=[keys.REPLAN])
     policy = CountingPolicy()
-    executor, td = ChunkExecutor(policy, n_action_steps=4, gate=gate), TensorDict(batch_size=[2])
+    executor, td = ChunkExecutor(policy, n_action_steps=4, controller=controller), TensorDict(batch_size=[2])
     td = step(executor, td, [0.0, 0.0], [True, True])
     td = step(executor, td, [0.0, 101.0], [False, False])
     td = step(executor, td, [0.0, 0.0], [False, False])

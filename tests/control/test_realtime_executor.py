@@ -96,8 +96,8 @@ def test_samples_of_a_batch_keep_their_own_clocks():
 
 
 def test_a_gate_is_not_heard_while_an_answer_is_awaited():
-    gate = TensorDictModule(lambda now: torch.ones_like(now, dtype=torch.bool), ["now"], [keys.REPLAN])
-    executor = RealtimeExecutor(ClockPolicy(), HOLD, 8, latency=0.15, gate=gate)
+    controller = TensorDictModule(lambda now: torch.ones_like(now, dtype=torch.bool), ["now"], [keys.REPLAN])
+    executor = RealtimeExecutor(ClockPolicy(), HOLD, 8, latency=0.15, controller=controller)
     assert play(executor, 20) == expected(3, 1, 9, 20)
 
 

@@ -51,8 +51,8 @@ def make_actor():
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny(image_size=SIZE, **sizes)))
     policy.network.head.fc2.bias.data[2] = -2.0  # downwards
     policy.pruner = SpecPrune(alpha=0.1, dynamic=False)
-    gate = ActionAwareController(thresholds=ANY_MOTION, warmup_steps=WARMUP)
-    return ChunkExecutor(policy, n_action_steps=N_ACTION_STEPS, gate=gate)
+    controller = ActionAwareController(thresholds=ANY_MOTION, warmup_steps=WARMUP)
+    return ChunkExecutor(policy, n_action_steps=N_ACTION_STEPS, controller=controller)
 
 
 def test_tokens_are_pruned_by_history_and_speed(env):

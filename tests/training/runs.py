@@ -9,7 +9,7 @@ import hydra
 import torch
 
 from tests.recipe_modules import RECIPES, load_recipe
-from torchrl_sparse.evaluation.latency.measure import num_threads
+from torchrl_sparse.runtime.threads import num_threads
 
 
 def stop_and_go_on(recipe, out, settings):

@@ -1,19 +1,5 @@
 """Sparsity over (denoising step × block): what to skip (planners) and how it is skipped (engines)."""
 
-from torchrl_sparse.blocks.bac import BAC
-from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
-from torchrl_sparse.blocks.uniform import Uniform
+import lazy_loader as lazy
 
-__all__ = [
-    "BAC",
-    "Dense",
-    "PlanSpec",
-    "Planner",
-    "Schedule",
-    "StaticPlanner",
-    "StaticSchedule",
-    "Uniform",
-    "denoise",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -17,7 +17,6 @@ Where print and release differ:
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -26,7 +25,7 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, block_name
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 
 __all__ = [
     "BAC",
@@ -165,7 +164,7 @@ def bac_blockwise_schedule(
     policy: str,
     objective: Objective = "anchor",
     force_last: bool = True,
-) -> Schedule:
+) -> CacheSchedule:
     """Ablation ``bac_blockwise`` (Table 2, "block-wise ACS"): ACS for every block, without BUA.
 
     Arguments: :func:`bac_schedule`.
@@ -184,7 +183,7 @@ def bac_unified_schedule(
     policy: str,
     objective: Objective = "anchor",
     force_last: bool = True,
-) -> Schedule:
+) -> CacheSchedule:
     """Ablation ``bac_unified`` (Table 2, "unified ACS"): all blocks share the ACS of their mean similarity.
 
     Arguments: :func:`bac_schedule`.
@@ -204,7 +203,7 @@ def bac_schedule(
     force_last: bool = True,
     top_k: int = 5,
     transitive: bool = False,
-) -> Schedule:
+) -> CacheSchedule:
     """The method itself, ``bac``: ACS for every block, then BUA.
 
     Args:
@@ -238,17 +237,17 @@ SCHEDULES = {
 """The method and its ablations by name."""
 
 
-class BAC(StaticSchedule):
+class BAC(SchedulePlanner):
     """Writes a BAC schedule, or that of one of its ablations, for every observation.
 
     Args:
-        schedule: what a function of :data:`SCHEDULES` made, or the path of its file.
+        schedule: what a function of :data:`SCHEDULES` made.
 
     Raises:
         ValueError: if the schedule was made by another method.
     """
 
-    def __init__(self, schedule: Schedule | str | os.PathLike) -> None:
+    def __init__(self, schedule: CacheSchedule) -> None:
         super().__init__(schedule)
         if self.schedule.method not in SCHEDULES:
             raise ValueError(
@@ -267,9 +266,9 @@ def _schedule(
     policy: str,
     steps: Sequence[Sequence[int]],
     settings: dict[str, Any],
-) -> Schedule:
+) -> CacheSchedule:
     num_blocks, num_steps = calibration.similarity.shape[:2]
     settings = {**settings, "num_calibration_samples": calibration.num_samples}
-    return Schedule(
+    return CacheSchedule(
         method, policy, num_steps, num_blocks // len(BLOCK_TYPES), tuple(steps), settings=settings
     )

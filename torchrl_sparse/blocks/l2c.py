@@ -6,7 +6,7 @@ other step and weighs sparsity with an L1 term; here every step but the first ma
 is SAG's, so that both methods can be compared at the same cost. Pruned blocks reuse their own latest output.
 
 :mod:`torchrl_sparse.training.pruner.trainer` trains it; its mask is kept as a
-:class:`~torchrl_sparse.blocks.static.Schedule`.
+:class:`~torchrl_sparse.blocks.schedule.CacheSchedule`.
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
 """Planners: TensorDict modules that write the prune mask of a query, and nothing else.
 
-A new method subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
-does not) and writes one method.
+A planner of one's own subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
+does not) and writes one method; ``policy.plan = Mine()`` is all that using it takes. One that is kept in a file gets a
+line in :data:`torchrl_sparse.blocks.saved.PLANNERS`, and one that is asked for by name, as benchmarks do, a line in
+:data:`torchrl_sparse.methods.diffusion.METHODS`.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from tensordict import TensorDictBase
@@ -23,13 +25,13 @@ __all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
 
 @dataclass(frozen=True)
 class PlanSpec:
-    """What a planner plans for.
+    """The policy and the sampler that a planner serves.
 
     Attributes:
         num_inference_steps: denoising steps K of a query.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
-        sampler: name of its denoising schedule, see `Sampler.name`.
+        sampler: name of its sampler, see `Sampler.name`.
     """
 
     num_inference_steps: int
@@ -42,17 +44,33 @@ class PlanSpec:
         """Blocks 3L, the width of a mask."""
         return len(BLOCK_TYPES) * self.num_layers
 
+    def check_is(self, asked: PlanSpec, who: str) -> None:
+        """Raise ValueError, in the name of ``who`` was made for this, unless ``asked`` is the same.
+
+        >>> PlanSpec(100, 8, "a policy").check_is(PlanSpec(100, 8, "another"), "BAC")
+        Traceback (most recent call last):
+        ...
+        ValueError: BAC: made for policy fingerprint 'a policy', got 'another'
+        """
+        for name in (field.name for field in fields(self)):
+            if (made_for := getattr(self, name)) != (got := getattr(asked, name)):
+                label = "policy fingerprint" if name == "policy" else name
+                raise ValueError(f"{who}: made for {label} {made_for!r}, got {got!r}")
+
 
 class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
-    A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that
-    cannot serve every policy :meth:`bind`, and raises ValueError there. ``policy.plan = planner`` binds it.
+    A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that was made for
+    one policy sets ``made_for``. ``policy.plan = planner`` binds it.
 
     Attributes:
         reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see
             :mod:`torchrl_sparse.blocks.mask`).
+        is_static: True where the mask does not depend on the observation.
+        made_for: the only spec that it can be bound to; None serves every policy.
+        rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -72,6 +90,9 @@ class Planner(TensorDictModuleBase):
     in_keys = [COND]
     out_keys = [PRUNE_MASK]
     reuse: Reuse = "block"
+    is_static = False
+    made_for: PlanSpec | None = None
+    rate: float | None = None
 
     def __init__(self) -> None:
         super().__init__()
@@ -79,7 +100,7 @@ class Planner(TensorDictModuleBase):
 
     @property
     def spec(self) -> PlanSpec:
-        """What the planner is bound to.
+        """The spec that the planner is bound to.
 
         Raises:
             RuntimeError: before :meth:`bind`.
@@ -91,24 +112,30 @@ class Planner(TensorDictModuleBase):
         return self._spec
 
     def bind(self, spec: PlanSpec) -> None:
-        """Prepare to serve ``spec``; a policy calls it when it is given the planner or another scheduler.
+        """Prepare to serve ``spec``; a policy calls it when it is given the planner or another sampler.
 
         Raises:
-            ValueError: if the planner cannot serve it; the planner then stays as it was.
+            ValueError: if the planner was made for another; it then stays as it was.
         """
+        if self.made_for is not None:
+            self.made_for.check_is(spec, type(self).__name__)
+        self._prepare(spec)
         self._spec = spec
+
+    def _prepare(self, spec: PlanSpec) -> None:
+        """Make what :meth:`masks` needs for ``spec``, or raise ValueError and leave everything as it is."""
 
     @property
     def fingerprint(self) -> str:
-        """Names what decides the masks: two planners of one class and one fingerprint decide alike."""
+        """A name of what decides the masks: two planners of one class and one fingerprint decide alike."""
         return tensors_fingerprint(self.state_dict())
 
     def masks(self, cond: Tensor) -> Tensor:
-        """Masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
+        """Return masks bool [B, K, 3L], row 0 all False, for encoded observations ``cond`` f32 [B, To, D]."""
         raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
 
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
-        """Further arguments of :meth:`masks`, each with the batch dimensions flattened into ``rows``."""
+        """Return further arguments of :meth:`masks`, each with the batch dimensions flattened into ``rows``."""
         return {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -135,7 +162,7 @@ class Planner(TensorDictModuleBase):
 
 
 def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
-    """Sixteen hexadecimal digits that name the values of named tensors."""
+    """Return sixteen hexadecimal digits that name the values of named tensors."""
     digest = hashlib.sha256()
     for name, value in sorted(tensors.items()):
         digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
@@ -145,36 +172,36 @@ def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
 class StaticPlanner(Planner):
     """Base of the planners whose mask does not depend on the observation; a subclass writes :meth:`mask`."""
 
+    is_static = True
+
     def __init__(self) -> None:
         super().__init__()
         # Not persistent: the mask belongs to the method, not to the policy's checkpoint.
         self.register_buffer("_mask", None, persistent=False)
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """The mask bool [K, 3L] of every query for ``spec``, row 0 all False.
+        """Return the mask bool [K, 3L] of every query for ``spec``, row 0 all False.
 
         Raises:
             ValueError: if the planner cannot serve ``spec``.
         """
         raise NotImplementedError(f"{type(self).__name__} must define mask(spec)")
 
-    def bind(self, spec: PlanSpec) -> None:
-        """Make and check the mask once."""
+    def _prepare(self, spec: PlanSpec) -> None:
         mask = self.mask(spec)
         try:
             validate_mask(mask, spec.num_inference_steps, spec.num_layers, batch=())
         except ValueError as error:
             raise ValueError(f"{type(self).__name__}.mask: {error}") from error
         self._mask = mask
-        super().bind(spec)
 
     @property
     def fingerprint(self) -> str:
-        """Names the bound mask."""
+        """A name of the bound mask."""
         return tensors_fingerprint({"mask": self.mask(self.spec)})
 
     def masks(self, cond: Tensor) -> Tensor:
-        """The mask, once per row of ``cond``."""
+        """Return the mask, once per row of ``cond``."""
         # A copy per row: an expanded view in the TensorDict would break whoever writes to one row in place.
         return self._mask.to(cond.device).repeat(len(cond), 1, 1)
 
@@ -188,5 +215,5 @@ class Dense(StaticPlanner):
     """
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """All False, [K, 3L]."""
+        """Return a mask that is all False, [K, 3L]."""
         return torch.zeros(spec.num_inference_steps, spec.num_blocks, dtype=torch.bool)

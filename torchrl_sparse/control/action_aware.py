@@ -90,7 +90,7 @@ def fine_mode(twist: Tensor, fine: Tensor, thresholds: Thresholds) -> Tensor:
 class ActionAwareController(TensorDictModuleBase):
     """Switches each sample between coarse and fine, grants the budget of that mode, and re-plans on entering fine.
 
-    The gate of a `ChunkExecutor`: it runs at every step and writes ``("control", "fine")``, the budget, and
+    The controller of a `ChunkExecutor`: it runs at every step and writes ``("control", "fine")``, the budget, and
     ``("control", "replan")``, which is True where fine mode begins, so that what is left of a chunk that was planned coarsely
     is dropped. State is in keys, per sample, and starts anew where ``"is_init"``.
 

@@ -14,16 +14,16 @@ class ChunkExecutor(TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
 
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
-    when the gate asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to the
-    policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are zero on
-    served steps.
+    when the controller asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to
+    the policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are
+    zero on served steps.
 
     All state is in keys, so it follows the environment through any collector.
 
     Args:
         policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
         n_action_steps: actions of a chunk that are executed before the next query (Ta).
-        gate: a TensorDictModule that may write ``("control", "replan")``; run at every step.
+        controller: a TensorDictModule that may write ``("control", "replan")``; run at every step.
 
     Raises:
         ValueError: if a chunk is shorter than ``n_action_steps``.
@@ -42,30 +42,36 @@ class ChunkExecutor(TensorDictModuleBase):
         self,
         policy: TensorDictModuleBase,
         n_action_steps: int = 8,
-        gate: TensorDictModuleBase | None = None,
+        controller: TensorDictModuleBase | None = None,
     ):
         super().__init__()
         if n_action_steps < 1:
             raise ValueError(f"n_action_steps: expected at least 1, got {n_action_steps}")
         self.policy = policy
         self.n_action_steps = n_action_steps
-        self.gate = gate
+        self.controller = controller
 
     @property
     def in_keys(self):
         return _unique(
-            [keys.IS_INIT, *(self.gate.in_keys if self.gate is not None else ()), *self.policy.in_keys]
+            [
+                keys.IS_INIT,
+                *(self.controller.in_keys if self.controller is not None else ()),
+                *self.policy.in_keys,
+            ]
         )
 
     @property
     def out_keys(self):
         own = [keys.ACTION, keys.AGE, keys.QUERIED]
-        return _unique([*own, *(self.gate.out_keys if self.gate is not None else ()), *self.policy.out_keys])
+        return _unique(
+            [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
+        )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.gate is not None:
-            tensordict = self.gate(tensordict)
+        if self.controller is not None:
+            tensordict = self.controller(tensordict)
         due = self._due(tensordict)
         if due.any():
             self._query(tensordict, due)

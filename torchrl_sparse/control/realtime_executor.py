@@ -36,7 +36,7 @@ class RealtimeExecutor(ChunkExecutor):
         latency: seconds that a query takes; None takes each query's own time, as the policy measured it. Rows of a batch
             share a measured time, so measured latencies want batches of one.
         control_freq: steps a second.
-        gate: as for `ChunkExecutor`; not heard while an answer is awaited.
+        controller: as for `ChunkExecutor`; not heard while an answer is awaited.
 
     Raises:
         ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
@@ -60,9 +60,9 @@ class RealtimeExecutor(ChunkExecutor):
         *,
         latency: float | None = None,
         control_freq: float = 20.0,
-        gate: TensorDictModuleBase | None = None,
+        controller: TensorDictModuleBase | None = None,
     ):
-        super().__init__(policy, n_action_steps, gate)
+        super().__init__(policy, n_action_steps, controller)
         if latency is not None and not (math.isfinite(latency) and latency >= 0):
             raise ValueError(f"latency: expected None or seconds >= 0, got {latency}")
         self.hold = hold

@@ -1,0 +1,5 @@
+"""Policies: a network, a plan and an engine composed as TensorDict modules."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

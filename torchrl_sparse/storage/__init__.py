@@ -1,1 +1,5 @@
-"""Reading and writing policies. Nothing in a checkpoint is ever executed."""
+"""Files: policies in and out, published formats in. Nothing in a checkpoint is ever executed."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -7,9 +7,9 @@ import torch
 from torchrl_sparse.evaluation.latency.measure import (
     describe_machine,
     measure_latency,
-    num_threads,
     summarize_latency,
 )
+from torchrl_sparse.runtime.threads import num_threads
 
 
 def test_rounds_are_interleaved_and_shuffled():
@@ -90,7 +90,7 @@ def test_machine_description():
     [
         (lambda: measure_latency({}), "at least one callable"),
         (lambda: measure_latency({"a": lambda: None}, repeats=0), "repeats >= 1"),
-        (lambda: measure_latency({"a": lambda: None}, threads=0), "threads must be >= 1"),
+        (lambda: measure_latency({"a": lambda: None}, threads=0), "threads: expected at least 1"),
         (lambda: summarize_latency([]), "got none"),
         (lambda: summarize_latency([float("nan")]), "finite"),
     ],

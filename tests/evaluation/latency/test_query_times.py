@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, TransformerForDiffusion, keys
 from torchrl_sparse.blocks.planner import Planner
-from torchrl_sparse.evaluation.rollouts.methods import time_planning, time_queries
+from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 
 QUERIES = TensorDict({"history": {"state": torch.arange(3.0).view(3, 1, 1).expand(3, 2, 5).clone()}}, [3])
 

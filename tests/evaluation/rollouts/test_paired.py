@@ -5,8 +5,8 @@ from torchrl.envs import check_env_specs
 
 from tests.evaluation.rollouts.fakes import CHUNK_LENGTH, FLOPS_PER_QUERY, FakeActor, FakeEnv, expected_length
 from torchrl_sparse import keys
-from torchrl_sparse.evaluation.latency.measure import num_threads
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.runtime.threads import num_threads
 
 SEEDS = [7, 3, 10, 4, 25, 6, 1, 8, 15, 2, 11]
 

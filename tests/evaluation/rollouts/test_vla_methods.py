@@ -14,11 +14,11 @@ pytest.importorskip("transformers")
 
 from tests.tokens.helpers import CONFIG, later, make_policy, query
 from torchrl_sparse import keys
+from torchrl_sparse.control.queries import answer
 from torchrl_sparse.envs.rendering import GL_HINT
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
     TokenMethod,
-    answer,
     matching_share,
     mid_episode_query,
     seen_images,
@@ -51,7 +51,8 @@ def test_names_make_pruners():
     assert TokenMethod.parse("random@0.25").pruner().share == 0.25
     assert TokenMethod.parse("fastv@specprune").pruner(0.125).share == 0.125
     gates = [
-        TokenMethod.parse(name).executor(make_policy(), 2).gate for name in ("specprune", "specprune_static")
+        TokenMethod.parse(name).executor(make_policy(), 2).controller
+        for name in ("specprune", "specprune_static")
     ]
     assert gates[0] is not None
     assert gates[1] is None

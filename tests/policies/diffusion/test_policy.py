@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_sparse import BAC, Dense, DiffusionPolicy, Sampler, Schedule, StaticSchedule, Uniform, keys
+from torchrl_sparse import BAC, CacheSchedule, Dense, DiffusionPolicy, Sampler, SchedulePlanner, Uniform, keys
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
 from torchrl_sparse.blocks.planner import Planner
@@ -39,8 +39,8 @@ def test_plans_that_prune_nothing_are_bit_exactly_dense(policy, plan):
     if plan == "all updates":
         noise, cond = policy.sample_noise(torch.tensor([1])), torch.zeros(1, 2, 5)
         calibration = calibrate(policy.network, policy.sampler, noise, cond)
-        sampler = bac_schedule(calibration, policy.num_inference_steps, policy=policy.fingerprint)
-        policy.plan = BAC(sampler)
+        schedule = bac_schedule(calibration, policy.num_inference_steps, policy=policy.fingerprint)
+        policy.plan = BAC(schedule)
     else:
         policy.plan = Uniform(1)
     assert torch.equal(policy(request(2))[keys.CHUNK], dense)
@@ -83,12 +83,12 @@ def test_changing_the_sampler_rebinds_the_plan(policy):
 def test_a_plan_that_does_not_fit_leaves_the_policy_as_it_was(policy):
     steps = tuple((0, 3) for _ in range(policy.num_blocks))
     layers = policy.network.n_layer
-    policy.plan = StaticSchedule(Schedule("mine", policy.fingerprint, 8, layers, steps))
+    policy.plan = SchedulePlanner(CacheSchedule("mine", policy.fingerprint, 8, layers, steps))
     before = policy(request(1))[keys.CHUNK]
     with pytest.raises(ValueError, match="made for num_inference_steps 8, got 4"):
         policy.sampler = Sampler("ddim", 4)
     with pytest.raises(ValueError, match="made for policy fingerprint 'another'"):
-        policy.plan = StaticSchedule(Schedule("mine", "another", 8, layers, steps))
+        policy.plan = SchedulePlanner(CacheSchedule("mine", "another", 8, layers, steps))
     assert policy.num_inference_steps == 8
     assert torch.equal(policy(request(1))[keys.CHUNK], before)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from torchrl_sparse import ChunkExecutor
+from torchrl_sparse.envs.for_policy import instructed_env
 from torchrl_sparse.envs.named_lift import COLOURS
-from torchrl_sparse.evaluation.rollouts.vla_methods import instructed_env
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 ASSET = Path(__file__).parents[3] / "assets/vla"

@@ -42,9 +42,9 @@ _FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settin
 
 
 def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
-    """The value, f32 [B, 1, 1], that ``rate`` of each row's logits are above, the first step's not among them.
+    """Return the value, f32 [B, 1, 1], that ``rate`` of each row's logits exceed, those of the first step left out.
 
-    Gradients run through it: logits that all move together change nothing, and must not be drawn anywhere.
+    Gradients run through it: a shift of all logits changes no mask, and so has no gradient.
 
     Args:
         logits: f32 [B, K, 3L].
@@ -62,11 +62,11 @@ def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PrunerInfo:
-    """What a pruner was trained for.
+    """The policy, sampler and rates that a pruner was trained for.
 
     Attributes:
         policy: fingerprint of the policy.
-        sampler: name of its denoising schedule, see `Sampler.name`.
+        sampler: name of its sampler, see `Sampler.name`.
         rate: prune rate that it is asked for where the TensorDict says nothing, in (0, 1).
         rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
         reuse: what pruned blocks reuse.
@@ -130,11 +130,15 @@ class SAGPruner(Planner):
                 f"got {info.rate_range} and rate_input={network.rate_input}"
             )
         self.network, self.info, self.reuse = network.eval(), info, info.reuse
+        self.made_for = PlanSpec(
+            len(network.timesteps), network.num_blocks // len(BLOCK_TYPES), info.policy, info.sampler
+        )
         self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
         self._rate = info.rate
 
     @property
     def rate(self) -> float:
+        """Prune rate of the queries that bring none."""
         return self._rate
 
     @rate.setter
@@ -144,29 +148,11 @@ class SAGPruner(Planner):
 
     @property
     def fingerprint(self) -> str:
-        """Names the weights and the rate."""
+        """A name of the weights and the rate."""
         return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
 
-    def bind(self, spec: PlanSpec) -> None:
-        """See :meth:`Planner.bind`.
-
-        Raises:
-            ValueError: if the pruner was trained for another policy or another sampler.
-        """
-        trained_for = PlanSpec(
-            len(self.network.timesteps),
-            self.network.num_blocks // len(BLOCK_TYPES),
-            self.info.policy,
-            self.info.sampler,
-        )
-        for name, expected in asdict(trained_for).items():
-            if (asked := getattr(spec, name)) != expected:
-                label = "policy fingerprint" if name == "policy" else name
-                raise ValueError(f"SAG pruner: trained for {label} {expected!r}, got {asked!r}")
-        super().bind(spec)
-
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
-        """The rate of every query, if it is an input.
+        """Return the rate of every query, if it is an input.
 
         Raises:
             ValueError: if a rate is out of the range that the pruner was trained for.
@@ -180,7 +166,7 @@ class SAGPruner(Planner):
         return {"rate": rate.reshape(rows, 1)}
 
     def masks(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Masks bool [B, K, 3L].
+        """Return masks bool [B, K, 3L].
 
         Args:
             cond: encoded observations f32 [B, To, D].

@@ -10,8 +10,7 @@ import os
 import platform
 import random
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,7 +19,9 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["Latency", "describe_machine", "measure_latency", "num_threads", "summarize_latency"]
+from torchrl_sparse.runtime.threads import num_threads
+
+__all__ = ["Latency", "describe_machine", "measure_latency", "summarize_latency"]
 
 
 @dataclass(frozen=True)
@@ -115,26 +116,6 @@ def measure_latency(
             if on_round is not None and round_index >= 0:
                 on_round(round_index + 1, repeats)
     return {name: summarize_latency(values) for name, values in samples.items()}
-
-
-@contextmanager
-def num_threads(threads: int | None) -> Iterator[None]:
-    """Run a block with ``threads`` intra-op threads of PyTorch (None: as many as now); restore them
-    afterwards.
-
-    >>> with num_threads(1):
-    ...     torch.get_num_threads()
-    1
-    """
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be >= 1 or None, got {threads}")
-    before = torch.get_num_threads()
-    if threads is not None:
-        torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> dict[str, Any]:

@@ -1,0 +1,5 @@
+"""Results: their schema, their files and their tables."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -1,17 +1,14 @@
-"""The methods of a benchmark by name, and the queries on which they are compared."""
+"""The methods of a benchmark by name."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
@@ -19,19 +16,12 @@ from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.blocks.planner import Dense, Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency, num_threads, summarize_latency
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.runtime.clock import synchronised_clock
 
-_CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
-# Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
-EVALUATION_SEED = 100_000
-CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
 _FEWER_STEPS = re.compile(r"ddim([1-9]\d*|(?:_\d+)+)")
 METHODS = "dense, ddim<N>, ddim_<t>_<t>..., uniform, " + ", ".join(SCHEDULES)
 
@@ -63,7 +53,7 @@ class MethodName:
         plan, *rates = match.groups()
         return cls(plan, tuple(float(rate) for rate in rates if rate is not None))
 
-    def gate(self) -> ActionAwareController | None:
+    def controller(self) -> ActionAwareController | None:
         """What re-plans and moves the rate while an episode runs."""
         if len(self.rates) < 2:
             return None
@@ -142,7 +132,7 @@ def _saved_planner(path: Path, policy: DiffusionPolicy) -> tuple[Planner, Sample
         planner = SAGPruner.from_pretrained(path.parent)
         sampler, num_steps = planner.info.sampler, len(planner.network.timesteps)
     else:
-        planner = StaticSchedule(path)
+        planner = SchedulePlanner.from_pretrained(path)
         sampler, num_steps = planner.schedule.sampler, planner.schedule.num_inference_steps
     return planner, Sampler.from_name(sampler, num_steps, policy.sampler.num_train_timesteps)
 
@@ -158,37 +148,10 @@ def _set_rates(name: str, plan: Planner, rates: tuple[float, ...]) -> None:
 def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
     path = schedules / f"{name}.json"
     if path.exists():
-        found = Schedule.load(path)
+        found = CacheSchedule.from_pretrained(path)
         if found.settings.get("num_updates") == num_updates:
-            return StaticSchedule(found)
-    return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
-
-
-def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
-    """Arguments of `make_env` for an environment that shows what ``policy`` observes.
-
-    Raises:
-        ValueError: if the policy has cameras and its ``source`` does not say which.
-    """
-    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
-    if policy.vision is None:
-        return options
-    named = policy.source.get("cameras", {})
-    cameras = {name: named.get(name, "") for name in policy.vision.cameras}
-    if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
-        raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
-    return (
-        options | camera_options(cameras) | {"image_size": policy.vision.image_size[0], "object_state": False}
-    )
-
-
-def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
-    """Arguments of `make_env` for images by their names here and in demonstrations.
-
-    >>> camera_options({"image": "agentview_image"})
-    {'camera': 'agentview'}
-    """
-    return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}
+            return SchedulePlanner(found)
+    return SchedulePlanner(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
 
 
 def calibrate_policy(
@@ -203,23 +166,6 @@ def calibrate_policy(
     return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
 
 
-def record_queries(
-    actor: ChunkExecutor, make_env: Callable[..., EnvBase], seeds: Sequence[int]
-) -> TensorDictBase:
-    """Every query of one episode per seed: [number of queries], with what the policy read and what it answered."""
-    env = make_env(seeds=list(seeds))
-    episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
-    env.close()
-    wanted = [*actor.policy.in_keys, *actor.policy.out_keys]
-    return torch.cat([steps[steps[keys.QUERIED].squeeze(-1)].select(*wanted) for steps in episodes])
-
-
-def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:
-    """Asks another method the same: same observations, same noise."""
-    with torch.no_grad():
-        return policy(queries.select(*policy.in_keys, strict=False))
-
-
 def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:
     """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
     return {
@@ -229,52 +175,3 @@ def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:
         "sampler": policy.sampler.config,
         "planner": policy.plan.fingerprint,
     }
-
-
-def time_queries(
-    methods: Mapping[str, DiffusionPolicy],
-    queries: TensorDictBase,
-    *,
-    repeats: int,
-    threads: int,
-    on_round: Callable[[int, int], None] | None = None,
-) -> dict[str, Latency]:
-    """Latency of recorded queries [N] under each method, interleaved; see `measure_latency`.
-
-    Every round asks all methods the next query: asked the same again, an engine would know the mask already.
-    """
-    calls = {
-        name: partial(_answer_next, method, cycle(queries.unbind(0))) for name, method in methods.items()
-    }
-    return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)
-
-
-def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> None:
-    answer(policy, next(queries))
-
-
-def time_planning(
-    methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
-) -> dict[str, Latency]:
-    """Latency of the planners alone, within recorded queries [N]: from their encoding to their denoising, interleaved.
-
-    In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
-    """
-    seconds = {name: [] for name in methods}
-    with num_threads(threads), torch.no_grad():
-        for policy in methods.values():
-            answer(policy, queries[0])  # the first takes longer
-        for query in queries.unbind(0):
-            for name, policy in methods.items():
-                seconds[name].append(_planning_seconds(policy, query))
-    return {name: summarize_latency(samples) for name, samples in seconds.items()}
-
-
-def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
-    device = next(policy.network.parameters()).device
-    encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
-    start = synchronised_clock(device)
-    planned = policy.module["plan"](encoded)
-    seconds = synchronised_clock(device) - start
-    policy.module["denoise"](planned)
-    return seconds

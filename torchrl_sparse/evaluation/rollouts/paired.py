@@ -18,10 +18,10 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.evaluation.latency.measure import num_threads
 from torchrl_sparse.evaluation.rollouts.collectors import lost_workers, start_collector
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.runtime.threads import num_threads
 
 __all__ = ["rollout_episodes"]
 

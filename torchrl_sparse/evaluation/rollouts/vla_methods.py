@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,10 +15,6 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.rollouts.methods import camera_options
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens import (
@@ -31,9 +26,10 @@ from torchrl_sparse.tokens import (
     SpecPrune,
     VLACachePruner,
 )
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import replay
 
-__all__ = ["TokenMethod", "instructed_env", "matching_share", "mid_episode_query", "seen_images"]
+__all__ = ["TokenMethod", "matching_share", "mid_episode_query", "seen_images"]
 
 DENSE = "dense"
 _SPECPRUNE = {
@@ -112,8 +108,8 @@ class TokenMethod:
 
     def executor(self, policy: VLAPolicy, n_action_steps: int) -> ChunkExecutor:
         """``policy`` under this method's controller, if it has one."""
-        gate = ActionAwareController() if self.name == "specprune" else None
-        return ChunkExecutor(policy, n_action_steps, gate)
+        controller = ActionAwareController() if self.name == "specprune" else None
+        return ChunkExecutor(policy, n_action_steps, controller)
 
 
 def method_identity(
@@ -122,29 +118,6 @@ def method_identity(
     """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
     fixed = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
     return fixed | ({"options": dict(options)} if TokenMethod.parse(text).name in _SPECPRUNE else {})
-
-
-def instructed_env(
-    task: str, policy: VLAPolicy, cameras: Mapping[str, str], horizon: int | None = None
-) -> Callable[..., Any]:
-    """A maker of environments that show and say what ``policy`` reads; its keywords are those of `make_env`.
-
-    Args:
-        task: see `make_env`.
-        policy: decides the size of the images.
-        cameras: as in demonstrations: name of an observation here -> name of the images in the file.
-        horizon: steps until an episode is truncated; None for the task's own.
-    """
-    return partial(
-        make_env,
-        find_robosuite_task(task).name,
-        n_obs_steps=1,
-        image_size=policy.network.config.image_size,
-        object_state=False,
-        instruction=True,
-        horizon=horizon,
-        **camera_options(cameras),
-    )
 
 
 def matching_share(
@@ -187,12 +160,6 @@ def mid_episode_query(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> T
     remembered = [key for key in policy.out_keys if key in policy.in_keys]
     query = queries[last].exclude(*remembered)
     return query.update(answers[last - 1].select(*remembered)) if last else query
-
-
-def answer(policy: VLAPolicy, query: TensorDictBase) -> TensorDictBase:
-    """What a policy answers; the query stays as it is."""
-    with torch.no_grad():
-        return policy(query.clone(recurse=False))
 
 
 def seen_images(policy: VLAPolicy, step: TensorDictBase) -> Tensor:

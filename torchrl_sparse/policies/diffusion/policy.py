@@ -45,15 +45,16 @@ class DiffusionPolicy(TensorDictSequential):
         network: the denoiser.
         normalizer: of states and actions.
         vision: encoder of the cameras; their features come before the state in the network's condition.
-        sampler: sampler; DDPM with all training steps by default.
-        plan: what to skip; nothing by default.
+        sampler: DDPM with all training steps by default.
+        plan: the planner; None is dense.
         engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
             fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the
             same mask and seed. In training mode, and where the condition requires gradients, the differentiable
             reference runs whatever is chosen.
 
     Attributes:
-        plan: the planner. Assign another to change the method: ``policy.plan = planner``.
+        plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
+            which then reads as the `Dense` planner.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
@@ -77,10 +78,9 @@ class DiffusionPolicy(TensorDictSequential):
         engine: EngineName = "auto",
     ):
         sampler = Sampler() if sampler is None else sampler
-        plan = Dense() if plan is None else plan
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
-            plan=plan,
+            plan=Dense(),
             denoise=ActionDenoiser(network, normalizer, sampler, engine),
         )
         super().__init__(stages)
@@ -120,14 +120,32 @@ class DiffusionPolicy(TensorDictSequential):
         else:
             super().__setattr__(name, value)
 
-    def _install(self, plan: Planner, sampler: Sampler) -> None:
-        """Changes planner and sampler together, or, if the planner cannot serve that sampler, neither."""
+    def _install(self, plan: Planner | None, sampler: Sampler) -> None:
+        """Change planner and sampler together, or, if the planner cannot serve that sampler, neither."""
+        plan = Dense() if plan is None else plan
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         denoiser = self.module["denoise"]
         denoiser.sampler, denoiser.reuse = sampler, plan.reuse
         self.module["plan"] = plan
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
+
+    def with_plan(self, plan: Planner | None, sampler: Sampler | None = None) -> DiffusionPolicy:
+        """Return a policy of the same networks under another planner and, unless it is None, another sampler.
+
+        Raises:
+            ValueError: if the planner was made for another policy or sampler.
+        """
+        policy = DiffusionPolicy(
+            self.network,
+            self.normalizer,
+            vision=self.vision,
+            sampler=self.sampler if sampler is None else sampler,
+            plan=plan,
+            engine=self.engine,
+        )
+        policy.source = self.source
+        return policy
 
     # -- numbers about it ----------------------------------------------------------------------------------------------
 
@@ -152,7 +170,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """Names these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
+        """A name of these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
         digest = hashlib.sha256()
         for part in (self.network, self.vision):
             if part is not None:
@@ -171,7 +189,7 @@ class DiffusionPolicy(TensorDictSequential):
         self.module["denoise"].engine = EngineSlot(name)
 
     def engine_info(self) -> str:
-        """Which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
+        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
         ``"auto"`` had to do without the native one, also why.
 
         Raises:
@@ -180,20 +198,20 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["denoise"].engine.describe(self.network, self.sampler)
 
     def block_costs(self) -> dict[str, BlockCost]:
-        """Seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
+        """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
         slot = self.module["denoise"].engine
         return engine_block_costs(slot.get(self.network, self.sampler), self.network)
 
     # -- running it ----------------------------------------------------------------------------------------------------
 
     def sample_noise(self, seed: Tensor) -> Tensor:
-        """All noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
+        """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
         return sample_noise(seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, *, reuse: Reuse = "block"
     ) -> Tensor:
-        """Normalised actions f32 [B, H, A] in the chosen engine, see `torchrl_sparse.blocks.engine.Engine.denoise`."""
+        """Return normalised actions f32 [B, H, A] from the chosen engine, see `torchrl_sparse.blocks.engine.Engine.denoise`."""
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -206,13 +224,13 @@ class DiffusionPolicy(TensorDictSequential):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
-        """Writes ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
+        """Write ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
         stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source)
         write_pretrained(Path(path), stored, half=half)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Reads what `save_pretrained` wrote, to run in ``engine``. Nothing in the files is executed.
+        """Read what `save_pretrained` wrote, to run in ``engine``. Nothing in the files is executed.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -221,7 +239,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Reads a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
+        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
 
         The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
         what the policy was trained for. Nothing in the file is executed.

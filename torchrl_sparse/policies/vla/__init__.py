@@ -1,1 +1,5 @@
-"""Vision-language-action policies (the OpenVLA-OFT architecture at any size) and the interface of what prunes their tokens."""
+"""Vision-language-action policies: the OpenVLA-OFT architecture at any size."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

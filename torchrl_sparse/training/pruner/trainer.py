@@ -25,8 +25,8 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse, prune_rate
-from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.blocks.sag.planner import check_rates, rate_threshold
+from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.training_state import read_checkpoint
@@ -72,7 +72,7 @@ class PrunerConfig:
             ``"seconds"`` of its type.
         reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         gradient: ``"chain"`` differentiates the whole chain of denoising steps; ``"step"`` cuts it between them
-            (:func:`~torchrl_sparse.blocks.relaxed.step_errors` says what is lost).
+            (:func:`~torchrl_sparse.blocks.sag.relaxed.step_errors` says what is lost).
         explore: share of the pruned blocks that an update evaluates to learn what they are worth; the smaller,
             the cheaper an update and the noisier its gradient.
         checkpointed: recompute denoising steps in the backward pass, for the memory of one step.

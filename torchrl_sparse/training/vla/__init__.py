@@ -1,0 +1,5 @@
+"""Training of vision-language-action policies, and calibration of their token budget."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

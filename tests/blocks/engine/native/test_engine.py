@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from torchrl_sparse.blocks.engine import denoise
-from torchrl_sparse.blocks.engine.native import engine as native
-from torchrl_sparse.blocks.engine.native import library
+from torchrl_sparse.blocks.engine.native import engine as native, library
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
 from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, native_available
 from torchrl_sparse.blocks.engine.native.packing import pack_panels

@@ -5,7 +5,7 @@ import torch
 
 from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS, random_mask
 from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
+from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 
 NUM_BLOCKS = 3 * NUM_LAYERS
 

@@ -1,4 +1,4 @@
-"""Static schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
+"""Cache schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
 read.
 
 ::
@@ -47,7 +47,7 @@ from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
 from torchrl_sparse.networks.diffusion.sampler import split_sampler
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["Schedule", "StaticSchedule"]
+__all__ = ["CacheSchedule", "SchedulePlanner"]
 
 FORMAT = "torchrl_sparse.schedule/1"
 _FIELDS = (
@@ -64,7 +64,7 @@ _FIELDS = (
 
 
 @dataclass(frozen=True)
-class Schedule:
+class CacheSchedule:
     """Which blocks are computed at which denoising steps, and for which policy that was decided.
 
     Attributes:
@@ -74,7 +74,7 @@ class Schedule:
         num_layers: layers L.
         computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
             with 0.
-        sampler: name of the denoising schedule that it was made for, see `Sampler.name`.
+        sampler: name of the sampler that it was made for, see `Sampler.name`.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
@@ -82,7 +82,7 @@ class Schedule:
         ValueError: if a field does not hold what is described here.
 
     Examples:
-        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> schedule = CacheSchedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
         >>> schedule.mask().int().tolist()
         [[0, 0, 0], [1, 1, 0], [0, 1, 1], [1, 1, 0]]
     """
@@ -128,8 +128,8 @@ class Schedule:
         sampler: str = "ddpm",
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
-    ) -> Schedule:
-        """The schedule of a mask bool [K, 3L].
+    ) -> CacheSchedule:
+        """Make the schedule of a mask bool [K, 3L].
 
         Raises:
             ValueError: if ``mask`` is no prune mask.
@@ -141,11 +141,16 @@ class Schedule:
             method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
         )
 
+    @property
+    def spec(self) -> PlanSpec:
+        """The policy and the sampler that it was made for."""
+        return PlanSpec(self.num_inference_steps, self.num_layers, self.policy, self.sampler)
+
     def mask(self) -> Tensor:
-        """The prune mask bool [K, 3L]."""
+        """Return the prune mask bool [K, 3L]."""
         return mask_from_steps(self.computed_steps, self.num_inference_steps)
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write the file under a temporary name and move it into place: no reader ever sees half of it.
 
         Raises:
@@ -156,7 +161,7 @@ class Schedule:
             temporary.write_text(text, encoding="utf-8")
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> Schedule:
+    def from_pretrained(cls, path: str | os.PathLike) -> CacheSchedule:
         """Read and check a file; nothing in it is executed.
 
         Raises:
@@ -173,7 +178,7 @@ class Schedule:
             raise ValueError(f"schedule {path}: {error}") from error
 
     def _to_json(self) -> str:
-        """JSON with one line per block, which the standard library's indentation cannot do."""
+        """Return JSON with one line per block, which the standard library's indentation cannot do."""
         head = {
             "format": FORMAT,
             "method": self.method,
@@ -192,46 +197,40 @@ class Schedule:
         return "\n".join(["{", *lines, '  "computed_steps": {', ",\n".join(blocks), "  }", "}", ""])
 
 
-class StaticSchedule(StaticPlanner):
+class SchedulePlanner(StaticPlanner):
     """Writes the mask of a schedule for every observation; serves only the policy that it was made for.
 
     Args:
-        schedule: the schedule, or the path of its file.
-
-    Raises:
-        ValueError, FileNotFoundError: if the file cannot be used, see :meth:`Schedule.load`.
+        schedule: the schedule.
 
     Examples:
-        >>> schedule = Schedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
-        >>> StaticSchedule(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
+        >>> schedule = CacheSchedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
+        >>> SchedulePlanner(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
         Traceback (most recent call last):
         ...
-        ValueError: schedule 'by hand': made for policy fingerprint 'a policy', got 'another'
+        ValueError: SchedulePlanner: made for policy fingerprint 'a policy', got 'another'
     """
 
-    def __init__(self, schedule: Schedule | str | os.PathLike) -> None:
+    def __init__(self, schedule: CacheSchedule) -> None:
         super().__init__()
-        self.schedule = schedule if isinstance(schedule, Schedule) else Schedule.load(schedule)
-        self.reuse = self.schedule.reuse
+        self.schedule, self.reuse, self.made_for = schedule, schedule.reuse, schedule.spec
+
+    @classmethod
+    def from_pretrained(cls, path: str | os.PathLike) -> SchedulePlanner:
+        """Read a schedule's file; errors are those of :meth:`CacheSchedule.from_pretrained`."""
+        return cls(CacheSchedule.from_pretrained(path))
+
+    def save_pretrained(self, path: str | os.PathLike) -> None:
+        """Write the schedule's file, see :meth:`CacheSchedule.save_pretrained`."""
+        self.schedule.save_pretrained(path)
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """The schedule's mask [K, 3L].
-
-        Raises:
-            ValueError: if the schedule was made for another policy or sampler, or for other numbers of steps or layers.
-        """
-        for name in ("num_inference_steps", "num_layers", "policy", "sampler"):
-            made_for, asked = getattr(self.schedule, name), getattr(spec, name)
-            if made_for != asked:
-                label = "policy fingerprint" if name == "policy" else name
-                raise ValueError(
-                    f"schedule {self.schedule.method!r}: made for {label} {made_for!r}, got {asked!r}"
-                )
+        """Return the schedule's mask [K, 3L]."""
         return self.schedule.mask()
 
 
 def _checked_fields(data: Any) -> dict[str, Any]:
-    """Arguments of :class:`Schedule` from decoded JSON; the values themselves are checked by the class."""
+    """Return the arguments of :class:`CacheSchedule` from decoded JSON; the values themselves are checked by the class."""
     if not isinstance(data, dict):
         raise ValueError(f"expected a JSON object, got {type(data).__name__}")
     if data.get("format") != FORMAT:

@@ -7,13 +7,13 @@ from tensordict import TensorDict
 
 from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS, random_mask
 from torchrl_sparse.blocks.planner import PlanSpec
-from torchrl_sparse.blocks.static import Schedule, StaticSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.keys import COND, PRUNE_MASK
 
 
 @pytest.fixture
 def schedule():
-    return Schedule.from_mask(
+    return CacheSchedule.from_mask(
         random_mask(),
         method="bac",
         policy="8d1f",
@@ -23,12 +23,12 @@ def schedule():
 
 @pytest.fixture
 def path(schedule, tmp_path):
-    schedule.save(tmp_path / "schedule.json")
+    schedule.save_pretrained(tmp_path / "schedule.json")
     return tmp_path / "schedule.json"
 
 
 def test_a_file_brings_back_the_same_schedule(schedule, path):
-    loaded = Schedule.load(path)
+    loaded = CacheSchedule.from_pretrained(path)
     assert loaded == schedule
     assert torch.equal(loaded.mask(), random_mask())
 
@@ -46,16 +46,20 @@ def test_blocks_may_be_listed_in_any_order(schedule, path):
     data = json.loads(path.read_text())
     data["computed_steps"] = dict(reversed(data["computed_steps"].items()))
     path.write_text(json.dumps(data))
-    assert Schedule.load(path) == schedule
+    assert CacheSchedule.from_pretrained(path) == schedule
 
 
 def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
-    Schedule.from_mask(torch.zeros(4, 3, dtype=torch.bool), method="dense", policy="x").save(path)
-    assert Schedule.load(path).num_inference_steps == 4
-    unwritable = Schedule.from_mask(schedule.mask(), method="bac", policy="8d1f", settings={"bad": object()})
+    CacheSchedule.from_mask(torch.zeros(4, 3, dtype=torch.bool), method="dense", policy="x").save_pretrained(
+        path
+    )
+    assert CacheSchedule.from_pretrained(path).num_inference_steps == 4
+    unwritable = CacheSchedule.from_mask(
+        schedule.mask(), method="bac", policy="8d1f", settings={"bad": object()}
+    )
     with pytest.raises(TypeError):
-        unwritable.save(path)
-    assert Schedule.load(path).num_inference_steps == 4
+        unwritable.save_pretrained(path)
+    assert CacheSchedule.from_pretrained(path).num_inference_steps == 4
     assert [file.name for file in path.parent.iterdir()] == ["schedule.json"]
 
 
@@ -102,15 +106,15 @@ def test_a_damaged_file_is_refused_naming_file_and_field(path, damage, message):
     path.write_text(damage(before))
     assert path.read_text() != before
     with pytest.raises(ValueError, match=f"(?s)schedule {re.escape(str(path))}: .*{message}"):
-        Schedule.load(path)
+        CacheSchedule.from_pretrained(path)
 
 
 def test_binary_rubbish_and_a_missing_file_are_refused(tmp_path):
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(ValueError, match="expected a complete JSON file"):
-        Schedule.load(tmp_path / "binary")
+        CacheSchedule.from_pretrained(tmp_path / "binary")
     with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
-        StaticSchedule(tmp_path / "nowhere.json")
+        SchedulePlanner.from_pretrained(tmp_path / "nowhere.json")
 
 
 @pytest.mark.parametrize(
@@ -118,12 +122,12 @@ def test_binary_rubbish_and_a_missing_file_are_refused(tmp_path):
 )
 def test_only_prune_masks_become_schedules(mask):
     with pytest.raises(ValueError, match="prune mask: expected"):
-        Schedule.from_mask(mask, method="by hand", policy="x")
+        CacheSchedule.from_mask(mask, method="by hand", policy="x")
 
 
 @pytest.mark.parametrize("from_file", [True, False])
 def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, from_file):
-    planner = StaticSchedule(path if from_file else schedule)
+    planner = SchedulePlanner.from_pretrained(path) if from_file else SchedulePlanner(schedule)
     planner.bind(PlanSpec(NUM_STEPS, NUM_LAYERS, "8d1f"))
     masks = planner(TensorDict({COND: torch.randn(3, 2, 5)}, [3]))[PRUNE_MASK]
     assert torch.equal(masks, random_mask().expand(3, -1, -1))
@@ -141,4 +145,4 @@ def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, f
 )
 def test_a_schedule_made_for_another_policy_is_refused_naming_both(schedule, spec, message):
     with pytest.raises(ValueError, match=f"schedule 'bac': made for {message}"):
-        StaticSchedule(schedule).bind(spec)
+        SchedulePlanner(schedule).bind(spec)

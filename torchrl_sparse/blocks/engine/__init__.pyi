@@ -1,0 +1,18 @@
+from .base import (
+    Engine as Engine,
+    ReferenceEngine as ReferenceEngine,
+)
+from .costs import BlockCost as BlockCost
+from .factory import (
+    EngineName as EngineName,
+    make_engine as make_engine,
+)
+from .native import (
+    NativeEngine as NativeEngine,
+    native_available as native_available,
+)
+from .reference import (
+    FeatureRecorder as FeatureRecorder,
+    denoise as denoise,
+)
+from .torch import TorchEngine as TorchEngine

@@ -1,0 +1,2 @@
+from .engine import NativeEngine as NativeEngine
+from .library import native_available as native_available

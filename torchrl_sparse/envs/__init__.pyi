@@ -1,0 +1,5 @@
+from .robosuite import RobosuiteEnv as RobosuiteEnv
+from .transforms import (
+    EndEffectorVelocity as EndEffectorVelocity,
+    make_env as make_env,
+)

@@ -1,0 +1,67 @@
+"""Latency of recorded queries, and of the planners within them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import cycle
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_sparse.control.queries import answer
+from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency, summarize_latency
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.runtime.threads import num_threads
+
+__all__ = ["time_planning", "time_queries"]
+
+
+def time_queries(
+    methods: Mapping[str, DiffusionPolicy],
+    queries: TensorDictBase,
+    *,
+    repeats: int,
+    threads: int,
+    on_round: Callable[[int, int], None] | None = None,
+) -> dict[str, Latency]:
+    """Time recorded queries [N] under each method, interleaved; see `measure_latency`.
+
+    Every round asks all methods the next query: asked the same again, an engine would know the mask already.
+    """
+    calls = {
+        name: partial(_answer_next, method, cycle(queries.unbind(0))) for name, method in methods.items()
+    }
+    return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)
+
+
+def time_planning(
+    methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
+) -> dict[str, Latency]:
+    """Time the planners alone, within recorded queries [N]: from their encoding to their denoising, interleaved.
+
+    In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
+    """
+    seconds = {name: [] for name in methods}
+    with num_threads(threads), torch.no_grad():
+        for policy in methods.values():
+            answer(policy, queries[0])  # the first takes longer
+        for query in queries.unbind(0):
+            for name, policy in methods.items():
+                seconds[name].append(_planning_seconds(policy, query))
+    return {name: summarize_latency(samples) for name, samples in seconds.items()}
+
+
+def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> None:
+    answer(policy, next(queries))
+
+
+def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
+    device = next(policy.network.parameters()).device
+    encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
+    start = synchronised_clock(device)
+    planned = policy.module["plan"](encoded)
+    seconds = synchronised_clock(device) - start
+    policy.module["denoise"](planned)
+    return seconds

@@ -1,0 +1,62 @@
+"""The evaluation of one method: its episodes, with a log that is resumed and a bar that shows how far it is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+
+__all__ = ["evaluate", "success_rate"]
+
+
+def evaluate(
+    name: str,
+    actor: TensorDictModuleBase,
+    make_env: Callable[..., EnvBase],
+    seeds: Sequence[int],
+    *,
+    log: str | os.PathLike | None = None,
+    identity: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> list[EpisodeResult]:
+    """Run one episode per seed and show a progress bar.
+
+    Args:
+        name: of the method, for the bar.
+        actor, make_env, seeds: see `rollout_episodes`.
+        log: JSON-lines file that every finished episode is appended to; those that are in it already are not run again.
+        identity: what makes these episodes this method's own; a log with another identity is refused.
+        options: others of `rollout_episodes`, such as ``num_envs``, ``workers`` and ``backend``.
+
+    Returns:
+        The episodes in the order of ``seeds``.
+
+    Raises:
+        As `rollout_episodes`.
+    """
+    with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
+        return rollout_episodes(
+            actor,
+            make_env,
+            seeds,
+            results_file=log,
+            identity=identity,
+            on_episode=lambda _, done, total: bar.update(done - bar.n),
+            **options,
+        )
+
+
+def success_rate(episodes: Sequence[EpisodeResult]) -> float:
+    """Return the share of episodes that succeeded.
+
+    >>> success_rate([EpisodeResult(0, True, 8, 1, 10.0, 0.5), EpisodeResult(1, False, 24, 3, 90.0, 0.9)])
+    0.5
+    """
+    return sum(episode.success for episode in episodes) / len(episodes)

@@ -1,0 +1,8 @@
+from .diffusion import (
+    METHODS as METHODS,
+    Method as Method,
+    MethodInputs as MethodInputs,
+    MethodName as MethodName,
+    check_method as check_method,
+    make_method as make_method,
+)

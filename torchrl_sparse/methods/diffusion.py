@@ -1,0 +1,245 @@
+"""The methods of a diffusion policy by name: planner and sampler, controller, and colour in figures.
+
+A method is written ``NAME``, ``NAME@RATE`` (every query is asked for that prune rate) or ``NAME@COARSE-FINE`` (a
+controller asks for the first rate in coarse motion and for the second in fine motion). NAME is a key of
+:data:`METHODS`, or matches the pattern of one (``ddim10``, ``ddim_87_20``), or names a planner that is saved in the
+folder at hand, as ``NAME.json`` or ``NAME/``.
+
+A method of one's own is one line, executed before its name is used::
+
+    METHODS["mine"] = Method(lambda inputs: (MyPlanner(), inputs.sampler))
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_sparse.blocks.bac import SCHEDULES
+from torchrl_sparse.blocks.calibration import Calibration
+from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
+from torchrl_sparse.blocks.saved import load_planner
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+from torchrl_sparse.blocks.uniform import Uniform
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.keys import PRUNE_RATE
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+__all__ = [
+    "METHODS",
+    "Method",
+    "MethodInputs",
+    "MethodName",
+    "check_method",
+    "make_controller",
+    "make_method",
+]
+
+
+@dataclass(frozen=True)
+class MethodName:
+    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``.
+
+    Attributes:
+        name: see the module.
+        rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
+    """
+
+    name: str
+    rates: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, text: str) -> MethodName:
+        """Raise ValueError unless ``text`` is written as above.
+
+        >>> MethodName.parse("sag_rates@0.95-0.7")
+        MethodName(name='sag_rates', rates=(0.95, 0.7))
+        """
+        match = re.fullmatch(r"(\w+)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        if match is None:
+            raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
+        name, *rates = match.groups()
+        return cls(name, tuple(float(rate) for rate in rates if rate is not None))
+
+
+@dataclass(frozen=True)
+class MethodInputs:
+    """Everything that a method may be made from.
+
+    Attributes:
+        name: the method's, without rates.
+        spec: the policy, with its own sampler.
+        sampler: the policy's own.
+        num_updates: M, how often ``uniform`` and BAC compute a block.
+        planners: folder of saved planners.
+        calibration: makes a calibration of the policy; called where one is needed.
+    """
+
+    name: str
+    spec: PlanSpec
+    sampler: Sampler
+    num_updates: int
+    planners: Path
+    calibration: Callable[[], Calibration]
+
+
+def move_rate(rates: tuple[float, ...]) -> ActionAwareController | None:
+    """Return what moves the prune rate between two that were written, and nothing for one or none."""
+    if len(rates) < 2:
+        return None
+    coarse, fine = rates
+    return ActionAwareController(coarse=coarse, fine=fine, budget_key=PRUNE_RATE)
+
+
+@dataclass(frozen=True)
+class Method:
+    """How to make a method.
+
+    Attributes:
+        make: returns planner and sampler; ValueError where the inputs do not allow it.
+        pattern: regular expression of further names that it goes by; ``inputs.name`` says which.
+        controller: returns what a `ChunkExecutor` runs at every step beside the policy, given the rates that were
+            written, or None.
+        color: in figures, such as ``"#0072B2"``; None takes what is left.
+    """
+
+    make: Callable[[MethodInputs], tuple[Planner, Sampler]]
+    pattern: str | None = None
+    controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
+    color: str | None = None
+
+
+def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    return Dense(), inputs.sampler
+
+
+def _ddim(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """At diffusers' timesteps, as many as the name ends with."""
+    return Dense(), Sampler("ddim", int(inputs.name.removeprefix("ddim")), inputs.sampler.num_train_timesteps)
+
+
+def _ddim_at_timesteps(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """At the timesteps of the name."""
+    return Dense(), Sampler.from_name(inputs.name, num_train_timesteps=inputs.sampler.num_train_timesteps)
+
+
+def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    return Uniform(interval=-(-inputs.spec.num_inference_steps // inputs.num_updates)), inputs.sampler
+
+
+def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """The saved schedule if it has as many updates, else a new one."""
+    path = inputs.planners / f"{inputs.name}.json"
+    schedule = CacheSchedule.from_pretrained(path) if path.exists() else None
+    if schedule is None or schedule.settings.get("num_updates") != inputs.num_updates:
+        make = SCHEDULES[inputs.name]
+        schedule = make(inputs.calibration(), inputs.num_updates, policy=inputs.spec.policy)
+    return SchedulePlanner(schedule), inputs.sampler
+
+
+def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """A saved planner and the sampler that it was made for."""
+    planner, sampler = load_planner(_saved_path(inputs.planners, inputs.name)), inputs.sampler
+    if (spec := planner.made_for) is not None:
+        sampler = Sampler.from_name(spec.sampler, spec.num_inference_steps, sampler.num_train_timesteps)
+    return planner, sampler
+
+
+# Okabe and Ito's colours, which stay apart for colour-blind readers.
+METHODS: dict[str, Method] = {
+    "dense": Method(_dense, color="#333333"),
+    "ddim10": Method(_ddim, color="#E69F00"),
+    "ddim<N>": Method(_ddim, pattern=r"ddim[1-9]\d*"),
+    "ddim_<t>_<t>...": Method(_ddim_at_timesteps, pattern=r"ddim(_\d+)+"),
+    "uniform": Method(_uniform, color="#56B4E9"),
+    "bac": Method(_bac, color="#0072B2"),
+    "bac_blockwise": Method(_bac, color="#D55E00"),
+    "bac_unified": Method(_bac, color="#CC79A7"),
+}
+"""Name -> method. Planners that are saved in a folder need no line: their files say what they are."""
+
+SAVED = Method(_saved)
+
+
+def check_method(text: str, planners: Path) -> None:
+    """Raise ValueError unless ``text`` is written as a `MethodName` whose method is known or saved in ``planners``."""
+    _find(text, planners)
+
+
+def make_method(
+    text: str,
+    policy: DiffusionPolicy,
+    *,
+    num_updates: int,
+    planners: Path,
+    calibration: Callable[[], Calibration],
+) -> DiffusionPolicy:
+    """Return the policy under a method; it shares the networks with ``policy``.
+
+    Args:
+        text: the method, as the module says.
+        policy: the trained policy with its own sampler.
+        num_updates, planners, calibration: see `MethodInputs`. A BAC schedule that is not in ``planners``, or was made
+            with another M, is computed.
+
+    Raises:
+        ValueError: for an unknown name, a planner that was made for another policy, or a rate that it does not take.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> options = {"num_updates": 10, "planners": Path("assets/lift"), "calibration": lambda: None}
+        >>> make_method("ddim10", policy, **options).num_inference_steps
+        10
+        >>> make_method("sag", policy, **options).plan.is_static
+        False
+    """
+    method, written = _find(text, planners), MethodName.parse(text)
+    inputs = MethodInputs(written.name, policy.plan.spec, policy.sampler, num_updates, planners, calibration)
+    planner, sampler = method.make(inputs)
+    if written.rates:
+        _ask_for(planner, written)
+    return policy.with_plan(planner, sampler)
+
+
+def make_controller(text: str) -> TensorDictModuleBase | None:
+    """Return the controller of a method, of a saved one too."""
+    written = MethodName.parse(text)
+    return (_lookup(written.name) or SAVED).controller(written.rates)
+
+
+def _find(text: str, planners: Path) -> Method:
+    name = MethodName.parse(text).name
+    if (method := _lookup(name)) is not None:
+        return method
+    if _saved_path(planners, name) is None:
+        raise ValueError(
+            f"methods: expected {', '.join(METHODS)}, or a planner in {planners} ({name}.json or {name}/), got {text!r}"
+        )
+    return SAVED
+
+
+def _lookup(name: str) -> Method | None:
+    matching = (
+        method for method in METHODS.values() if method.pattern and re.fullmatch(method.pattern, name)
+    )
+    return METHODS.get(name) or next(matching, None)
+
+
+def _saved_path(planners: Path, name: str) -> Path | None:
+    candidates = (planners / f"{name}.json", planners / name / "config.json")
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _ask_for(planner: Planner, written: MethodName) -> None:
+    """Set the rate of queries that bring none. Both rates are tried: a wrong one is found now and not in mid-episode."""
+    if planner.rate is None:
+        raise ValueError(
+            f"methods: {written.name}: expected a planner that takes a prune rate, got {type(planner).__name__}"
+        )
+    for rate in reversed(written.rates):
+        planner.rate = rate

@@ -1,0 +1,2 @@
+from .diffusion import DiffusionPolicy as DiffusionPolicy
+from .vla import VLAPolicy as VLAPolicy

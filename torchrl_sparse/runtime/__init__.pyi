@@ -1,0 +1,3 @@
+from .backends import backend_runtime as backend_runtime
+from .clock import synchronised_clock as synchronised_clock
+from .interrupt import StopSignal as StopSignal

@@ -1,0 +1,30 @@
+"""PyTorch's number of threads, for a while."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+__all__ = ["num_threads"]
+
+
+@contextmanager
+def num_threads(threads: int | None) -> Iterator[None]:
+    """Run a block with ``threads`` intra-op threads of PyTorch (None: as many as now); restore them afterwards.
+
+    Raises:
+        ValueError: for fewer than one thread.
+
+    >>> with num_threads(1):
+    ...     torch.get_num_threads()
+    1
+    """
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads: expected at least 1 or None, got {threads}")
+    before = torch.get_num_threads()
+    if threads is not None:
+        torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

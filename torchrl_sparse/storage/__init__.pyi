@@ -1,0 +1,4 @@
+from .published import (
+    CheckpointError as CheckpointError,
+    read_diffusion_policy as read_diffusion_policy,
+)

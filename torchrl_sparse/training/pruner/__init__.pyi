@@ -1,0 +1,4 @@
+from .trainer import (
+    PrunerConfig as PrunerConfig,
+    PrunerTrainer as PrunerTrainer,
+)
