@@ -22,6 +22,8 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.options import env_options
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.plots import (
@@ -42,16 +44,11 @@ from torchrl_sparse.evaluation.results.report import (
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.methods import (
-    CALIBRATION_SEED,
-    EVALUATION_SEED,
     MethodName,
     answer,
-    calibrate_policy,
     check_method,
-    env_options,
     make_method,
     method_identity,
-    record_queries,
     time_planning,
     time_queries,
 )
@@ -60,6 +57,7 @@ from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_er
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.queries import calibrate_policy, record_queries
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")
 

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
+from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.figures.plots import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import (
     draw_tokens,
@@ -39,7 +40,6 @@ from torchrl_sparse.evaluation.results.report import (
 )
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
-from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
     TokenMethod,

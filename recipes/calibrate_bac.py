@@ -14,9 +14,10 @@ from omegaconf import DictConfig
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.options import env_options
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.rollouts.methods import calibrate_policy, env_options
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.queries import calibrate_policy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")

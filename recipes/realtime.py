@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation.latency.measure import describe_machine
@@ -29,18 +30,15 @@ from torchrl_sparse.evaluation.results.realtime import (
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.methods import (
-    CALIBRATION_SEED,
-    EVALUATION_SEED,
-    calibrate_policy,
     check_method,
     make_method,
     method_identity,
-    record_queries,
     time_queries,
 )
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.queries import calibrate_policy, record_queries
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")

@@ -21,6 +21,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
 from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -123,8 +124,8 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.envs.options import env_options
     from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.rollouts.methods import env_options
     from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 
     sampler = Sampler("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else Sampler()
@@ -132,7 +133,7 @@ def evaluate(trainer: PolicyTrainer, config: DictConfig) -> float | None:
     episodes = rollout_episodes(
         ChunkExecutor(policy, trainer.config.n_action_steps),
         partial(make_env, find_task(config.task).name, **env_options(policy)),
-        range(config.eval_seed, config.eval_seed + config.eval_episodes),
+        range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )

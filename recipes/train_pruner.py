@@ -30,6 +30,7 @@ from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED
 from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -39,8 +40,6 @@ from torchrl_sparse.training.diffusion.published import published_shape
 from torchrl_sparse.training.loop import make_logger
 from torchrl_sparse.training.pruner.reference import make_reference, with_queries
 from torchrl_sparse.training.pruner.trainer import PrunerConfig, PrunerTrainer, imitate
-
-ROLLOUT_SEED = 2_000_000  # of the first episode; no demonstration, calibration or evaluation has it
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_pruner")
@@ -98,8 +97,9 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
             f"got {config.reference.target}"
         )
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
+    from torchrl_sparse.envs.options import env_options
     from torchrl_sparse.envs.transforms import make_env
-    from torchrl_sparse.evaluation.rollouts.methods import env_options, record_queries
+    from torchrl_sparse.training.diffusion.queries import record_queries
 
     task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
@@ -112,7 +112,7 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     )
     environment = partial(make_env, task.name, **env_options(policy))
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
-    return record_queries(actor, environment, range(ROLLOUT_SEED, ROLLOUT_SEED + config.rollouts))
+    return record_queries(actor, environment, range(CLOSED_LOOP_SEED, CLOSED_LOOP_SEED + config.rollouts))
 
 
 @contextmanager

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.results.report import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
-from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED, make_method, method_identity
+from torchrl_sparse.evaluation.rollouts.methods import make_method, method_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
@@ -12,26 +12,20 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.bac import SCHEDULES
-from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.planner import Dense, Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
 from torchrl_sparse.blocks.static import Schedule, StaticSchedule
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency, num_threads, summarize_latency
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.clock import synchronised_clock
 
-_CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
-# Of the first episode: Diffusion Policy's test_start_seed, which no demonstration has.
-EVALUATION_SEED = 100_000
-CALIBRATION_SEED = 1_000_000  # of the first observation that schedules are computed from
 _FEWER_STEPS = re.compile(r"ddim([1-9]\d*|(?:_\d+)+)")
 METHODS = "dense, ddim<N>, ddim_<t>_<t>..., uniform, " + ", ".join(SCHEDULES)
 
@@ -162,56 +156,6 @@ def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
         if found.settings.get("num_updates") == num_updates:
             return StaticSchedule(found)
     return StaticSchedule(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
-
-
-def env_options(policy: DiffusionPolicy) -> dict[str, Any]:
-    """Arguments of `make_env` for an environment that shows what ``policy`` observes.
-
-    Raises:
-        ValueError: if the policy has cameras and its ``source`` does not say which.
-    """
-    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
-    if policy.vision is None:
-        return options
-    named = policy.source.get("cameras", {})
-    cameras = {name: named.get(name, "") for name in policy.vision.cameras}
-    if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
-        raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
-    return (
-        options | camera_options(cameras) | {"image_size": policy.vision.image_size[0], "object_state": False}
-    )
-
-
-def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
-    """Arguments of `make_env` for images by their names here and in demonstrations.
-
-    >>> camera_options({"image": "agentview_image"})
-    {'camera': 'agentview'}
-    """
-    return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}
-
-
-def calibrate_policy(
-    policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
-) -> Calibration:
-    """Calibrates on the first observation of one episode per seed, as BAC's release does with a single one."""
-    env = make_env(seeds=list(seeds))
-    first = torch.stack([env.reset() for _ in seeds])
-    env.close()
-    encoded = policy.module["encode"](first)
-    noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
-    return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
-
-
-def record_queries(
-    actor: ChunkExecutor, make_env: Callable[..., EnvBase], seeds: Sequence[int]
-) -> TensorDictBase:
-    """Every query of one episode per seed: [number of queries], with what the policy read and what it answered."""
-    env = make_env(seeds=list(seeds))
-    episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
-    env.close()
-    wanted = [*actor.policy.in_keys, *actor.policy.out_keys]
-    return torch.cat([steps[steps[keys.QUERIED].squeeze(-1)].select(*wanted) for steps in episodes])
 
 
 def answer(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDict:

@@ -16,9 +16,9 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.envs.options import camera_options
 from torchrl_sparse.envs.tasks import get_task
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.evaluation.rollouts.methods import camera_options
 from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
