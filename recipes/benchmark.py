@@ -46,7 +46,6 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.methods import (
     MethodName,
-    calibrate_policy,
     check_method,
     make_method,
     method_identity,
@@ -55,6 +54,7 @@ from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import published_shape
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")

@@ -32,7 +32,6 @@ from torchrl_sparse.evaluation.results.realtime import (
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.methods import (
-    calibrate_policy,
     check_method,
     make_method,
     method_identity,
@@ -40,6 +39,7 @@ from torchrl_sparse.evaluation.rollouts.methods import (
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")

@@ -97,7 +97,7 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.control.queries import record_queries
     from torchrl_sparse.envs.for_policy import diffusion_env
-    from torchrl_sparse.envs.seeds import PRUNER_ROLLOUT_SEED
+    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED
 
     task, schedules = find_task(config.task), initial_schedules(config)
     played = DiffusionPolicy(
@@ -109,7 +109,7 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
         engine=policy.engine,
     )
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
-    seeds = range(PRUNER_ROLLOUT_SEED, PRUNER_ROLLOUT_SEED + config.rollouts)
+    seeds = range(CLOSED_LOOP_SEED, CLOSED_LOOP_SEED + config.rollouts)
     return record_queries(actor, diffusion_env(task.name, policy), seeds)
 
 
