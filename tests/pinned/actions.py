@@ -1,0 +1,107 @@
+"""What every shipped method answers to a few fixed queries."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.pinned import build
+
+ASSETS = Path(__file__).parents[2] / "assets"
+STORED = Path(__file__).with_name("actions.safetensors")
+ENGINES = ("native", "torch")
+_OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
+_INSTRUCTION, _KEPT = "lift the green cube", 45.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One method of one policy, in one engine where the policy has engines."""
+
+    asset: str
+    method: str
+    engine: str = ""
+
+    def __str__(self) -> str:
+        return "/".join(filter(None, (self.asset, self.method, self.engine)))
+
+    @property
+    def rounding(self) -> int:
+        """Blocks of a mask that rounding may decide: a pruner that looks compares numbers which may be equal but for it."""
+        return 2 if (ASSETS / self.asset / self.method.partition("@")[0]).is_dir() else 0
+
+    def answer(self) -> dict[str, Tensor]:
+        """Normalised chunk [Q, n, A], mask [Q, ...] and FLOPs [Q, 1] of the Q queries."""
+        torch.manual_seed(0)
+        return _vla_answers(self) if self.asset == "vla" else _diffusion_answers(self)
+
+
+def cases() -> Iterator[Case]:
+    """All of what is shipped."""
+    for folder in sorted(path.parent for path in ASSETS.glob("*/model.safetensors")):
+        for method in shipped_methods(folder):
+            for engine in ("",) if folder.name == "vla" else ENGINES:
+                yield Case(folder.name, method, engine)
+
+
+def shipped_methods(folder: Path) -> list[str]:
+    """Dense, uniform, the planners beside the policy, and what its tables name."""
+    tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
+    named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
+    files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
+    if folder.name == "vla":
+        return sorted(named | {path.name for path in files})
+    pruners = {path.parent.name for path in folder.glob("*/config.json")}
+    return sorted({"dense", "uniform"} | named | pruners | {path.stem for path in files})
+
+
+def _diffusion_answers(case: Case) -> dict[str, Tensor]:
+    """The first query on its own, the others as a batch: engines have a way for each."""
+    first, *others = (build.diffusion_query(**observation) for observation in _OBSERVATIONS[case.asset])
+    actor = build.diffusion_actor(ASSETS / case.asset, case.method, case.engine)
+    answers = [build.diffusion_answer(actor, query) for query in (first[None], torch.stack(others))]
+    return {name: torch.cat([answer[name] for answer in answers]) for name in answers[0]}
+
+
+def _vla_answers(case: Case) -> dict[str, Tensor]:
+    """Two queries of an episode, the second in the knowledge of the first."""
+    actor = build.vla_actor(ASSETS / case.asset, case.method, _vla_queries(), _KEPT)
+    answers, last = [], None
+    for query in _vla_queries():
+        answers.append(build.vla_answer(actor, query, last))
+        last = query
+    return {name: torch.stack([answer[name] for answer in answers]) for name in answers[0]}
+
+
+def _vla_queries() -> list:
+    lift = _OBSERVATIONS["lift"]
+    return [
+        build.vla_query(
+            images,
+            state=observation["state"][-1][10:],
+            instruction=_INSTRUCTION,
+            eef_vel=observation["eef_vel"],
+            seed=observation["seed"],
+            step=observation["step"],
+        )
+        for images, observation in zip(_images(), (lift[0], lift[2]), strict=True)
+    ]
+
+
+@cache
+def _images() -> list[Tensor]:
+    """Coarse patterns of two cameras, u8 [2, 3, 84, 84], and the same with more and more change towards one corner."""
+    generator = np.random.default_rng(0)
+    coarse = generator.integers(40, 216, (2, 3, 12, 12)).repeat(7, axis=2).repeat(7, axis=3)
+    ramp = np.linspace(0, 1, 84)
+    change = generator.integers(-40, 41, coarse.shape) * ramp * ramp[:, None]
+    before = coarse + generator.integers(-5, 6, coarse.shape)
+    after = before + generator.integers(-1, 2, coarse.shape) + change
+    return [torch.from_numpy(images.clip(0, 255).astype(np.uint8)) for images in (before, after)]
