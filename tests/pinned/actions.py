@@ -34,7 +34,7 @@ class Case:
 
     @property
     def rounding(self) -> int:
-        """Blocks of a mask that rounding may decide: a pruner that looks compares numbers which may be equal but for it."""
+        """Blocks, in all masks together, that rounding may decide: a pruner compares numbers that may be nearly equal."""
         return 2 if (ASSETS / self.asset / self.method.partition("@")[0]).is_dir() else 0
 
     def answer(self) -> dict[str, Tensor]:

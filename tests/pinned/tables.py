@@ -66,7 +66,10 @@ def _sweep(path: Path) -> list[str]:
         )
         for name in tested
     ]
-    metrics = [_numbers(build.trial_metrics(results)) for _, results in trials]
+    metrics = [
+        _numbers({key: number for key, number in found.items() if key.startswith("tested/")})
+        for found in (build.trial_metrics(results) for _, results in trials)
+    ]
     return [*_results(path), build.format_table(build.merge_trials(trials)), *metrics]
 
 
