@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,20 +20,24 @@ from tests.pinned import build
 ASSETS = Path(__file__).parents[2] / "assets"
 STORED = Path(__file__).with_name("actions.safetensors")
 ENGINES = ("native", "torch")
+# All shipped planners reuse by "block", so copies of two of lift's stand for the other rules.
+_COPIED = {"bac": "bac.json", "sag": "sag/config.json"}
+_RULES = ("type", "single")
 _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
 _INSTRUCTION, _KEPT = "lift the green cube", 45.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """One method of one policy, in one engine where the policy has engines."""
+    """One method of one policy, in one engine where the policy has engines, and perhaps under another rule of reuse."""
 
     asset: str
     method: str
     engine: str = ""
+    reuse: str = ""
 
     def __str__(self) -> str:
-        return "/".join(filter(None, (self.asset, self.method, self.engine)))
+        return "/".join(filter(None, (self.asset, self.method, self.reuse, self.engine)))
 
     @property
     def rounding(self) -> int:
@@ -44,11 +51,13 @@ class Case:
 
 
 def cases() -> Iterator[Case]:
-    """All of what is shipped."""
+    """All of what is shipped, and copies under other rules of reuse."""
     for folder in sorted(path.parent for path in ASSETS.glob("*/model.safetensors")):
         for method in shipped_methods(folder):
             for engine in ("",) if folder.name == "vla" else ENGINES:
                 yield Case(folder.name, method, engine)
+    for method, rule, engine in product(_COPIED, _RULES, ENGINES):
+        yield Case("lift", method, engine, rule)
 
 
 def shipped_methods(folder: Path) -> list[str]:
@@ -65,9 +74,23 @@ def shipped_methods(folder: Path) -> list[str]:
 def _diffusion_answers(case: Case) -> dict[str, Tensor]:
     """The first query on its own, the others as a batch: engines have a way for each."""
     first, *others = (build.diffusion_query(**observation) for observation in _OBSERVATIONS[case.asset])
-    actor = build.diffusion_actor(ASSETS / case.asset, case.method, case.engine)
+    folder = ASSETS / case.asset
+    with tempfile.TemporaryDirectory() as copies:
+        planners = _reusing(folder, Path(copies), case.reuse) if case.reuse else folder
+        actor = build.diffusion_actor(folder, planners, case.method, case.engine)
     answers = [build.diffusion_answer(actor, query) for query in (first[None], torch.stack(others))]
     return {name: torch.cat([answer[name] for answer in answers]) for name in answers[0]}
+
+
+def _reusing(folder: Path, copies: Path, rule: str) -> Path:
+    """Copies of planners that reuse by ``rule``."""
+    shutil.copytree(
+        folder, copies, ignore=shutil.ignore_patterns("model.*", "episodes", "figures"), dirs_exist_ok=True
+    )
+    for name in _COPIED.values():
+        content = json.loads((folder / name).read_text(encoding="utf-8"))
+        (copies / name).write_text(json.dumps({**content, "reuse": rule}), encoding="utf-8")
+    return copies
 
 
 def _vla_answers(case: Case) -> dict[str, Tensor]:

@@ -69,14 +69,14 @@ def _policy(folder: Path, engine: str) -> DiffusionPolicy:
     return DiffusionPolicy.from_pretrained(folder, engine=engine)
 
 
-def diffusion_actor(folder: Path, name: str, engine: str) -> ChunkExecutor:
-    """The method ``name`` as `recipes/benchmark.py` makes it, with a query at every step."""
+def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> ChunkExecutor:
+    """The method ``name`` as `recipes/benchmark.py` makes it, with a query at every step, from files in ``planners``."""
 
     def calibration() -> None:
         raise AssertionError(f"{name}: expected a shipped schedule, got one to compute")
 
     policy = make_method(
-        name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=folder, calibration=calibration
+        name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=planners, calibration=calibration
     )
     return ChunkExecutor(policy, n_action_steps=1, gate=MethodName.parse(name).gate())
 
