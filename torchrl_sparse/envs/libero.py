@@ -8,6 +8,8 @@ An optional extra, as it brings 350 MB of scenes::
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -62,9 +64,8 @@ def make_libero_env(
     """
     if suite not in SUITES:
         raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
-    _register_missing_mount()
     try:
-        env = LiberoEnv(
+        env = _MountedLibero(
             suite,
             task_id,
             camera_height=image_size,
@@ -82,6 +83,33 @@ def make_libero_env(
     return TransformedEnv(
         env, Compose(InitTracker(), pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState())
     )
+
+
+class _MountedLibero(LiberoEnv):
+    """`LiberoEnv` in robosuite 1.5, which does not know the base of the robots in LIBERO's floor scenes: None.
+
+    Robots are made anew at every reset. robosuite's table has the entry only meanwhile.
+    """
+
+    def _build_env(self, *args: Any, **kwargs: Any) -> Any:
+        with _base_of_floor_robots():
+            return super()._build_env(*args, **kwargs)
+
+    def _reset(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        with _base_of_floor_robots():
+            return super()._reset(*args, **kwargs)
+
+
+@contextmanager
+def _base_of_floor_robots() -> Iterator[None]:
+    import_robosuite()
+    from robosuite.models.bases import BASE_MAPPING, NullMount
+
+    BASE_MAPPING[None] = NullMount
+    try:
+        yield
+    finally:
+        del BASE_MAPPING[None]
 
 
 class RotationVectorState(Transform):
@@ -116,11 +144,3 @@ def rotation_vector(quaternion: Tensor) -> Tensor:
     sine = (1 - w.square()).sqrt()
     turn = quaternion[..., :3] * 2 * w.acos() / sine.clamp_min(torch.finfo(w.dtype).tiny)
     return torch.where(sine > 0, turn, 0.0)
-
-
-def _register_missing_mount() -> None:
-    """LIBERO's floor scenes ask for a robot without a base by a name that robosuite 1.5 does not know."""
-    import_robosuite()
-    from robosuite.models.bases import BASE_MAPPING, NullMount
-
-    BASE_MAPPING.setdefault(None, NullMount)
