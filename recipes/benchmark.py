@@ -19,7 +19,6 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer, record_queries
 from torchrl_sparse.envs.benchmarks import find_task
@@ -45,14 +44,12 @@ from torchrl_sparse.evaluation.results.report import (
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.methods import (
-    MethodName,
     calibrate_policy,
-    check_method,
-    make_method,
     method_identity,
 )
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
+from torchrl_sparse.methods.diffusion import MethodName, check_method, make_controller, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.published import published_shape
@@ -66,7 +63,7 @@ def main(config: DictConfig) -> None:
     if config.n_action_steps is None:
         config.n_action_steps = published_shape(task.name).n_action_steps
     for name in config.methods:
-        check_method(name, Path(config.schedules))
+        check_method(name, Path(config.planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = diffusion_env(task.name, policy, config.horizon)
 
@@ -81,7 +78,7 @@ def main(config: DictConfig) -> None:
             name,
             policy,
             num_updates=config.num_updates,
-            schedules=Path(config.schedules),
+            planners=Path(config.planners),
             calibration=calibration,
         )
         for name in names
@@ -103,9 +100,7 @@ def main(config: DictConfig) -> None:
             threads=config.threads,
             on_round=lambda done, total: bar.update(done - bar.n),
         )
-    adaptive = {
-        name: method for name, method in methods.items() if not isinstance(method.plan, StaticPlanner)
-    }
+    adaptive = {name: method for name, method in methods.items() if not method.plan.is_static}
     planning = time_planning(adaptive, queries, threads=config.threads)
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
@@ -132,9 +127,7 @@ def main(config: DictConfig) -> None:
 
 
 def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(
-        policy, n_action_steps=config.n_action_steps, controller=MethodName.parse(name).controller()
-    )
+    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, controller=make_controller(name))
 
 
 def evaluate(
@@ -200,7 +193,7 @@ def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, querie
         ratio = results["methods"][name]["flops"]["ratio_to_dense"]
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
     for name, method in methods.items():
-        if not isinstance(method.plan, StaticPlanner):
+        if not method.plan.is_static:
             draw_masks(name, method, queries, out)
     surging = {name: masks[name] for name in SURGE_METHODS if name in masks}
     if surging:
@@ -234,7 +227,7 @@ def film(
             continue
         env = environment(seeds=[seed])
         try:
-            adaptive = not isinstance(methods[name].plan, StaticPlanner)
+            adaptive = not methods[name].plan.is_static
             frames, captions = follow(name, executor(name, methods[name], config), env, adaptive)
         except RuntimeError as error:
             print(f"no video: {error}")

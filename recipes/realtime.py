@@ -33,11 +33,10 @@ from torchrl_sparse.evaluation.results.realtime import (
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.methods import (
     calibrate_policy,
-    check_method,
-    make_method,
     method_identity,
 )
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.methods.diffusion import check_method, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 
@@ -46,7 +45,7 @@ from torchrl_sparse.runtime.backends import backend_runtime
 def main(config: DictConfig) -> None:
     out, task = Path(config.out), get_task(config.task)
     for name in config.methods:
-        check_method(name, Path(config.schedules))
+        check_method(name, Path(config.planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = diffusion_env(task.name, policy, config.horizon)
     first = EVALUATION_SEED + config.seed
@@ -61,7 +60,7 @@ def main(config: DictConfig) -> None:
         make_method,
         policy=policy,
         num_updates=config.num_updates,
-        schedules=Path(config.schedules),
+        planners=Path(config.planners),
         calibration=calibration,
     )
     methods = {name: make(name) for name in dict.fromkeys(["dense", *config.methods])}

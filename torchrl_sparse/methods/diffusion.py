@@ -231,8 +231,10 @@ def _lookup(name: str) -> Method | None:
 
 
 def _saved_path(planners: Path, name: str) -> Path | None:
-    candidates = (planners / f"{name}.json", planners / name / "config.json")
-    return next((path for path in candidates if path.is_file()), None)
+    file, folder = planners / f"{name}.json", planners / name
+    if file.is_file():
+        return file
+    return folder if (folder / "config.json").is_file() else None
 
 
 def _ask_for(planner: Planner, written: MethodName) -> None:
