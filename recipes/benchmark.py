@@ -21,9 +21,9 @@ from tqdm import tqdm
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer, record_queries
-from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.plots import (
     plot_error_surge,
@@ -43,15 +43,18 @@ from torchrl_sparse.evaluation.results.report import (
 )
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.rollouts.methods import (
-    calibrate_policy,
-    method_identity,
-)
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
-from torchrl_sparse.methods.diffusion import MethodName, check_method, make_controller, make_method
+from torchrl_sparse.methods.diffusion import (
+    MethodName,
+    check_method,
+    make_controller,
+    make_method,
+    method_identity,
+)
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import published_shape
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")

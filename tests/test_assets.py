@@ -8,9 +8,8 @@ import pytest
 from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.results.report import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
-from torchrl_sparse.evaluation.rollouts.methods import method_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
-from torchrl_sparse.methods.diffusion import make_method
+from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"

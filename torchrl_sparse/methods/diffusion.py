@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -210,6 +211,22 @@ def make_controller(text: str) -> TensorDictModuleBase | None:
     """Return the controller of a method, of a saved one too."""
     written = MethodName.parse(text)
     return (_lookup(written.name) or SAVED).controller(written.rates)
+
+
+def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
+    """Return all that makes the episodes of one method its own, as JSON values for an `EpisodeLog`.
+
+    Args:
+        text: the method.
+        policy: as :func:`make_method` returned it.
+    """
+    return {
+        "method": text,
+        "policy": policy.fingerprint,
+        "engine": policy.engine,
+        "sampler": policy.sampler.config,
+        "planner": policy.plan.fingerprint,
+    }
 
 
 def _find(text: str, planners: Path) -> Method:

@@ -1,9 +1,8 @@
-"""Calibration of a policy in an environment, and the identity of a method's episodes."""
+"""The calibration of a policy on what it observes in its environment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
@@ -12,7 +11,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["calibrate_policy", "method_identity"]
+__all__ = ["calibrate_policy"]
 
 
 def calibrate_policy(
@@ -25,14 +24,3 @@ def calibrate_policy(
     encoded = policy.module["encode"](first)
     noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
     return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
-
-
-def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:
-    """Return all that makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
-    return {
-        "method": name,
-        "policy": policy.fingerprint,
-        "engine": policy.engine,
-        "sampler": policy.sampler.config,
-        "planner": policy.plan.fingerprint,
-    }
