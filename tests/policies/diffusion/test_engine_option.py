@@ -6,8 +6,13 @@ import pytest
 import torch
 
 from torchrl_sparse import DiffusionPolicy, Sampler, TransformerForDiffusion, Uniform, keys
-from torchrl_sparse.blocks.engine import ENGINES as ENGINE_TABLE
-from torchrl_sparse.blocks.engine import EngineEntry, ReferenceEngine, make_engine, native_available
+from torchrl_sparse.blocks.engine import (
+    ENGINES as ENGINE_TABLE,
+    EngineEntry,
+    ReferenceEngine,
+    make_engine,
+    native_available,
+)
 
 from .test_policy import request
 
