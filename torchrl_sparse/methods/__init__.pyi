@@ -6,3 +6,9 @@ from .diffusion import (
     check_method as check_method,
     make_method as make_method,
 )
+from .vla import (
+    TOKEN_METHODS as TOKEN_METHODS,
+    TokenMethod as TokenMethod,
+    TokenMethodName as TokenMethodName,
+    make_pruner as make_pruner,
+)

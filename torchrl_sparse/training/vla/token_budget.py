@@ -18,7 +18,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.specprune import SpecPrune
@@ -167,7 +167,7 @@ def replay(
     Returns:
         The policy's ``out_keys`` under ``pruner``, [Q].
     """
-    worker = with_pruner(policy, pruner)
+    worker = policy.with_pruner(pruner)
     carried: list[NestedKey] = [key for key in worker.out_keys if key in worker.in_keys]
     device = next(policy.network.parameters()).device
     answers, left = [], TensorDict({}, [])
@@ -233,7 +233,7 @@ def measure_success(
     """
     rates, kept = [], []
     for pruner in (None, *pruners):
-        actor = make_actor(with_pruner(policy, pruner))
+        actor = make_actor(policy.with_pruner(pruner))
         won, tokens = [], []
         for seed in seeds:
             steps = _rollout(actor, make_env, seed)
