@@ -22,7 +22,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer, record_queries
-from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
@@ -46,7 +46,6 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.methods import (
     MethodName,
-    calibrate_policy,
     check_method,
     make_method,
     method_identity,
@@ -55,6 +54,7 @@ from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import published_shape
 
 SURGE_METHODS = ("uniform", "bac_blockwise", "bac")

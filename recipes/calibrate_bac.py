@@ -13,8 +13,8 @@ from omegaconf import DictConfig
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.evaluation.rollouts.methods import calibrate_policy
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")

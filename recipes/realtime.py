@@ -20,7 +20,7 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.realtime import (
@@ -32,7 +32,6 @@ from torchrl_sparse.evaluation.results.realtime import (
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.methods import (
-    calibrate_policy,
     check_method,
     make_method,
     method_identity,
@@ -40,11 +39,12 @@ from torchrl_sparse.evaluation.rollouts.methods import (
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")
 def main(config: DictConfig) -> None:
-    out, task = Path(config.out), get_task(config.task)
+    out, task = Path(config.out), find_robosuite_task(config.task)
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
@@ -102,7 +102,7 @@ def evaluate(
     """Episodes of one method whose answers come ``steps`` late, read from their log as far as they are there."""
     actor = RealtimeExecutor(
         policy,
-        HoldPose(get_task(config.task)),
+        HoldPose(find_robosuite_task(config.task)),
         config.n_action_steps,
         latency=steps / config.control_freq,
         control_freq=config.control_freq,

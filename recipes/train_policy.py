@@ -20,7 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
-from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -137,7 +138,7 @@ def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | N
         "dense",
         ChunkExecutor(policy, trainer.config.n_action_steps),
         diffusion_env(config.task, policy),
-        range(config.eval_seed, config.eval_seed + config.eval_episodes),
+        range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )

@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from tests.evaluation.synthetic import make_results
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, EVALUATION_SEED
 from torchrl_sparse.evaluation.results.report import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
@@ -39,6 +40,8 @@ def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials(path, tmp_pat
         assert command[:2] == ["/usr/bin/env", "python"]
         assert (path.parents[2] / command[2]).is_file()
         assert not any(word.startswith("${") for word in command)
+        first = EVALUATION_SEED + int(next(word for word in command if word.startswith("seed="))[5:])
+        assert first == DEVELOPMENT_SEED
         seen.add(tuple(command))
         finish(sweep, trial)
     assert len(seen) == len(sweep.trials) == 8

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from torchrl.envs import EnvBase
-
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.bac import SCHEDULES
-from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.planner import Dense, Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
@@ -152,18 +149,6 @@ def _bac(name, policy, num_updates, schedules, calibration) -> Planner:
         if found.settings.get("num_updates") == num_updates:
             return SchedulePlanner(found)
     return SchedulePlanner(SCHEDULES[name](calibration(), num_updates, policy=policy.fingerprint))
-
-
-def calibrate_policy(
-    policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
-) -> Calibration:
-    """Calibrates on the first observation of one episode per seed, as BAC's release does with a single one."""
-    env = make_env(seeds=list(seeds))
-    first = torch.stack([env.reset() for _ in seeds])
-    env.close()
-    encoded = policy.module["encode"](first)
-    noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
-    return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
 
 
 def method_identity(name: str, policy: DiffusionPolicy) -> dict[str, Any]:

@@ -1,0 +1,26 @@
+"""The calibration of a policy on what it observes in its environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torchrl.envs import EnvBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+__all__ = ["calibrate_policy"]
+
+
+def calibrate_policy(
+    policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
+) -> Calibration:
+    """Calibrate on the first observation of one episode per seed, as BAC's release does with a single one."""
+    env = make_env(seeds=list(seeds))
+    first = torch.stack([env.reset() for _ in seeds])
+    env.close()
+    encoded = policy.module["encode"](first)
+    noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
+    return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
