@@ -11,13 +11,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-
-from torchrl_sparse import keys
-from torchrl_sparse.blocks.engine import native_available
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.engine_report import format_engine_table
 from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.latency import summarize_latency
 from torchrl_sparse.evaluation.methods import MethodName, make_method
 from torchrl_sparse.evaluation.realtime import format_realtime, load_realtime
 from torchrl_sparse.evaluation.report import (
@@ -31,9 +26,14 @@ from torchrl_sparse.evaluation.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.tracking import trial_metrics
 from torchrl_sparse.evaluation.vla_methods import TokenMethod, matching_share
 from torchrl_sparse.evaluation.vla_report import format_vla_table
+from torchrl_sparse.tokens.calibration import TokenBudget
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.evaluation.latency import summarize_latency
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
-from torchrl_sparse.tokens.calibration import TokenBudget
 
 __all__ = [
     "EpisodeResult",

@@ -136,9 +136,7 @@ def check_matches(texts: Iterable[str]) -> None:
     plain = [text for text, matched in like.items() if matched is None]
     for text, matched in like.items():
         if matched is not None and matched not in plain:
-            raise ValueError(
-                f"methods: {text}: expected one of {', '.join(plain)} after @, got {matched!r}"
-            )
+            raise ValueError(f"methods: {text}: expected one of {', '.join(plain)} after @, got {matched!r}")
 
 
 def make_pruner(

@@ -22,9 +22,7 @@ __all__ = ["matching_share", "method_identity", "mid_episode_query", "seen_image
 _HALVINGS = 10
 
 
-def method_identity(
-    text: str, number: float | None, policy: VLAPolicy, settings: Settings
-) -> dict[str, Any]:
+def method_identity(text: str, number: float | None, policy: VLAPolicy, settings: Settings) -> dict[str, Any]:
     """Return what tells the episodes of one method from others', as JSON values for an `EpisodeLog`.
 
     Args:

@@ -42,7 +42,8 @@ class VLAPolicy(VLAWrapperBase):
         tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
 
     Attributes:
-        pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense policy.
+        pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense
+            policy.
 
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
