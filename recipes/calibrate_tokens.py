@@ -4,7 +4,7 @@
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla demos=data/lift_named_images.h5   # without rendering
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla measure=success tolerance=0.05
 
-Writes ``out``, which `TokenBudget.load` reads, and a figure beside it.
+Writes ``out``, which `TokenBudget.from_pretrained` reads, and a figure beside it.
 """
 
 from __future__ import annotations
