@@ -39,8 +39,10 @@ def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
     ("change", "message"),
     [
         ({"preset": "mine"}, "preset: expected 'paper' or 'release', got 'mine'"),
-        ({"points": 3}, "expected a token budget with preset, alpha"),
-        ({"more": 1}, "more"),
+        ({"points": 3}, "points: expected a valid array, got 3"),
+        ({"more": 1}, "more: expected no such key, got 1"),
+        ({"options": {"keep_shere": 0.5}}, "options: expected fields of SpecPruneOptions, got .*keep_shere"),
+        ({"options": {"keep_share": 2}}, "keep_share: expected more than 0 and at most 1, got 2"),
     ],
 )
 def test_wrong_files_are_named(tmp_path, change, message):

@@ -48,7 +48,7 @@ class TokenMethod:
         make: called with keyword arguments; returns the pruner, or None for the dense policy.
         number: the argument of ``make`` that NAME@NUMBER sets; None where there is none.
         matches: whether NAME@METHOD may be written: its number is a share in (0, 1], of which more keeps more tokens.
-        settings: the section of a benchmark's settings whose entries are further arguments of ``make``; None for no such section.
+        settings: the section of a benchmark's settings whose entries are further arguments of ``make``; None for none.
         controller: returns what a `ChunkExecutor` runs at every step beside the policy; None for nothing.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
     """

@@ -14,9 +14,7 @@ from typing import Any, Literal
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.tokens.specprune import SpecPrune
 
-__all__ = ["BudgetPoint", "Measure", "TokenBudget", "smallest_alpha"]
-
-Measure = Literal["action_error", "success"]
+__all__ = ["BudgetPoint", "TokenBudget", "smallest_alpha"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class TokenBudget:
 
     preset: Literal["paper", "release"]
     alpha: float
-    measure: Measure
+    measure: Literal["action_error", "success"]
     tolerance: float
     points: tuple[BudgetPoint, ...]
     options: dict[str, Any] = field(default_factory=dict)
