@@ -4,5 +4,12 @@ from .diffusion import (
     MethodInputs as MethodInputs,
     MethodName as MethodName,
     check_method as check_method,
+    make_controller as make_controller,
     make_method as make_method,
+)
+from .vla import (
+    TOKEN_METHODS as TOKEN_METHODS,
+    TokenMethod as TokenMethod,
+    TokenMethodName as TokenMethodName,
+    make_pruner as make_pruner,
 )
