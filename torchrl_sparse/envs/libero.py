@@ -64,17 +64,16 @@ def make_libero_env(
     """
     if suite not in SUITES:
         raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    options = {
+        "camera_height": image_size,
+        "camera_width": image_size,
+        "wrist_camera": "robot0_eye_in_hand",
+        "max_episode_steps": SUITES[suite] if max_episode_steps is None else max_episode_steps,
+        "init_state_mode": init_state_mode,
+    }
     try:
-        env = _MountedLibero(
-            suite,
-            task_id,
-            camera_height=image_size,
-            camera_width=image_size,
-            wrist_camera="robot0_eye_in_hand",
-            max_episode_steps=SUITES[suite] if max_episode_steps is None else max_episode_steps,
-            init_state_mode=init_state_mode,
-            **kwargs,
-        )
+        with _base_of_floor_robots():
+            env = _MountedLibero(suite, task_id, **options, **kwargs)
     except ImportError as error:
         raise ImportError(
             f"LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]': {error}"
@@ -90,10 +89,6 @@ class _MountedLibero(LiberoEnv):
 
     Robots are made anew at every reset. robosuite's table has the entry only meanwhile.
     """
-
-    def _build_env(self, *args: Any, **kwargs: Any) -> Any:
-        with _base_of_floor_robots():
-            return super()._build_env(*args, **kwargs)
 
     def _reset(self, *args: Any, **kwargs: Any) -> TensorDictBase:
         with _base_of_floor_robots():
