@@ -25,9 +25,9 @@ from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.plots import (
     plot_error_surge,
-    plot_pareto,
     plot_schedule,
     plot_similarity,
 )
@@ -39,8 +39,8 @@ from torchrl_sparse.evaluation.results.report import (
     build_results,
     format_pairs,
     format_table,
-    save_results,
 )
+from torchrl_sparse.evaluation.results.schema import PolicyShape, Results, save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
@@ -178,22 +178,22 @@ def error_to_dense(method: DiffusionPolicy, queries: TensorDictBase) -> tuple[fl
     return action_error(normalize(answer(method, queries)[keys.CHUNK]), normalize(queries[keys.CHUNK]))
 
 
-def describe(policy: DiffusionPolicy, config: DictConfig) -> dict[str, int]:
-    return {
-        "params": sum(parameter.numel() for parameter in policy.network.parameters()),
-        "num_inference_steps": policy.num_inference_steps,
-        "horizon": policy.horizon,
-        "n_obs_steps": policy.n_obs_steps,
-        "n_action_steps": config.n_action_steps,
-    }
+def describe(policy: DiffusionPolicy, config: DictConfig) -> PolicyShape:
+    return PolicyShape(
+        params=sum(parameter.numel() for parameter in policy.network.parameters()),
+        num_inference_steps=policy.num_inference_steps,
+        horizon=policy.horizon,
+        n_obs_steps=policy.n_obs_steps,
+        n_action_steps=config.n_action_steps,
+    )
 
 
-def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, queries, out: Path) -> None:
+def draw(results: Results, methods: dict[str, DiffusionPolicy], calibration, queries, out: Path) -> None:
     plot_pareto(results, out / "pareto.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
     masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
     for name, mask in masks.items():
-        ratio = results["methods"][name]["flops"]["ratio_to_dense"]
+        ratio = results.methods[name].flops.ratio_to_dense
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
     for name, method in methods.items():
         if not method.plan.is_static:
