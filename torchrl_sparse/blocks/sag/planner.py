@@ -1,4 +1,4 @@
-"""Sparse ActionGen (SAG, arXiv:2601.12894): a pruner that looks at the observation, then decides what to skip.
+"""Sparse ActionGen (SAG, arXiv:2601.12894): a learned planner that decides from the observation.
 
 One small network reads the encoded observation and the coordinates of all K x 3L blocks, and predicts the whole
 mask of a query before its first denoising step (Section 3.2 of the paper)::
@@ -13,8 +13,8 @@ output of their type ("one-for-all"). The paper does not publish sizes; those he
 the dense FLOPs. :mod:`torchrl_sparse.training.pruner.trainer` trains it.
 
 Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
-query through ``("diffusion", "prune_rate")``, and keeps each of them exactly, because the logits are then compared
-with that one of them that leaves so many above it.
+query through ``("diffusion", "prune_rate")``. It keeps each of them exactly: it prunes as many blocks as the rate
+asks for, those of the highest logits.
 """
 
 from __future__ import annotations
