@@ -8,10 +8,10 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.runtime.progress import progress
 
 __all__ = ["evaluate", "success_rate"]
 
@@ -41,14 +41,14 @@ def evaluate(
     Raises:
         As `rollout_episodes`.
     """
-    with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
+    with progress(name, "episode", len(seeds)) as show:
         return rollout_episodes(
             actor,
             make_env,
             seeds,
             results_file=log,
             identity=identity,
-            on_episode=lambda _, done, total: bar.update(done - bar.n),
+            on_episode=lambda _, done, total: show(done, total),
             **options,
         )
 
