@@ -24,7 +24,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.specprune import SpecPrune
@@ -86,7 +86,7 @@ def pruners(config: DictConfig) -> list[SpecPrune]:
 
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:
-    state_keys = get_task(config.task).proprioception_keys
+    state_keys = find_robosuite_task(config.task).proprioception_keys
     episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config.cameras))
     return InstructedDemonstrations(episodes, read_instructions(config.demos))
 

@@ -24,9 +24,9 @@ from torchrl_sparse.evaluation.results.vla_report import (
     plot_vla_times,
     save_vla_results,
 )
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
+from torchrl_sparse.tokens.base import TokenPruner
 
 
 @hydra.main(version_base=None, config_path=".", config_name="profile_vla")

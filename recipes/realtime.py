@@ -20,7 +20,7 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.realtime import (
@@ -44,7 +44,7 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")
 def main(config: DictConfig) -> None:
-    out, task = Path(config.out), get_task(config.task)
+    out, task = Path(config.out), find_robosuite_task(config.task)
     for name in config.methods:
         check_method(name, Path(config.schedules))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
@@ -102,7 +102,7 @@ def evaluate(
     """Episodes of one method whose answers come ``steps`` late, read from their log as far as they are there."""
     actor = RealtimeExecutor(
         policy,
-        HoldPose(get_task(config.task)),
+        HoldPose(find_robosuite_task(config.task)),
         config.n_action_steps,
         latency=steps / config.control_freq,
         control_freq=config.control_freq,

@@ -28,7 +28,7 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy

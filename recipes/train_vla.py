@@ -23,7 +23,7 @@ from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
@@ -56,7 +56,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     """Reads the demonstrations and builds a policy that fits them, or takes the one to start from."""
     episodes = read_demos(
         config.demos,
-        get_task(config.task).proprioception_keys,
+        find_robosuite_task(config.task).proprioception_keys,
         cameras=chosen_cameras(config.cameras),
         image_folder=Path(config.out) / "images",
     )
@@ -92,7 +92,7 @@ def untrained_policy(demos: InstructedDemonstrations, config: DictConfig) -> VLA
 def read_objects(config: DictConfig) -> ObjectPositions:
     """Where the objects are that the task's instructions name, in the order of these."""
     positions = read_demos(config.demos, ["object_positions"]).data[keys.STATE]
-    return ObjectPositions(positions.unflatten(1, (-1, 3)), get_task(config.task).instructions).standardised()
+    return ObjectPositions(positions.unflatten(1, (-1, 3)), find_robosuite_task(config.task).instructions).standardised()
 
 
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:

@@ -19,7 +19,7 @@ from torchrl_sparse import DiffusionPolicy, SAGPruner
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results, save_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
@@ -99,7 +99,7 @@ def test_calibration_writes_a_schedule_per_method(schedules):
 def test_conversion_makes_what_training_reads(work, demos):
     out = work / "converted.h5"
     assert f"{out}: 2 demonstrations" in run("convert_robomimic", f"demos={demos}", f"out={out}")
-    assert len(read_demos(out, get_task("lift").state_keys)) == 2
+    assert len(read_demos(out, find_robosuite_task("lift").state_keys)) == 2
 
 
 def test_image_policies_go_the_same_way(work, demos):

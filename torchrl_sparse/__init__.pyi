@@ -35,15 +35,11 @@ from .networks import (
     TransformerForDiffusion as TransformerForDiffusion,
     VisionEncoder as VisionEncoder,
 )
-from .networks.vla import (
-    TokenPruner as TokenPruner,
-    VLAConfig as VLAConfig,
-)
+from .networks.vla import VLAConfig as VLAConfig
 from .policies import (
     DiffusionPolicy as DiffusionPolicy,
     VLAPolicy as VLAPolicy,
 )
-from .storage import load_openvla_oft as load_openvla_oft
 from .tokens import (
     EfficientVLAPruner as EfficientVLAPruner,
     FastVPruner as FastVPruner,
@@ -51,6 +47,7 @@ from .tokens import (
     RandomPruner as RandomPruner,
     SparseVLMPruner as SparseVLMPruner,
     SpecPrune as SpecPrune,
+    TokenPruner as TokenPruner,
     VLACachePruner as VLACachePruner,
 )
 

@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys, make_env
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 
 HOLDING = -7.0
@@ -116,7 +116,7 @@ def test_holding_leaves_the_arm_where_it_is():
     env = RobosuiteEnv("Lift", seeds=[3])
     td = env.reset()
     start = env.raw_observation()["robot0_eef_pos"]
-    td[keys.ACTION] = HoldPose(get_task("lift"))(td.clone())[keys.HOLD]
+    td[keys.ACTION] = HoldPose(find_robosuite_task("lift"))(td.clone())[keys.HOLD]
     for _ in range(20):
         td = env.step(td)["next"].set(keys.ACTION, td[keys.ACTION])
     moved = env.raw_observation()["robot0_eef_pos"] - start
@@ -132,7 +132,7 @@ def policy():
 
 
 def test_without_latency_robosuite_sees_the_ordinary_evaluation(policy):
-    hold, make = HoldPose(get_task("lift")), partial(make_env, "Lift", horizon=40)
+    hold, make = HoldPose(find_robosuite_task("lift")), partial(make_env, "Lift", horizon=40)
 
     def outcomes(actor):
         episodes = rollout_episodes(actor, make, [100_000], num_envs=1)
@@ -149,7 +149,10 @@ def test_without_latency_every_action_is_the_ordinary_one(policy):
     )
     td[keys.EPISODE_SEED] = torch.arange(3)[:, None]
     late = td.clone()
-    executors = ChunkExecutor(policy), RealtimeExecutor(policy, HoldPose(get_task("lift")), latency=0.0)
+    executors = (
+        ChunkExecutor(policy),
+        RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift")), latency=0.0),
+    )
     for step in range(10):
         for each in (td, late):
             each[keys.EPISODE_STEP] = torch.full((3, 1), step)
@@ -159,7 +162,7 @@ def test_without_latency_every_action_is_the_ordinary_one(policy):
 
 
 def test_its_keys_pass_through_a_collector(policy):
-    actor = RealtimeExecutor(policy, HoldPose(get_task("lift")), latency=0.1)
+    actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift")), latency=0.1)
     collector = Collector(
         make_env("Lift"),
         actor,

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchrl_sparse import keys
-from torchrl_sparse.envs.experts import draw_operator, make_expert
+from torchrl_sparse.envs.experts.operators import draw_operator
 
 OSC = {
     "type": "OSC_POSE",
@@ -64,7 +64,7 @@ def record(env, seed, steps=None):
     env.set_seed(seed)
     present = env.reset()
     if steps is None:
-        expert = make_expert(env.task.name, env.sim_env, draw_operator("proficient", rng).draw(rng))
+        expert = env.task.load_expert()(env.sim_env, draw_operator("proficient", rng).draw(rng))
     demo = {"states": [], "actions": [], "obs": [], "seen": [], "model": env.get_initial_state().model_xml}
     while not present["done"] and len(demo["states"]) != steps:
         action = rng.uniform(-0.9, 0.9, 7 * env.task.arms) if steps else scripted_delta(env, expert)

@@ -16,9 +16,9 @@ from torchrl_sparse.data.absolute import AbsoluteActions, convert_demos
 from torchrl_sparse.data.demos import read_initial_state
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 
-LIFT, TRANSPORT = get_task("Lift"), get_task("TwoArmTransport")
+LIFT, TRANSPORT = find_robosuite_task("Lift"), find_robosuite_task("TwoArmTransport")
 MASKS = {"train": ["demo_1"], "better": ["demo_0", "demo_1"]}
 
 

@@ -19,7 +19,7 @@ from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_ini
 from torchrl_sparse.data.hdf5_writer import Episode
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.rotations import pose_to_absolute
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect_demos.py"
@@ -49,7 +49,7 @@ class FakeExpert:
     def __init__(self, fails=()):
         self.seeds, self.fails = [], fails
 
-    def __call__(self, env, seed, quality="proficient"):
+    def __call__(self, task, env, seed, quality="proficient"):
         self.seeds.append(seed)
         length = 3 + seed % 4
         arrays = np.random.default_rng(seed).standard_normal((length, 7))
@@ -75,7 +75,7 @@ class FakeExpert:
 def fake(monkeypatch):
     expert = FakeExpert(fails={3, 5})
     monkeypatch.setattr(demos, "demonstrate", expert)
-    monkeypatch.setattr(demos, "RobosuiteEnv", lambda task: None)
+    monkeypatch.setattr(RobosuiteTask, "make", lambda task: None)
     return expert
 
 
@@ -95,13 +95,13 @@ def test_layout_is_the_documented_one(collected):
             assert demo["actions"].shape == demo["executed_actions"].shape == (steps, 7)
             assert demo["states"].shape == (steps, 32)
             assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == [0] * (steps - 1) + [1]
-            assert set(demo["obs"]) == set(get_task("Lift").state_keys)
+            assert set(demo["obs"]) == set(find_robosuite_task("Lift").state_keys)
     assert (summary.attempts, summary.successes, summary.kept) == (3, 3, 3)
     assert str(summary).startswith("successes/attempts 3/3, kept 3, mean length ")
 
 
 def test_the_reader_reads_it(collected):
-    read = read_demos(collected[0], get_task("Lift").state_keys)
+    read = read_demos(collected[0], find_robosuite_task("Lift").state_keys)
     assert len(read) == 3
     assert read.data[keys.STATE].shape[1:] == (19,)
 
@@ -135,7 +135,9 @@ def test_executed_actions_replay_to_the_same_states(collected, env):
 
 
 def test_an_episode_is_fixed_by_its_seed_alone(collected, env):
-    again = demonstrate(env, seed=50)  # after other episodes in the same environment
+    again = demonstrate(
+        find_robosuite_task("Lift"), env, seed=50
+    )  # after other episodes in the same environment
     with h5py.File(collected[0]) as file:
         np.testing.assert_array_equal(file["data/demo_0/actions"], again.actions)
         np.testing.assert_array_equal(file["data/demo_0/states"], again.states)

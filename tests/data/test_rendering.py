@@ -9,7 +9,7 @@ from torchrl_sparse import keys, make_env
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.rendering import render_demos
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import pose_to_absolute
 
 CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
@@ -39,7 +39,7 @@ def test_pictures_are_those_of_the_environment(files):
     plain, with_images = files
     camera_args = {"camera": "agentview", "wrist_camera": "robot0_eye_in_hand", "image_size": 32}
     env = make_env("Lift", object_state=False, **camera_args)
-    demos = read_demos(with_images, get_task("Lift").proprioception_keys, cameras=CAMERAS)
+    demos = read_demos(with_images, find_robosuite_task("Lift").proprioception_keys, cameras=CAMERAS)
     with h5py.File(plain) as file:
         executed = file["data/demo_0/executed_actions"][:6]
     td = env.reset(initial_state=read_initial_state(plain, 0))

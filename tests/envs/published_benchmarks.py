@@ -9,7 +9,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Normalizer, Sampler, keys, make_env
-from torchrl_sparse.envs.benchmarks import find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.training.diffusion.published import published_network, published_shape
 
 

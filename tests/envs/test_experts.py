@@ -7,12 +7,15 @@ import pytest
 import torch
 
 from torchrl_sparse.data.demos import demonstrate
-from torchrl_sparse.envs.experts import EXPERTS, OPERATORS, Disturbance, draw_operator, make_expert
 from torchrl_sparse.envs.experts.base import DOWNWARD, Hand, downward, nearest
+from torchrl_sparse.envs.experts.disturbance import Disturbance
 from torchrl_sparse.envs.experts.nut_assembly_square import grasp_yaw
+from torchrl_sparse.envs.experts.operators import OPERATORS, draw_operator
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask, find_task
 from torchrl_sparse.rotations import pose_to_absolute
 
+EXPERTS = [name for name, task in TASKS.items() if isinstance(task, RobosuiteTask)]
 PROFICIENT = OPERATORS["proficient"][0]
 STILL = replace(PROFICIENT, noise=0.0, bump=0.0, slip=0.0, hesitation=0.0)
 
@@ -50,7 +53,7 @@ def start(env, seed):
     ],
 )
 def test_succeeds_within_the_horizon(envs, task, quality):
-    episode = demonstrate(envs[task], seed=30_000, quality=quality)
+    episode = demonstrate(find_task(task), envs[task], seed=30_000, quality=quality)
     assert episode.success
     assert episode.operator in {operator.name for operator in OPERATORS[quality]}
 
@@ -59,17 +62,19 @@ def test_succeeds_within_the_horizon(envs, task, quality):
 def test_label_depends_on_the_state_and_the_style_only(envs, task):
     env = envs[task]
     start(env, 4)
-    expert = make_expert(task, env.sim_env, style())
+    expert = find_task(task).load_expert()(env.sim_env, style())
     for _ in range(25):
         execute(env, expert.command())
-    np.testing.assert_array_equal(make_expert(task, env.sim_env, style()).command(), expert.command())
+    np.testing.assert_array_equal(
+        find_task(task).load_expert()(env.sim_env, style()).command(), expert.command()
+    )
 
 
 @pytest.mark.parametrize("task", EXPERTS)
 def test_target_is_one_clipped_step_from_the_hand(envs, task):
     env = envs[task]
     start(env, 5)
-    expert = make_expert(task, env.sim_env, style())
+    expert = find_task(task).load_expert()(env.sim_env, style())
     for _ in range(20):
         hand, command = expert.hand(), expert.command()
         assert np.linalg.norm(command[:3] - hand.position) <= expert.style.reach + 1e-9
@@ -80,7 +85,7 @@ def test_target_is_one_clipped_step_from_the_hand(envs, task):
 def test_lift_grasps_again_after_the_cube_was_dropped(envs):
     env = envs["Lift"]
     start(env, 6)
-    expert = make_expert("Lift", env.sim_env, style())
+    expert = find_task("Lift").load_expert()(env.sim_env, style())
     dropped = False
     for _ in range(120):
         command = expert.command()
@@ -106,7 +111,7 @@ def test_can_that_has_toppled_is_grasped_across_its_axis(envs):
     )  # turned about x: its axis along y
     env.sim_env.sim.data.set_joint_qpos(can.joints[0], lying)
     env.sim_env.sim.forward()
-    expert = make_expert("PickPlaceCan", env.sim_env, style())
+    expert = find_task("PickPlaceCan").load_expert()(env.sim_env, style())
     for _ in range(250):
         if execute(env, expert.command())["success"]:
             return
@@ -116,7 +121,7 @@ def test_can_that_has_toppled_is_grasped_across_its_axis(envs):
 def test_fingers_over_the_square_rise_before_they_grasp_the_handle(envs):
     env = envs["NutAssemblySquare"]
     start(env, 8)
-    expert = make_expert("NutAssemblySquare", env.sim_env, style())
+    expert = find_task("NutAssemblySquare").load_expert()(env.sim_env, style())
     nut = env.sim_env.nuts[env.sim_env.nut_id].root_body
     command = expert.command()
     while expert.hand().position[2] - expert.body(nut)[0][2] > 0.05:
@@ -160,7 +165,7 @@ def test_nearest_equivalent_angle():
 
 def test_unknown_names_are_listed(envs):
     with pytest.raises(ValueError, match=r"PickPlaceCan.*'Door'"):
-        make_expert("Door", envs["Lift"].sim_env, style())
+        find_task("Door").load_expert()
     with pytest.raises(ValueError, match=r"proficient, recovering, mixed.*'human'"):
         draw_operator("human", np.random.default_rng(0))
 

@@ -7,7 +7,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.control.realtime_executor import HoldPose
 from torchrl_sparse.envs.moving_lift import PERIOD, SPEED, cube_path
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 
 
 @pytest.fixture(scope="module")
@@ -77,5 +77,5 @@ def test_paths_are_smooth_and_as_fast_as_said():
 
 
 def test_it_observes_what_lift_observes():
-    moving, still = get_task("lift_moving"), get_task("lift")
+    moving, still = find_robosuite_task("lift_moving"), find_robosuite_task("lift")
     assert (moving.state_keys, moving.state_dim) == (still.state_keys, still.state_dim)

@@ -14,7 +14,7 @@ from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_ini
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.envs.named_lift import COLOURS, SPACING, X_RANGE, Y_RANGE
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task, find_task
 
 WORDS = [f"lift the {colour} cube" for colour in COLOURS]
 
@@ -107,7 +107,7 @@ def test_the_state_is_that_of_the_named_cube(env):
     td = start(env, 5)
     named = places(env)[WORDS.index(td[keys.INSTRUCTION])]
     np.testing.assert_allclose(td[keys.STATE][:3], named, atol=1e-6)
-    assert td[keys.STATE].shape == (get_task("LiftNamed").state_dim,)
+    assert td[keys.STATE].shape == (find_robosuite_task("LiftNamed").state_dim,)
 
 
 def test_unknown_words_are_refused(env):
@@ -137,7 +137,7 @@ def test_each_environment_of_a_batch_has_its_own_words(drawn):
 
 def test_the_expert_lifts_the_named_cube_and_leaves_the_others(env):
     for seed in range(30_000, 30_003):
-        assert demonstrate(env, seed).success
+        assert demonstrate(find_task("lift_named"), env, seed).success
         named = WORDS.index(env.instruction)
         heights = places(env)[:, 2]
         assert heights[named] > 0.84

@@ -9,7 +9,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import TASKS, get_task
+from torchrl_sparse.envs.tasks import TASKS, find_robosuite_task
 from torchrl_sparse.envs.transforms import EndEffectorVelocity, make_env
 from torchrl_sparse.rotations import matrix_to_rot6d
 
@@ -159,8 +159,8 @@ def test_instruction_is_written_when_asked_for():
 
 def test_bad_input_is_named(lift):
     with pytest.raises(ValueError, match=r"expected one of Lift, .*PickPlaceCan.*got 'Fly'"):
-        get_task("Fly")
-    assert get_task("can") is get_task("PickPlaceCan")
+        find_robosuite_task("Fly")
+    assert find_robosuite_task("can") is find_robosuite_task("PickPlaceCan")
     with pytest.raises(ValueError, match="action_mode: expected 'absolute' or 'delta', got 'joint'"):
         RobosuiteEnv("Lift", action_mode="joint")
     with pytest.raises(ValueError, match="seeds: expected at least one"):

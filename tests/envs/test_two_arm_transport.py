@@ -8,10 +8,11 @@ import torch
 from torchrl_sparse import keys
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.experts import OPERATORS, make_expert
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Hand, downward
+from torchrl_sparse.envs.experts.operators import OPERATORS
 from torchrl_sparse.envs.experts.two_arm_transport import Hammer
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.rotations import pose_to_absolute
 
@@ -31,7 +32,9 @@ def env():
 def expert(env):
     env.set_seed(3)
     env.reset()
-    return make_expert(TASK, env.sim_env, OPERATORS["proficient"][0].draw(np.random.default_rng(0)))
+    return find_task(TASK).load_expert()(
+        env.sim_env, OPERATORS["proficient"][0].draw(np.random.default_rng(0))
+    )
 
 
 def put(expert, thing, position, quaternion=(1.0, 0.0, 0.0, 0.0)):

@@ -1,4 +1,4 @@
-"""A small vision-language-action policy, queries for it, and a pruner that watches another one."""
+"""A small vision-language-action policy, queries for it, and a pruner that records another one."""
 
 import torch
 from tensordict import TensorDict
@@ -6,8 +6,8 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
@@ -94,8 +94,8 @@ def later(td, changed=None, seed=1):
     return td
 
 
-class Watch(TokenPruner):
-    """Does what another pruner does and notes the sequence that each layer worked on."""
+class Recorder(TokenPruner):
+    """Delegates to another pruner and records the sequence that each layer worked on."""
 
     def __init__(self, inner):
         self.inner, self.seen = inner, []

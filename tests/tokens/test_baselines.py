@@ -4,18 +4,10 @@ import pytest
 import torch
 from torch.nn import functional
 
-from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Watch, later, make_policy, query
+from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, SPEC, Recorder, later, make_policy, query
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import TokenKind
-from torchrl_sparse.tokens.efficientvla import (
-    LAYER_SIMILARITY,
-    EfficientVLAPruner,
-    LayerSimilarityProbe,
-    layer_similarity,
-    redundant_layers,
-    relevant_and_diverse,
-    visual_features,
-)
+from torchrl_sparse.networks.vla.hooks import TokenKind
+from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner, relevant_and_diverse
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
 from torchrl_sparse.tokens.random import RandomPruner
@@ -25,16 +17,16 @@ from torchrl_sparse.tokens.vla_cache import REUSED, VLACachePruner, attention_en
 NUM_VISUAL = CONFIG.num_visual
 
 
-def watched(pruner, td, note):
+def recorded(pruner, td, note):
     """Runs a query and gives ``note(index, state)`` for each layer, before the pruner answers."""
-    watch, notes = Watch(pruner), []
+    recorder, notes = Recorder(pruner), []
 
     def after_layer(index, state):
         notes.append(note(index, state))
         return pruner.after_layer(index, state)
 
-    watch.after_layer = after_layer
-    return make_policy(watch)(td), notes
+    recorder.after_layer = after_layer
+    return make_policy(recorder)(td), notes
 
 
 # -- random, frame difference ----------------------------------------------------------------------------------------
@@ -70,7 +62,9 @@ def test_frame_difference_keeps_the_most_changed_of_each_camera():
 
 def test_fastv_keeps_what_the_last_prompt_token_attends_to():
     pruner = FastVPruner(share=0.25, layer=2)
-    td, notes = watched(pruner, query(), lambda index, state: (state.scores, pruner.score_rows(state), state))
+    td, notes = recorded(
+        pruner, query(), lambda index, state: (state.scores, pruner.score_rows(state), state)
+    )
     assert [scores is not None for scores, _, _ in notes] == [False, True, False, False, False, False]
     scores, rows, state = notes[1]
     assert (rows.sum(-1) == 1).all()
@@ -116,7 +110,7 @@ def test_efficientvla_takes_relevant_tokens_and_then_unlike_ones():
 
 def test_efficientvla_skips_layers_and_prunes_after_the_second():
     pruner = EfficientVLAPruner(share=0.25, skipped=[2, 4])
-    td, notes = watched(pruner, query(), lambda index, state: index)
+    td, notes = recorded(pruner, query(), lambda index, state: index)
     assert notes == [0, 1, 3, 5]
     assert sorted(set(td[keys.TOKEN_DEPTH].flatten().tolist())) == [2, 4]
     assert ((td[keys.TOKEN_DEPTH] == 4).sum(-1) == 8).all()
@@ -125,29 +119,15 @@ def test_efficientvla_skips_layers_and_prunes_after_the_second():
             make_policy(EfficientVLAPruner(skipped=[layer]))
 
 
-def test_probe_measures_each_layer_and_leaves_the_actions_alone():
-    def copies(index, state):
-        return state.hidden.clone(), state.alive.clone()
-
-    td, notes = watched(LayerSimilarityProbe(), query(), copies)
-    assert torch.equal(td[keys.CHUNK], make_policy()(query())[keys.CHUNK])
-    for layer in range(1, LAYERS):
-        (before, alive), (after, _) = notes[layer - 1], notes[layer]
-        torch.testing.assert_close(td[LAYER_SIMILARITY][:, layer], layer_similarity(before, after, alive))
-    assert len(redundant_layers(td[LAYER_SIMILARITY], 2)) == 2
-    with pytest.raises(ValueError, match="count: expected from 0 to fewer than the 6 layers, got 6"):
-        redundant_layers(td[LAYER_SIMILARITY], 6)
-
-
 def test_visual_features_are_indexed_by_token():
     def check(index, state):
-        features = visual_features(state)
+        features = state.visual_features
         for row, slot in state.is_visual.nonzero().tolist():
             assert torch.equal(features[row, state.positions[row, slot] - 1], state.hidden[row, slot])
         assert (features[~state.visual_alive] == 0).all()
         return state.visual_alive.sum()
 
-    _, counts = watched(EfficientVLAPruner(share=0.25), query(), check)
+    _, counts = recorded(EfficientVLAPruner(share=0.25), query(), check)
     assert counts[-1] < counts[0]
 
 
@@ -161,7 +141,7 @@ def test_raters_are_words_of_the_prompt():
         assert (raters & ~text).sum() == 0
         assert (raters.any(-1) & (raters.sum(-1) < text.sum(-1))).all()
 
-    watched(SparseVLMPruner(), query(), rows)
+    recorded(SparseVLMPruner(), query(), rows)
 
 
 def test_the_rank_of_attention_is_spared():
@@ -197,11 +177,11 @@ def test_sparsevlm_drops_the_least_rated_and_recycles_some_of_them():
     def note(index, state):
         if state.scores is not None:
             counts = dropped_counts(state.attention, state.visual_alive, 0.5)
-            before.update(scores=state.scores, counts=counts, hidden=visual_features(state))
+            before.update(scores=state.scores, counts=counts, hidden=state.visual_features)
         elif index == 3:
             before.update(alive=state.visual_alive)
 
-    watched(pruner, query(), note)
+    recorded(pruner, query(), note)
     for row in range(3):
         count = int(before["counts"][row])
         order = before["scores"][row].argsort(descending=True)
@@ -229,7 +209,7 @@ def test_recycled_tokens_hold_the_mean_of_their_cluster():
 
 def test_recycled_tokens_reach_the_next_layer():
     pruner, changed = SparseVLMPruner(scale=0.5, layers=[11], recycled=0.5), []
-    watch = Watch(pruner)
+    recorder = Recorder(pruner)
 
     def after_layer(index, state):
         before = state.hidden
@@ -238,8 +218,8 @@ def test_recycled_tokens_reach_the_next_layer():
         assert keep is None or not (changed[-1] & ~keep).any()
         return keep
 
-    watch.after_layer = after_layer
-    make_policy(watch)(query())
+    recorder.after_layer = after_layer
+    make_policy(recorder)(query())
     assert changed[2].any(-1).all()
     assert not any(slots.any() for index, slots in enumerate(changed) if index != 2)
 

@@ -9,13 +9,13 @@ from tests.tokens.helpers import (
     LAYERS,
     PER_CAMERA,
     PRUNERS,
-    Watch,
+    Recorder,
     later,
     make_policy,
     query,
 )
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import TokenKind
+from torchrl_sparse.networks.vla.hooks import TokenKind
 
 METHODS = list(PRUNERS)
 DROPS = [name for name in METHODS if name != "vla_cache"]  # which reuses tokens instead
@@ -49,16 +49,16 @@ def test_pruning_changes_the_actions(name, dense):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_positions_are_a_sorted_subset_and_only_visual_tokens_go(name):
-    watch = Watch(PRUNERS[name]())
-    policy = make_policy(watch)
+    recorder = Recorder(PRUNERS[name]())
+    policy = make_policy(recorder)
     first = policy(query())
-    watch.seen.clear()
+    recorder.seen.clear()
     policy(later(first))
-    whole = Watch(KEEP_ALL[name]())
+    whole = Recorder(KEEP_ALL[name]())
     make_policy(whole)(query())
     originals, original_kinds, original_alive = whole.seen[0]
     gone = 0
-    for positions, kinds, alive in watch.seen:
+    for positions, kinds, alive in recorder.seen:
         for row in range(len(positions)):
             mine = positions[row][alive[row]]
             everything = originals[row][original_alive[row]]
@@ -137,10 +137,10 @@ def test_depth_names_the_cameras_in_their_order():
 def test_kinds_follow_the_cameras_in_any_order_of_pruning():
     """Whichever camera loses tokens first, ids below the first camera's count are its own."""
     for name in DROPS:
-        watch = Watch(PRUNERS[name]())
-        policy = make_policy(watch)
+        recorder = Recorder(PRUNERS[name]())
+        policy = make_policy(recorder)
         policy(later(policy(query())))
-        for positions, kinds, alive in watch.seen:
+        for positions, kinds, alive in recorder.seen:
             primary = (positions >= 1) & (positions <= PER_CAMERA)
             wrist = (positions > PER_CAMERA) & (positions <= 2 * PER_CAMERA)
             assert torch.equal(primary & alive, (kinds == TokenKind.PRIMARY) & alive)

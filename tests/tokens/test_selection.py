@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.tokens.selection import (
     best,
     best_per_camera,

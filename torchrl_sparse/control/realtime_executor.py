@@ -43,11 +43,11 @@ class RealtimeExecutor(ChunkExecutor):
 
     Examples:
         >>> from torchrl_sparse import DiffusionPolicy, Sampler, make_env
-        >>> from torchrl_sparse.envs.tasks import get_task
+        >>> from torchrl_sparse.envs.tasks import find_robosuite_task
         >>> env = make_env("Lift", seeds=[7])
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> policy.sampler = Sampler("ddim", 10)
-        >>> actor = RealtimeExecutor(policy, HoldPose(get_task("lift")), latency=0.1)
+        >>> actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift")), latency=0.1)
         >>> env.rollout(3, actor)["control", "delay"].flatten().tolist()
         [2, 2, 2]
     """
@@ -122,10 +122,11 @@ class HoldPose(TensorDictModuleBase):
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl_sparse.envs.tasks import get_task
+        >>> from torchrl_sparse.envs.tasks import find_robosuite_task
         >>> state = torch.zeros(2, 19)
         >>> state[:, 13] = 1.0  # x of the quaternion: half a turn about x
-        >>> HoldPose(get_task("lift"))(TensorDict({"observation": {"state": state}}, [2]))["control", "hold"][0].tolist()
+        >>> hold = HoldPose(find_robosuite_task("lift"))
+        >>> hold(TensorDict({"observation": {"state": state}}, [2]))["control", "hold"][0].tolist()
         [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0]
     """
 

@@ -23,13 +23,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from torchrl_sparse.data.demos import env_args
 from torchrl_sparse.data.hdf5_reader import demo_names, naming, open_demos, read_array
 from torchrl_sparse.data.hdf5_writer import copy_attributes, lay_out
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import POSE_DIM
 from torchrl_sparse.storage.atomic import atomic_path
 
@@ -77,7 +76,7 @@ def convert_demos(path: str | Path, out: str | Path) -> int:
         missing = [name for name in names if not _part(parts, name).exists()]
         if missing:
             _make_parts(path, source["data"], missing, control, parts)
-        _merge(path, source, out, names, parts, settings | {"env_args": env_args(get_task(control.env_name))})
+        _merge(path, source, out, names, parts, settings | {"env_args": _env_args(control)})
     shutil.rmtree(parts)
     return len(names)
 
@@ -102,7 +101,7 @@ class AbsoluteActions:
 
     def __init__(self, control: RecordedControl):
         self.control = control
-        task = get_task(control.env_name)
+        task = find_robosuite_task(control.env_name)
         if control.robots != ("Panda",) * task.arms:
             raise ValueError(f"robots: expected {task.arms} times Panda, got {', '.join(control.robots)}")
         self.env = RobosuiteEnv(task.name)
@@ -250,3 +249,8 @@ def _fill(target: h5py.Group, demo: h5py.Group, part: h5py.File) -> None:
     for name, item in demo.get("obs", {}).items():
         if item.dtype == np.uint8 and item.ndim == 4:
             demo.copy(item, target["obs"], name=name)
+
+
+def _env_args(control: RecordedControl) -> dict[str, Any]:
+    task = find_robosuite_task(control.env_name)
+    return task.demonstrator.env_args(task)

@@ -19,24 +19,20 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
+from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.data.benchmark_demos import benchmark_env_args, demonstrate_benchmark
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
-from torchrl_sparse.envs.benchmarks import Benchmark, find_task
-from torchrl_sparse.envs.experts import Disturbance, draw_operator, make_expert
-from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
-from torchrl_sparse.envs.seeded import SeededEnv
-from torchrl_sparse.envs.simulator import controller_config, import_robosuite
-from torchrl_sparse.envs.tasks import Task
-from torchrl_sparse.rotations import pose_to_absolute
+from torchrl_sparse.envs.robosuite import InitialState
+from torchrl_sparse.envs.tasks import Task, find_task
 from torchrl_sparse.runtime.backends import check_backend
 
 # Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
 _EXPERT_STREAM = 1
+_OBSERVED = "obs/"
 
 
 @dataclass(frozen=True)
@@ -74,11 +70,12 @@ class Summary:
         )
 
 
-def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Episode:
-    """One scripted episode of robosuite, to success or to the environment's horizon.
+def demonstrate(task: Task, env: EnvBase, seed: int, quality: str = "proficient") -> Episode:
+    """Act out one scripted episode, to success or to the environment's horizon.
 
     Args:
-        env: an environment of absolute actions.
+        task: what is demonstrated.
+        env: its environment; in robosuite one of absolute actions.
         seed: fixes the initial state, the operator, their style and every disturbance.
         quality: "proficient", "recovering" or "mixed".
 
@@ -86,41 +83,40 @@ def demonstrate(env: RobosuiteEnv, seed: int, quality: str = "proficient") -> Ep
         ValueError: if the task has no expert or the quality is unknown.
 
     Examples:
-        >>> episode = demonstrate(RobosuiteEnv("Lift"), seed=0)
+        >>> task = find_task("lift")
+        >>> episode = demonstrate(task, task.make(), seed=0)
         >>> episode.success, episode.actions.shape[1]
         (True, 7)
     """
     rng = np.random.default_rng([seed, _EXPERT_STREAM])
-    operator = draw_operator(quality, rng)
     env.set_seed(seed)
     present = env.reset()
-    start = env.get_initial_state()
-    expert = make_expert(env.task.name, env.sim_env, operator.draw(rng))
-    disturb = Disturbance(operator, env.task.arms, rng)
+    demonstrator = task.demonstrator(task, env, rng, quality)
     steps: list[dict[str, Any]] = []
-    while not steps or not steps[-1]["done"]:
-        clean = expert.command()
-        hands = np.stack([expert.hand(arm).position for arm in range(env.task.arms)])
-        executed = disturb(clean, hands)
-        step = {"action": clean, "executed": executed, "obs": env.raw_observation()}
-        step["state"] = env.sim_env.sim.get_state().flatten()
-        present[keys.ACTION] = torch.as_tensor(pose_to_absolute(executed), dtype=torch.float32)
-        present = env.step(present)["next"]
-        step["success"], step["done"] = bool(present[keys.SUCCESS]), bool(present["done"])
-        steps.append(step)
-    succeeded = np.array([step["success"] for step in steps])
+    done = False
+    while not done:
+        state, observed = demonstrator.record(present)
+        clean, executed = demonstrator.act(present)
+        command = torch.as_tensor(demonstrator.command(executed), dtype=torch.float32)
+        present = env.step(present.set(keys.ACTION, command))["next"]
+        done = bool(present["done"])
+        steps.append(
+            {"state": state, "clean": clean, "executed": executed, "success": bool(present[keys.SUCCESS])}
+            | {_OBSERVED + name: value for name, value in observed.items()}
+        )
+    arrays = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
     return Episode(
         seed=seed,
-        operator=operator.name,
-        instruction=start.instruction,
-        success=bool(succeeded[-1]),
-        model_file=start.model_xml,
-        states=np.stack([step["state"] for step in steps]),
-        actions=np.stack([step["action"] for step in steps]),
-        executed_actions=np.stack([step["executed"] for step in steps]),
-        rewards=succeeded.astype(np.float64),
-        dones=succeeded.astype(np.int64),
-        observations={key: np.stack([step["obs"][key] for step in steps]) for key in env.task.state_keys},
+        operator=demonstrator.operator,
+        instruction=demonstrator.instruction,
+        success=bool(arrays["success"][-1]),
+        model_file=demonstrator.model_file,
+        states=arrays["state"],
+        actions=arrays["clean"],
+        executed_actions=arrays["executed"],
+        rewards=arrays["success"].astype(np.float64),
+        dones=arrays["success"].astype(np.int64),
+        observations={key: arrays[_OBSERVED + key] for key in task.state_keys},
     )
 
 
@@ -128,7 +124,7 @@ def collect(
     path: str | Path,
     collection: Collection,
     *,
-    env: SeededEnv | None = None,
+    env: EnvBase | None = None,
     workers: int = 1,
     backend: str = "process",
     on_episode: Callable[[Summary], None] | None = None,
@@ -168,18 +164,18 @@ def collect(
             if not collection.keep_failures:
                 _check_yield(tally)
     task = find_task(collection.task)
-    made_in = benchmark_env_args(task) if isinstance(task, Benchmark) else env_args(task)
+    made_in = task.demonstrator.env_args(task)
     merge_episodes(path, kept, env_args=made_in, collection=settings | {"summary": asdict(tally)})
     shutil.rmtree(parts)
     return tally
 
 
 def _seeds_made(
-    parts: Path, collection: Collection, env: SeededEnv | None, workers: int, backend: str
+    parts: Path, collection: Collection, env: EnvBase | None, workers: int, backend: str
 ) -> Iterator[int]:
     """Makes one episode after the other, and yields its seed."""
     if workers == 1 and backend == "process":
-        own = cache(lambda: _make_env(collection.task) if env is None else env)
+        own = cache(lambda: find_task(collection.task).make() if env is None else env)
         return (_make_part(parts, collection, own, seed) for seed in itertools.count(collection.seed))
     make = partial(_make_part, parts, collection, partial(_worker_env, collection.task))
     return in_order(make, collection.seed, workers, backend=backend)
@@ -189,30 +185,18 @@ def _part(parts: Path, seed: int) -> Path:
     return parts / f"{seed:010d}.h5"
 
 
-def _make_part(parts: Path, collection: Collection, environment: Callable[[], SeededEnv], seed: int) -> int:
+def _make_part(parts: Path, collection: Collection, environment: Callable[[], EnvBase], seed: int) -> int:
     """Makes the episode of a seed, unless it is there; returns the seed."""
     if not _part(parts, seed).exists():
-        write_episode(_part(parts, seed), _demonstrate(environment(), collection, seed))
+        task = find_task(collection.task)
+        write_episode(_part(parts, seed), demonstrate(task, environment(), seed, collection.quality))
     return seed
 
 
-def _demonstrate(env: SeededEnv, collection: Collection, seed: int) -> Episode:
-    task = find_task(collection.task)
-    if isinstance(task, Benchmark):
-        rng = np.random.default_rng([seed, _EXPERT_STREAM])
-        return demonstrate_benchmark(env, task, seed, rng, collection.quality)
-    return demonstrate(env, seed, collection.quality)
-
-
-def _make_env(task: str) -> SeededEnv:
-    found = find_task(task)
-    return found.make() if isinstance(found, Benchmark) else RobosuiteEnv(found.name)
-
-
 @cache
-def _worker_env(task: str) -> SeededEnv:
-    """The environment of a worker process: making one takes longer than an episode."""
-    return _make_env(task)
+def _worker_env(task: str) -> EnvBase:
+    """Make the environment of a worker process once: it takes longer than an episode."""
+    return find_task(task).make()
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:
@@ -232,24 +216,6 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
             seed=int(demo.attrs.get("seed", -1)),
             instruction=read_instruction(demo),
         )
-
-
-def env_args(task: Task) -> dict[str, Any]:
-    """robomimic's description of the environment that demonstrations were made in."""
-    return {
-        "env_name": task.name,
-        "env_version": import_robosuite().__version__,
-        "type": 1,  # robomimic's EnvType.ROBOSUITE_TYPE
-        "env_kwargs": {
-            "robots": ["Panda"] * task.arms,
-            "controller_configs": controller_config(absolute=True),
-            "control_freq": 20,
-            "has_renderer": False,
-            "has_offscreen_renderer": False,
-            "use_camera_obs": False,
-            "reward_shaping": False,
-        },
-    }
 
 
 def _check(collection: Collection) -> None:

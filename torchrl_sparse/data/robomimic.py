@@ -125,7 +125,7 @@ def read_demos(
             message names file, demonstration and dataset.
 
     Examples:
-        >>> demos = read_demos("data/lift.h5", get_task("Lift").state_keys)  # doctest: +SKIP
+        >>> demos = read_demos("data/lift.h5", find_robosuite_task("Lift").state_keys)  # doctest: +SKIP
         >>> demos.data["action"].shape[1], len(demos)  # doctest: +SKIP
         (10, 200)
     """

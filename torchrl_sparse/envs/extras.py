@@ -8,13 +8,13 @@ from contextlib import redirect_stderr
 from importlib import import_module
 from types import ModuleType
 
-from torchrl_sparse.envs.simulator import stand_in_for_missing_cv2
+from torchrl_sparse.envs.simulator import cv2_or_stand_in
 
 __all__ = ["import_extra"]
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """A module of an optional simulator, also where no GL library is installed.
+    """Import a module of an optional simulator, also where no GL library is installed.
 
     Raises:
         ImportError: without it, with the command that installs it.
@@ -26,9 +26,8 @@ def import_extra(module: str, extra: str) -> ModuleType:
     """
     os.environ.setdefault("MUJOCO_GL", "egl")  # only used if something is rendered
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    stand_in_for_missing_cv2()
     try:
-        with redirect_stderr(io.StringIO()):  # simulators greet there
+        with cv2_or_stand_in(), redirect_stderr(io.StringIO()):  # simulators greet there
             return import_module(module)
     except ImportError as error:
         raise ImportError(

@@ -8,8 +8,8 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_sparse.envs.benchmarks import find_task
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -57,7 +57,7 @@ def instructed_env(
     """
     return partial(
         make_env,
-        get_task(task).name,
+        find_robosuite_task(task).name,
         n_obs_steps=1,
         image_size=policy.network.config.image_size,
         object_state=False,

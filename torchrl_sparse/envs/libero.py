@@ -19,7 +19,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.simulator import import_robosuite
-from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.envs.tasks import RobosuiteTask
 from torchrl_sparse.envs.transforms import EndEffectorVelocity
 
 __all__ = ["SUITES", "RotationVectorState", "make_libero_env"]
@@ -28,7 +28,7 @@ SUITES = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libe
 """The suites, and the steps after which OpenVLA-OFT's evaluation gives up an episode of each."""
 
 _POSE = ("observation", "pose")
-_TASK = Task(
+_TASK = RobosuiteTask(
     "LIBERO", "libero", arms=1, object_dim=0, horizon=520, instructions=()
 )  # tells where the pose lies
 

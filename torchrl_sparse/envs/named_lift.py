@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from torchrl_sparse.envs.simulator import import_robosuite
-from torchrl_sparse.envs.tasks import TASKS
+from torchrl_sparse.envs.tasks import find_robosuite_task
 
 import_robosuite()  # quietly, before anything else imports it
 from robosuite.environments.manipulation.lift import Lift  # noqa: E402
@@ -54,7 +54,7 @@ class LiftNamed(Lift):
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
-        choices = TASKS["LiftNamed"].instructions
+        choices = find_robosuite_task("LiftNamed").instructions
         self.instruction = choices[self.rng.integers(len(choices))]
 
     @property

@@ -15,7 +15,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
 
 
@@ -85,7 +85,7 @@ class RobosuiteEnv(SeededEnv):
     ):
         if action_mode not in ("absolute", "delta"):
             raise ValueError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
-        self.task = get_task(task)
+        self.task = find_robosuite_task(task)
         horizon = self.task.horizon if horizon is None else horizon
         super().__init__(horizon=horizon, seeds=seeds, device=device)
         self.action_mode = action_mode

@@ -6,13 +6,15 @@ import logging
 import os
 import sys
 import types
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.envs.tasks import RobosuiteTask
 
 
 def import_robosuite():
-    """robosuite, without its start-up warnings, and also where no GL library is installed.
+    """Import robosuite without its start-up warnings, and also where no GL library is installed.
 
     Raises:
         ImportError: with the command that installs it.
@@ -20,9 +22,9 @@ def import_robosuite():
     os.environ.setdefault("MUJOCO_GL", "egl")  # read by mujoco at import; only used if something is rendered
     quiet = logging.getLogger("robosuite_logs")
     quiet.addFilter(_only_errors)
-    stand_in_for_missing_cv2()
     try:
-        import robosuite
+        with cv2_or_stand_in():
+            import robosuite
     except ImportError as error:
         raise ImportError(
             "robosuite environments need `pip install 'robosuite==1.5.2' 'mujoco<3.10'`"
@@ -31,9 +33,9 @@ def import_robosuite():
 
 
 def make_simulator(
-    task: Task, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
+    task: RobosuiteTask, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
 ) -> Any:
-    """A state-only robosuite environment of Pandas under OSC_POSE.
+    """Make a state-only robosuite environment of Pandas under OSC_POSE.
 
     Args:
         task: what to build.
@@ -42,8 +44,7 @@ def make_simulator(
         control_freq: actions a second.
     """
     robosuite = import_robosuite()
-    from torchrl_sparse.envs import moving_lift, named_lift  # noqa: F401  (they register their tasks)
-
+    task.register()
     return robosuite.make(
         task.name,
         robots=["Panda"] * task.arms,
@@ -58,7 +59,7 @@ def make_simulator(
 
 
 def controller_config(absolute: bool) -> dict:
-    """The composite controller of one Panda, as robosuite takes it and as demonstration files record it."""
+    """Build the composite controller of one Panda, as robosuite takes it and as demonstration files record it."""
     from robosuite.controllers import load_composite_controller_config
 
     config = load_composite_controller_config(controller="BASIC")
@@ -73,9 +74,20 @@ def _only_errors(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.ERROR
 
 
-def stand_in_for_missing_cv2() -> None:
-    """Simulators import cv2 for what is drawn on a screen, and cv2 cannot be imported without libGL."""
+@contextmanager
+def cv2_or_stand_in() -> Iterator[None]:
+    """Let simulators import cv2 where it cannot be imported for want of libGL.
+
+    They need it for what is drawn on a screen, which nothing here does. The stand-in is gone when the block ends.
+    """
     try:
         import cv2  # noqa: F401
     except ImportError:
-        sys.modules["cv2"] = types.ModuleType("cv2")
+        stand_in = sys.modules["cv2"] = types.ModuleType("cv2")
+        try:
+            yield
+        finally:
+            if sys.modules.get("cv2") is stand_in:
+                del sys.modules["cv2"]
+    else:
+        yield

@@ -1,26 +1,98 @@
-"""The robosuite tasks: what each is called, observes and allows.
+"""The tasks by name: `TASKS` is the one table, `Task` what every entry offers, whichever simulator it runs in.
 
-Layouts follow the low-dimensional tasks of Diffusion Policy (arXiv:2303.04137): the task's object state first, then position,
-quaternion and finger positions of each arm. The quaternion is read from the grip *site*, the frame that absolute actions
-command; robosuite's ``robot0_eef_quat`` is another frame, about 90 degrees off.
+A new task is a file with its environment, and one line here or, from outside the package, ``TASKS[task.name] = task``.
+Simulators and experts are named as ``"module:attribute"`` and imported when one is made: optional extras cost nothing before.
+
+Layouts of robosuite's tasks follow the low-dimensional ones of Diffusion Policy (arXiv:2303.04137): the task's object state
+first, then position, quaternion and finger positions of each arm. The quaternion is read from the grip *site*, the frame that
+absolute actions command; robosuite's ``robot0_eef_quat`` is another frame, about 90 degrees off.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Protocol
+
+from torchrl.envs import EnvBase
+
+from torchrl_sparse.rotations import ABSOLUTE_DIM
+
+__all__ = ["TASKS", "RobosuiteTask", "StateTask", "Task", "find_robosuite_task", "find_task"]
+
+
+class Task(Protocol):
+    """One task; `RobosuiteTask` and `StateTask` are the two kinds here.
+
+    Attributes:
+        name: of the task in results.
+        alias: short name for folders and command lines.
+        state_dim, action_dim: sizes of the low-dimensional observation and of the action.
+        state_keys: names, in demonstration files, of the observations whose concatenation is the state.
+        proprioception_keys: those of them that remain where cameras show the objects; ValueError for a task without cameras.
+        acts_in_poses: whether actions are absolute poses of arms.
+        demonstrator: class whose instances act out one demonstration, see `torchrl_sparse.envs.experts.demonstrators`.
+    """
+
+    name: str
+    alias: str
+
+    @property
+    def state_dim(self) -> int: ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    @property
+    def state_keys(self) -> tuple[str, ...]: ...
+
+    @property
+    def proprioception_keys(self) -> tuple[str, ...]: ...
+
+    @property
+    def acts_in_poses(self) -> bool: ...
+
+    @property
+    def demonstrator(self) -> type: ...
+
+    def make(self, **kwargs: Any) -> EnvBase:
+        """Make the task's environment; its class documents ``kwargs`` and errors."""
+
+    def load_expert(self) -> type:
+        """Import the class of the task's scripted expert.
+
+        Raises:
+            ValueError: if there is none; the message lists the tasks that have one.
+        """
+
+
+class _Named:
+    """What both kinds of tasks do with the names of their parts."""
+
+    name: str
+    expert: str | None
+
+    def load_expert(self) -> type:
+        """See `Task.load_expert`."""
+        if self.expert is None:
+            having = ", ".join(name for name, task in TASKS.items() if getattr(task, "expert", None))
+            raise ValueError(f"task: expected one with an expert ({having}), got {self.name!r}")
+        return _load(self.expert)
 
 
 @dataclass(frozen=True)
-class Task:
-    """One robosuite task.
+class RobosuiteTask(_Named):
+    """A robosuite task of Panda arms under absolute poses; a `Task`.
 
     Attributes:
-        name: robosuite's name, or ours for a variant (`torchrl_sparse.envs.moving_lift`, `torchrl_sparse.envs.named_lift`).
-        alias: robomimic's short name; folders and command lines use it.
+        name: robosuite's name, or ours for a variant.
+        alias: robomimic's short name.
         arms: number of Panda arms.
         object_dim: size of robosuite's ``object-state``.
         horizon: steps after which an episode is truncated, as in Diffusion Policy's evaluation (20 Hz).
         instructions: the task in words; where there are several, each episode asks for one of them.
+        module: importing it registers the task with robosuite; None for robosuite's own.
+        expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.base.Expert`; None without one.
     """
 
     name: str
@@ -29,6 +101,8 @@ class Task:
     object_dim: int
     horizon: int
     instructions: tuple[str, ...]
+    module: str | None = None
+    expert: str | None = None
 
     @property
     def has_choice(self) -> bool:
@@ -36,7 +110,7 @@ class Task:
         return len(self.instructions) > 1
 
     def check_instruction(self, words: str) -> None:
-        """Raises ValueError unless ``words`` are one of `instructions`."""
+        """Raise ValueError unless ``words`` are one of `instructions`."""
         if words not in self.instructions:
             expected = ", ".join(map(repr, self.instructions))
             raise ValueError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
@@ -53,57 +127,173 @@ class Task:
 
     @property
     def acts_in_poses(self) -> bool:
-        """Whether actions are absolute poses of arms."""
+        """Always True."""
         return True
 
     @property
     def state_dim(self) -> int:
         return self.object_dim + self.arms * sum(_PROPRIOCEPTION.values())
 
+    @property
+    def action_dim(self) -> int:
+        return ABSOLUTE_DIM * self.arms
+
+    @property
+    def demonstrator(self) -> type:
+        """See `Task`."""
+        return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
+
+    @property
+    def pose_slices(self) -> list[tuple[slice, slice]]:
+        """For each arm, where its position and its quaternion (xyzw) lie in the state."""
+        return [
+            (self.state_slice(f"robot{arm}_eef_pos"), self.state_slice(f"robot{arm}_eef_quat_site"))
+            for arm in range(self.arms)
+        ]
+
     def state_slice(self, key: str) -> slice:
-        """Where one of `state_keys` lies in the state."""
+        """Locate one of `state_keys` in the state."""
         sizes = [self.object_dim, *self.arms * tuple(_PROPRIOCEPTION.values())]
         index = self.state_keys.index(key)
         return slice(sum(sizes[:index]), sum(sizes[: index + 1]))
 
+    def make(self, **kwargs: Any) -> EnvBase:
+        """Make its `torchrl_sparse.envs.robosuite.RobosuiteEnv`."""
+        return _load(f"{_ENVS}.robosuite:RobosuiteEnv")(self.name, **kwargs)
 
+    def register(self) -> None:
+        """Make robosuite know the task, where it is not robosuite's own."""
+        if self.module is not None:
+            import_module(self.module)
+
+
+@dataclass(frozen=True)
+class StateTask(_Named):
+    """A task of another simulator, which an optional extra brings; a `Task` whose policies observe the simulator's state.
+
+    Attributes:
+        name: of the task in results.
+        alias: short name.
+        state_dim, action_dim: sizes of the published low-dimensional observation and action.
+        environment: ``"module:class"`` of the environment.
+        expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
+            without one.
+    """
+
+    name: str
+    alias: str
+    state_dim: int
+    action_dim: int
+    environment: str
+    expert: str | None = None
+
+    @property
+    def state_keys(self) -> tuple[str, ...]:
+        """Name of the state in demonstration files."""
+        return ("state",)
+
+    @property
+    def proprioception_keys(self) -> tuple[str, ...]:
+        """Raise ValueError: no camera shows the rest."""
+        raise ValueError(f"cameras: expected none for {self.name}, whose policies see its state")
+
+    @property
+    def acts_in_poses(self) -> bool:
+        """Always False."""
+        return False
+
+    @property
+    def demonstrator(self) -> type:
+        """See `Task`."""
+        return _load(f"{_EXPERTS}.demonstrators:StateDemonstrator")
+
+    def make(self, **kwargs: Any) -> EnvBase:
+        """Make its environment; see the class for ``kwargs`` and errors."""
+        return _load(self.environment)(**kwargs)
+
+
+def _load(path: str) -> Any:
+    module, attribute = path.split(":")
+    return getattr(import_module(module), attribute)
+
+
+_ENVS, _EXPERTS = "torchrl_sparse.envs", "torchrl_sparse.envs.experts"
 _PROPRIOCEPTION = {"eef_pos": 3, "eef_quat_site": 4, "gripper_qpos": 2}
 
-TASKS = {
-    task.name: task
-    for task in (
-        Task("Lift", "lift", 1, 10, 400, ("lift the red cube",)),
-        Task("LiftMoving", "lift_moving", 1, 10, 400, ("lift the moving red cube",)),
-        Task(
-            "LiftNamed",
-            "lift_named",
-            1,
-            10,
-            200,
-            tuple(f"lift the {c} cube" for c in ("red", "green", "blue")),
-        ),
-        Task("PickPlaceCan", "can", 1, 14, 400, ("put the can into its bin",)),
-        Task("NutAssemblySquare", "square", 1, 14, 400, ("put the square nut on the square peg",)),
-        Task(
-            "TwoArmTransport",
-            "transport",
-            2,
-            41,
-            700,
-            ("hand the hammer over and put it into the target bin",),
-        ),
-        Task("ToolHang", "tool_hang", 1, 44, 700, ("assemble the frame and hang the tool on it",)),
-    )
-}
+
+def _expert(place: str) -> str:
+    return f"{_EXPERTS}.{place}"
 
 
-def get_task(name: str) -> Task:
-    """The task of that robosuite name or alias.
+_LIFT = _expert("lift:LiftExpert")
+_ROBOSUITE = (
+    RobosuiteTask("Lift", "lift", 1, 10, 400, ("lift the red cube",), expert=_LIFT),
+    RobosuiteTask(
+        *("LiftMoving", "lift_moving", 1, 10, 400, ("lift the moving red cube",)),
+        module=f"{_ENVS}.moving_lift",
+        expert=_expert("lift:LiftMovingExpert"),
+    ),
+    RobosuiteTask(
+        *("LiftNamed", "lift_named", 1, 10, 200),
+        instructions=tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue")),
+        module=f"{_ENVS}.named_lift",
+        expert=_LIFT,
+    ),
+    RobosuiteTask(
+        *("PickPlaceCan", "can", 1, 14, 400, ("put the can into its bin",)),
+        expert=_expert("pick_place_can:PickPlaceCanExpert"),
+    ),
+    RobosuiteTask(
+        *("NutAssemblySquare", "square", 1, 14, 400, ("put the square nut on the square peg",)),
+        expert=_expert("nut_assembly_square:NutAssemblySquareExpert"),
+    ),
+    RobosuiteTask(
+        *("TwoArmTransport", "transport", 2, 41, 700),
+        instructions=("hand the hammer over and put it into the target bin",),
+        expert=_expert("two_arm_transport:TwoArmTransportExpert"),
+    ),
+    RobosuiteTask(
+        *("ToolHang", "tool_hang", 1, 44, 700, ("assemble the frame and hang the tool on it",)),
+        expert=_expert("tool_hang:ToolHangExpert"),
+    ),
+)
+_OTHERS = (
+    StateTask("PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert")),
+    StateTask(
+        *("BlockPush", "block_push", 16, 2, f"{_ENVS}.block_push:BlockPushEnv"),
+        expert=_expert("block_push:BlockPushExpert"),
+    ),
+    StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv"),
+)
+
+TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}
+"""Every task by its name; assign to it to add one."""
+
+
+def find_task(name: str) -> Task:
+    """Find a task by its name or alias.
 
     Raises:
         ValueError: if there is none; the message lists those there are.
+
+    >>> find_task("pusht").state_dim, find_task("can").state_dim
+    (20, 23)
     """
     for task in TASKS.values():
         if name in (task.name, task.alias):
             return task
     raise ValueError(f"task: expected one of {', '.join(TASKS)} or their aliases, got {name!r}")
+
+
+def find_robosuite_task(name: str) -> RobosuiteTask:
+    """Find a task that robosuite simulates, by its name or alias.
+
+    Raises:
+        ValueError: if there is none; the message lists those there are.
+    """
+    found = [task for task in TASKS.values() if isinstance(task, RobosuiteTask)]
+    for task in found:
+        if name in (task.name, task.alias):
+            return task
+    names = ", ".join(task.name for task in found)
+    raise ValueError(f"task: expected one of {names} or their aliases, got {name!r}")

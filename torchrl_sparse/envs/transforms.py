@@ -13,16 +13,14 @@ from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv, Unsque
 from torchrl.envs.transforms import Transform
 
 from torchrl_sparse import keys
-from torchrl_sparse.envs.benchmarks import Benchmark, find_task
-from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.tasks import Task
+from torchrl_sparse.envs.tasks import RobosuiteTask, find_task
 
 
 def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
-    """A task with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
+    """Make a task's environment with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
 
     Args:
-        task: of robosuite, see `RobosuiteEnv`, or another benchmark, see `torchrl_sparse.envs.benchmarks`.
+        task: of robosuite, see `RobosuiteEnv`, or of another simulator, see `torchrl_sparse.envs.tasks.TASKS`.
         n_obs_steps: entries of a history; the first of an episode is repeated at its start.
         kwargs: of the environment's class; cameras asked for there get a history too.
 
@@ -30,8 +28,7 @@ def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEn
         >>> make_env("Lift").reset()["history", "state"].shape
         torch.Size([2, 19])
     """
-    found = find_task(task)
-    env = found.make(**kwargs) if isinstance(found, Benchmark) else RobosuiteEnv(task, **kwargs)
+    env = find_task(task).make(**kwargs)
     cameras = [key for key in (keys.IMAGE, keys.WRIST_IMAGE) if key in env.observation_spec.keys(True)]
     histories = [*state_history(n_obs_steps), *image_history(n_obs_steps, cameras)]
     return TransformedEnv(env, Compose(InitTracker(), *histories))
@@ -70,14 +67,11 @@ class EndEffectorVelocity(Transform):
         key: of the state.
     """
 
-    def __init__(self, task: Task, control_freq: float = 20.0, key: NestedKey = keys.STATE):
+    def __init__(self, task: RobosuiteTask, control_freq: float = 20.0, key: NestedKey = keys.STATE):
         super().__init__(in_keys=[key], out_keys=[keys.EEF_VEL])
         self.control_freq = control_freq
         self._key = key
-        self._poses = [
-            (task.state_slice(f"robot{i}_eef_pos"), task.state_slice(f"robot{i}_eef_quat_site"))
-            for i in range(task.arms)
-        ]
+        self._poses = task.pose_slices
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         state = tensordict_reset.get(self._key)

@@ -11,6 +11,7 @@ Network weights are fp16, normalisation constants as they are.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
@@ -22,28 +23,39 @@ from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_fro
 from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
 
-__all__ = ["read_vla", "write_vla"]
+__all__ = ["StoredVLA", "read_vla", "write_vla"]
 
 FORMAT = "torchrl_sparse.vla_policy/1"
 _FIELDS = {"format", "network", "tokenizer"}
 _NETWORK, _NORMALIZER = "network.", "normalizer."
 
 
-def write_vla(
-    path: Path, *, network: VLANetwork, normalizer: QuantileNormalizer, tokenizer: InstructionTokenizer
-) -> None:
-    """Writes both files into the folder ``path``, each in one piece or not at all."""
-    tensors = {_NETWORK + name: value.half() for name, value in network.state_dict().items()}
-    tensors |= {_NORMALIZER + name: value for name, value in normalizer.state_dict().items()}
+@dataclass(frozen=True)
+class StoredVLA:
+    """The parts of a vision-language-action policy that files hold.
+
+    Attributes:
+        network: the network, in evaluation mode.
+        normalizer: of states and actions.
+        tokenizer: of instructions.
+    """
+
+    network: VLANetwork
+    normalizer: QuantileNormalizer
+    tokenizer: InstructionTokenizer
+
+
+def write_vla(path: Path, policy: StoredVLA) -> None:
+    """Write both files into the folder ``path``, each in one piece or not at all."""
+    tensors = {_NETWORK + name: value.half() for name, value in policy.network.state_dict().items()}
+    tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
     write_tensors(path / "model.safetensors", tensors)
-    config = {"format": FORMAT, "network": network.config.to_dict(), "tokenizer": tokenizer.to_config()}
-    write_config(path / "config.json", config)
+    network, tokenizer = policy.network.config.to_dict(), policy.tokenizer.to_config()
+    write_config(path / "config.json", {"format": FORMAT, "network": network, "tokenizer": tokenizer})
 
 
-def read_vla(
-    path: Path, expected: VLAConfig | None = None
-) -> tuple[VLANetwork, QuantileNormalizer, InstructionTokenizer]:
-    """Network (f32, eval mode), normaliser and tokenizer from the folder ``path``.
+def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
+    """Read the policy in the folder ``path``, its network in f32.
 
     Args:
         path: the folder.
@@ -73,7 +85,7 @@ def read_vla(
         check_shapes(f"{where}: {prefix}", found, _shapes(module.state_dict()))
         check_finite(f"{where}: {prefix}", found)
     network.load_state_dict({name: value.float() for name, value in weights.items()})
-    return network.eval(), QuantileNormalizer(**constants), tokenizer
+    return StoredVLA(network.eval(), QuantileNormalizer(**constants), tokenizer)
 
 
 def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig) -> None:

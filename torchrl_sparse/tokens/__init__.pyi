@@ -1,3 +1,4 @@
+from .base import TokenPruner as TokenPruner
 from .efficientvla import EfficientVLAPruner as EfficientVLAPruner
 from .fastv import FastVPruner as FastVPruner
 from .frame_difference import FrameDifferencePruner as FrameDifferencePruner

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind, VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import best, check_share
 
 
 def last_text_token(kind: Tensor, alive: Tensor) -> Tensor:
-    """The last token of each row's prompt, bool [B, S].
+    """Return the last token of each row's prompt, bool [B, S].
 
     Args:
         kind: i64 [B, S], `TokenKind`.

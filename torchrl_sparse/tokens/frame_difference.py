@@ -6,13 +6,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 from torchrl_sparse.tokens.selection import best_per_camera, check_share
 
 
 def most_changed(similarity: Tensor, count: int, cameras: int) -> Tensor:
-    """In each camera the ``count`` patches that are least like their predecessors, bool [B, N].
+    """Choose in each camera the ``count`` patches least similar to their predecessors, bool [B, N].
 
     Args:
         similarity: [B, N], see `torchrl_sparse.tokens.frames.similarity`.

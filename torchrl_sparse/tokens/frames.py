@@ -1,4 +1,4 @@
-"""What changed in the cameras' images since the last query, patch by patch."""
+"""Changes in the cameras' images since the last query, patch by patch."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["FRAME_KEYS", "compare_frames", "patches", "similarity"]
 
 FRAME_KEYS = [keys.TOKEN_FRAMES, keys.IS_INIT]
-"""What `compare_frames` reads beside the images."""
+"""Keys that `compare_frames` reads beside the images."""
 
 
 def patches(frames: Tensor, grid: tuple[int, int]) -> Tensor:
-    """The pixels of each patch, f64 [B, V * rows * columns, P], camera by camera and row by row.
+    """Return the pixels of each patch, f64 [B, V * rows * columns, P], camera by camera and row by row.
 
     Args:
         frames: u8 [B, V, 3, h, w].
@@ -41,7 +41,7 @@ def patches(frames: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def similarity(previous: Tensor, current: Tensor) -> Tensor:
-    """Eq. 2 of SpecPrune-VLA (arXiv:2509.05614): cosine between patches of two frames, f32 [...].
+    """Return the cosine between patches of two frames, f32 [...]: Eq. 2 of SpecPrune-VLA (arXiv:2509.05614).
 
     Two black patches are alike; a black one is unlike any other.
 
@@ -59,7 +59,7 @@ def similarity(previous: Tensor, current: Tensor) -> Tensor:
 
 
 def compare_frames(td: TensorDictBase, spec: VisualSpec) -> tuple[Tensor, Tensor]:
-    """Compares the images of this query with those of the last, and remembers these.
+    """Compare the images of this query with those of the last, and remember these.
 
     Args:
         td: a query [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced.

@@ -1,4 +1,4 @@
-"""Random pruning: visual tokens drawn without looking at them. What every other method has to beat."""
+"""Random pruning: visual tokens drawn blindly, the control that every other method has to beat."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.networks.diffusion.noise import query_seed
-from torchrl_sparse.networks.vla.pruning import TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import best, check_share
 
 
 def random_set(seed: Tensor, num_tokens: int, count: int) -> Tensor:
-    """``count`` of the tokens, bool [B, num_tokens], row i from ``seed[i]`` alone.
+    """Draw ``count`` of the tokens, bool [B, num_tokens], row i from ``seed[i]`` alone.
 
     Args:
         seed: i64 [B].

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["best", "best_per_camera", "check_budget", "check_share", "ranks", "scaled_layers"]
 
 
 def ranks(score: Tensor, among: Tensor) -> Tensor:
-    """Place of each token, i64 [B, N]: 0 has the highest score; equal ones in the order of their ids; those not ``among`` last.
+    """Rank the tokens, i64 [B, N]: 0 has the highest score; equal ones in the order of their ids; those not ``among`` last.
 
     Args:
         score: [B, N].
@@ -29,7 +29,7 @@ def ranks(score: Tensor, among: Tensor) -> Tensor:
 
 
 def best(score: Tensor, count: Tensor | int, among: Tensor) -> Tensor:
-    """The ``count`` tokens of highest score, bool [B, N]; all of them where fewer compete.
+    """Choose the ``count`` tokens of highest score, bool [B, N]; all of them where fewer compete.
 
     Args:
         score: [B, N].
@@ -45,7 +45,7 @@ def best(score: Tensor, count: Tensor | int, among: Tensor) -> Tensor:
 
 
 def best_per_camera(score: Tensor, counts: Sequence[Tensor | int], among: Tensor) -> Tensor:
-    """`best` within each camera, bool [B, N]; the cameras' tokens follow each other, equally many each.
+    """Choose the `best` within each camera, bool [B, N]; the cameras' tokens follow each other, equally many each.
 
     Args:
         counts: one number, or i64 [B, 1], per camera.
@@ -56,7 +56,7 @@ def best_per_camera(score: Tensor, counts: Sequence[Tensor | int], among: Tensor
 
 
 def scaled_layers(layers: Sequence[int], depth: int, num_layers: int, first: int = 0) -> list[int]:
-    """Layers of a model ``depth`` deep, moved to the same relative depth in one of ``num_layers``; those from ``first`` on.
+    """Move layers of a model ``depth`` deep to the same relative depth in one of ``num_layers``; keep those from ``first`` on.
 
     Examples:
         >>> scaled_layers([5, 10, 15, 20], 32, 32, 2), scaled_layers([5, 10, 15, 20], 32, 8, 2)
@@ -67,7 +67,7 @@ def scaled_layers(layers: Sequence[int], depth: int, num_layers: int, first: int
 
 
 def check_budget(name: str, budget: float, spec: VisualSpec) -> None:
-    """Refuses a number of tokens per camera that the model does not have.
+    """Refuse a number of tokens per camera that the model does not have.
 
     Raises:
         ValueError: naming the budget and the model's tokens.
@@ -79,7 +79,7 @@ def check_budget(name: str, budget: float, spec: VisualSpec) -> None:
 
 
 def check_share(name: str, share: float) -> None:
-    """Refuses a share outside (0, 1].
+    """Refuse a share outside (0, 1].
 
     Raises:
         ValueError: naming it.

@@ -1,4 +1,4 @@
-"""SparseVLM: words that look at the image rate its tokens; of what is dropped, the better part is merged (arXiv:2410.04417).
+"""SparseVLM: words that matter to the image rate its tokens; of those dropped, the better part is merged (arXiv:2410.04417).
 
 Zhang et al., ICML 2025. How many tokens go is adaptive: the more independent directions the raters' attention has (its rank),
 the fewer. A merged token takes the place, and the position, of the token at the centre of its cluster.
@@ -11,14 +11,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner
+from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import check_share, scaled_layers
 
 _DEPTH = 32
 
 
 def text_raters(hidden: Tensor, is_visual: Tensor, is_text: Tensor) -> Tensor:
-    """The words that matter to what is seen: those that visual tokens resemble more than they do the mean word, bool [B, S].
+    """Choose the words that matter to the image, bool [B, S]: those more similar to the visual tokens than the mean word is.
 
     Args:
         hidden: [B, S, d].
@@ -37,7 +38,7 @@ def text_raters(hidden: Tensor, is_visual: Tensor, is_text: Tensor) -> Tensor:
 
 
 def dropped_counts(attention: Tensor, alive: Tensor, scale: float) -> Tensor:
-    """How many visual tokens each row drops, i64 [B]: ``scale`` times those beyond the rank of the raters' attention.
+    """Count the visual tokens that each row drops, i64 [B]: ``scale`` times those beyond the rank of the raters' attention.
 
     Args:
         attention: [B, raters, N], 0 for dead tokens.
@@ -48,7 +49,7 @@ def dropped_counts(attention: Tensor, alive: Tensor, scale: float) -> Tensor:
 
 
 def density_peaks(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Clusters around points that are dense and far from any denser one (Rodriguez and Laio, 2014).
+    """Cluster around points that are dense and far from any denser one (Rodriguez and Laio, 2014).
 
     Args:
         points: [n, d].
@@ -76,7 +77,7 @@ def density_peaks(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def merge(points: Tensor, cluster: Tensor, count: int) -> Tensor:
-    """The mean [count, d] of each cluster of ``points`` [n, d]."""
+    """Return the mean [count, d] of each cluster of ``points`` [n, d]."""
     member = torch.nn.functional.one_hot(cluster, count).to(points.dtype)
     return (member.T @ points) / member.sum(0)[:, None]
 
@@ -86,7 +87,7 @@ class SparseVLMPruner(TokenPruner):
 
     Args:
         scale: share of the tokens beyond the rank that go in each layer (the paper's lambda), in (0, 1].
-        layers: where, in a decoder 32 deep; scaled to the model's depth.
+        layers: after which to prune, in a decoder 32 deep; scaled to the model's depth.
         recycled: share of the dropped tokens, the best, that are merged.
         clusters: merged tokens, as a share of those.
     """
@@ -127,7 +128,7 @@ class SparseVLMPruner(TokenPruner):
         return keep
 
     def _recycle(self, hidden: Tensor, keep: Tensor, dropped: Tensor) -> None:
-        """Merges the first of the ``dropped`` slots, in place, into the slots of some of them."""
+        """Merge the first of the ``dropped`` slots, in place, into the slots of some of them."""
         slots = dropped[: max(1, round(self.recycled * len(dropped)))]
         count = max(1, round(self.clusters * len(slots)))
         points = hidden[slots].float()

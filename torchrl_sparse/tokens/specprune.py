@@ -6,7 +6,7 @@ arXiv:2509.05614. Nothing is trained. Each equation is the function named after 
 ====== ================================= =============================================================================
 Eq.    function                          defines
 ====== ================================= =============================================================================
-1      `score`                           attention of the instruction's words to a visual token
+1      `visual_scores` (`vla.decoder`)   attention of the instruction's words to a visual token
 2      `similarity` (`tokens.frames`)    cosine between a patch and the same patch at the last query
 3      `dynamic_set`                     patches that changed
 4      `layer_set`                       the best tokens of one layer, in each camera
@@ -38,7 +38,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner, VisualSpec
+from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 from torchrl_sparse.tokens.selection import (
     best,
@@ -50,17 +51,6 @@ from torchrl_sparse.tokens.selection import (
 )
 
 # -- equations -------------------------------------------------------------------------------------------------------
-
-
-def score(attention: Tensor) -> Tensor:
-    """Eq. 1: mean over heads and over the instruction's words, [..., N].
-
-    The decoder computes it for the words alone, so that its attention stays fused; see ``LayerState.scores``.
-
-    Args:
-        attention: [..., heads, words, N], after the softmax: how much each word looks at each visual token.
-    """
-    return attention.mean((-3, -2))
 
 
 def dynamic_set(similarity: Tensor, counts: list[Tensor], threshold: float) -> Tensor:
@@ -122,7 +112,7 @@ def updated_score(before: Tensor, layer_score: Tensor, beta: float) -> Tensor:
 
 @dataclass(frozen=True)
 class SpecPruneOptions:
-    """What the paper and its release set differently. Layers are those of a decoder 32 deep, and are scaled to the model's.
+    """Settings in which the paper and its release differ. Layers are those of a decoder 32 deep, and are scaled to the model's.
 
     Attributes:
         alpha: multiplies the budget: K = floor(alpha * camera share * budget) tokens per camera.
@@ -226,7 +216,7 @@ class SpecPrune(TokenPruner):
         return {*range(_SPECULATION), *self._dynamic_layers, *self._carry_layers}
 
     def begin(self, td: TensorDictBase) -> None:
-        """Everything that is known before the decoder runs: the budgets, what is carried, and what changed."""
+        """Compute everything that is known before the decoder runs: the budgets, the carried set, and the changed set."""
         alike, first = compare_frames(td, self.spec)
         counts = self._counts(td)
         td.set(_COUNTS, torch.cat(counts, -1))
@@ -235,7 +225,7 @@ class SpecPrune(TokenPruner):
         td.set(_TO_CARRY, torch.zeros_like(alike))
 
     def _counts(self, td: TensorDictBase) -> list[Tensor]:
-        """K of each camera, i64 [B, 1]."""
+        """Return K of each camera, i64 [B, 1]."""
         granted = self.options.alpha * keys.recall(td, keys.TOKEN_BUDGET, (1,), self.options.budget).double()
         check_budget("alpha * budget", granted.max().item(), self.spec)
         shares = [1.0, *[self.options.wrist_share] * (len(self.spec.cameras) - 1)]

@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner, VisualSpec
-from torchrl_sparse.tokens.efficientvla import visual_features
+from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 from torchrl_sparse.tokens.selection import best, best_per_camera, check_share
 
@@ -32,8 +32,8 @@ _REUSABLE, _ALIKE, _REUSED_NOW, _ENTROPY, _NEW_CACHE = (
 def reusable_set(
     similarity: Tensor, attention: Tensor, static: int, relevant: int, threshold: float, cameras: int
 ) -> Tensor:
-    """Unchanged and irrelevant, bool [B, N]: in each camera the ``static`` patches most alike their predecessors, none below
-    ``threshold``, without the ``relevant`` most attended.
+    """Choose unchanged and irrelevant tokens, bool [B, N]: in each camera the ``static`` patches most similar to their
+    predecessors, none below ``threshold``, without the ``relevant`` most attended.
 
     Args:
         similarity: [B, N] to the last query's patches.
@@ -44,7 +44,7 @@ def reusable_set(
 
 
 def attention_entropy(attention: Tensor) -> Tensor:
-    """Entropy [B], in nats, of how each row spreads its attention over the visual tokens; mean over rows.
+    """Return the entropy [B], in nats, of each row's attention over the visual tokens; mean over rows.
 
     Args:
         attention: [B, R, N]; rows of zeros do not count.
@@ -57,7 +57,7 @@ def attention_entropy(attention: Tensor) -> Tensor:
 
 
 def reuse_shares(entropy: Tensor, growth: float) -> Tensor:
-    """Share of the reusable tokens that each layer reuses, [B, L]: 1 at the lowest entropy of all layers, 0 at the highest.
+    """Return the share of the reusable tokens that each layer reuses, [B, L]: from 0 at the highest entropy to 1 at the lowest.
 
     Args:
         entropy: [B, L].
@@ -125,7 +125,7 @@ class VLACachePruner(TokenPruner):
 
     def after_layer(self, index: int, state: LayerState) -> None:
         td, layers = state.td, self.spec.num_layers
-        features = visual_features(state)
+        features = state.visual_features
         if index == 0:
             td.set(_NEW_CACHE, features.new_zeros(len(features), layers, *features.shape[1:]))
         reused = self._reused(index, td)
@@ -139,7 +139,7 @@ class VLACachePruner(TokenPruner):
             td.set(keys.TOKEN_SCORE, state.scores)
 
     def _reused(self, index: int, td: TensorDictBase) -> Tensor:
-        """Tokens that are not computed from this layer on, bool [B, N]; none of them comes back in a deeper one."""
+        """Choose the tokens that are not computed from this layer on, bool [B, N]; none of them comes back in a deeper one."""
         reusable = td.get(_REUSABLE)
         share = keys.recall(td, REUSE_SHARE, (self.spec.num_layers,), 0.0)[:, index, None]
         count = (share * reusable.sum(-1, keepdim=True)).long()
@@ -153,6 +153,6 @@ class VLACachePruner(TokenPruner):
 
 
 def _with_features(state: LayerState, features: Tensor) -> Tensor:
-    """``state.hidden`` with the visual tokens' rows taken from ``features`` [B, N, d]."""
+    """Return ``state.hidden`` with the visual tokens' rows taken from ``features`` [B, N, d]."""
     ids = state.visual_ids.clamp(0, state.num_visual - 1)[..., None].expand_as(state.hidden)
     return torch.where(state.is_visual[..., None], features.gather(1, ids), state.hidden)

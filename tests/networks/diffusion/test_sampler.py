@@ -15,7 +15,7 @@ PUBLISHED = {
 SHAPE = (2, 10, 10)
 
 
-@pytest.mark.parametrize("steps", [100, 25, 10])
+@pytest.mark.parametrize("steps", [100, 25, 16, 10, 1])
 def test_ddpm_equals_diffusers_with_its_variance_noise(steps):
     sampler = Sampler("ddpm", steps)
     reference = DDPMScheduler(variance_type="fixed_small", **PUBLISHED)
@@ -76,7 +76,7 @@ def test_published_timesteps_run_from_99_to_0():
 def test_the_true_noise_leads_back_to_the_clean_sample(sampler):
     clean = torch.rand(SHAPE) * 2 - 1
     sample = torch.randn(SHAPE)
-    alphas = sampler.sampler.alphas_cumprod
+    alphas = sampler.scheduler.alphas_cumprod
     for k, timestep in enumerate(sampler.timesteps):
         eps = (sample - alphas[timestep].sqrt() * clean) / (1 - alphas[timestep]).sqrt()
         sample = sampler.step(eps, k, sample, torch.randn(SHAPE))
@@ -86,7 +86,7 @@ def test_the_true_noise_leads_back_to_the_clean_sample(sampler):
 def test_add_noise_mixes_by_the_cumulative_alpha():
     sampler = Sampler()
     clean, noise, timestep = torch.randn(3, 4, 2), torch.randn(3, 4, 2), torch.tensor([0, 50, 99])
-    alpha = sampler.sampler.alphas_cumprod[timestep][:, None, None]
+    alpha = sampler.scheduler.alphas_cumprod[timestep][:, None, None]
     expected = alpha.sqrt() * clean + (1 - alpha).sqrt() * noise
     torch.testing.assert_close(sampler.add_noise(clean, noise, timestep), expected)
 

@@ -7,7 +7,8 @@ from transformers import LlamaConfig, LlamaModel
 
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, pack, row_attention
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner
+from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind
+from torchrl_sparse.tokens.base import TokenPruner
 
 BATCH, VISUAL, TEXT, SLOTS = 3, 8, 4, 14
 

@@ -12,9 +12,9 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.flops import query_flops
 from torchrl_sparse.networks.vla.network import VLANetwork
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.base import TokenPruner
 
 
 def keep(batch, *rows):

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from tests.storage.published import openvla as published
 from torchrl_sparse import keys
-from torchrl_sparse.storage.published.openvla_oft import load_openvla_oft
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def folder(weights, tmp_path):
 
 
 def load(folder, **options):
-    return load_openvla_oft(folder, heads=published.SIZES["heads"], dtype=torch.float32, **options)
+    return VLAPolicy.from_openvla_oft(folder, heads=published.SIZES["heads"], dtype=torch.float32, **options)
 
 
 @torch.no_grad()

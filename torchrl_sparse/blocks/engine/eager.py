@@ -57,7 +57,7 @@ class EagerBaseline:
             raise ValueError(
                 f"eager baseline: diffusers has no sampler {sampler.name!r}, only evenly spaced timesteps"
             )
-        self._network, self._scheduler = network, sampler.sampler
+        self._network, self._scheduler = network, sampler.scheduler
         self._timesteps = sampler.timesteps
         self._forward = torch.compile(published_forward) if compiled else published_forward
 

@@ -74,13 +74,14 @@ class Expert(ABC):
         style: the operator's draw for this episode.
 
     Examples:
-        >>> from torchrl_sparse.envs.experts import draw_operator, make_expert
+        >>> from torchrl_sparse.envs.experts.operators import draw_operator
+        >>> from torchrl_sparse.envs.tasks import find_task
         >>> from torchrl_sparse.envs.robosuite import RobosuiteEnv
         >>> env = RobosuiteEnv("Lift", seeds=[0])
         >>> _ = env.reset()
         >>> rng = np.random.default_rng(0)
         >>> style = draw_operator("proficient", rng).draw(rng)
-        >>> make_expert("Lift", env.sim_env, style).command().shape
+        >>> find_task("Lift").load_expert()(env.sim_env, style).command().shape
         (7,)
     """
 

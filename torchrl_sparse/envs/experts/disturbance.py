@@ -1,4 +1,4 @@
-"""What the operator's hand does besides what was meant: noise, pauses, bumps, slips and missed grasps when executing."""
+"""Disturb what an operator means to do: noise, pauses, bumps, slips and missed grasps."""
 
 from __future__ import annotations
 
@@ -60,9 +60,7 @@ class Disturbance:
             f64 [7 * arms].
         """
         arms = clean.reshape(-1, POSE_DIM).copy()
-        self._noise = _MEMORY * self._noise + np.sqrt(1 - _MEMORY**2) * self._rng.standard_normal(
-            self._noise.shape
-        )
+        self._noise = next_noise(self._noise, self._rng)
         calm = np.clip(np.linalg.norm(arms[:, :3] - present, axis=-1, keepdims=True) / _CALM, 0.25, 1.0)
         if self._pausing():
             arms[:, :3] = present
@@ -113,3 +111,8 @@ class Disturbance:
         if self._missed_steps >= _CLOSING_STEPS:
             command[:3] = present + _MISS_RISE * np.array([*self._miss_drift, 1.0])
         self._missed_steps += 1
+
+
+def next_noise(noise: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw the standard normal noise of the next step, correlated with that of this one; of the same shape."""
+    return _MEMORY * noise + np.sqrt(1 - _MEMORY**2) * rng.standard_normal(noise.shape)

@@ -19,11 +19,12 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import pack, visual_scores
+from torchrl_sparse.networks.vla.hooks import LayerState
 from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 
 __all__ = ["SHAPES", "VLACase", "make_policy"]

@@ -38,8 +38,10 @@ from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant
 from torchrl_sparse.evaluation.latency.measure import Latency
+from torchrl_sparse.evaluation.results.tables import markdown_table, select_columns
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "format_engine_table",
@@ -51,6 +53,7 @@ __all__ = [
     "shape_results",
 ]
 
+_COLUMNS = ("variant", "p50, ms", "p10 – p90", "× eager", "× own dense", "max error")
 _COLORS = {"eager": "#999999", "reference": "#333333", "torch": "#E69F00", "native": "#0072B2"}
 
 
@@ -167,25 +170,41 @@ def save_engine_results(results: Mapping[str, Any], path: str | os.PathLike) -> 
         temporary.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
 
 
+def load_engine_results(path: str | os.PathLike) -> dict[str, Any]:
+    """Read an ``engine.json``."""
+    return read_json(path, dict[str, Any])
+
+
 def format_engine_table(name: str, shape: Mapping[str, Any]) -> str:
     """The rows of one shape as a table in Markdown."""
-    lines = [
+    head = (
         f"{name}: batch {shape['batch']}, threads {shape['threads']}, "
         f"weights read at {shape['bandwidth_gb_per_s']:.1f} GB/s, "
         f"products of {shape['f32_gflops_per_s']:.0f} GFLOP/s, "
-        f"program built in {1e3 * shape['program_build_s']:.2f} ms",
-        "",
-        "| variant | p50 (ms) | p10 – p90 | × eager | × own dense | max error |",
-        "|---|---|---|---|---|---|",
-    ]
-    for variant, row in shape["rows"].items():
-        spread = f"{1e3 * row['p10_s']:.1f} – {1e3 * row['p90_s']:.1f}"
-        lines.append(
-            f"| {variant} | {1e3 * row['p50_s']:.1f} | {spread} | {row['x_eager']:.1f} | {row['x_dense']:.1f} "
-            f"| {row['max_err']:.1e} |"
-        )
+        f"program built in {1e3 * shape['program_build_s']:.2f} ms"
+    )
+    table = markdown_table(select_columns(engine_rows(shape), _COLUMNS))
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape["all_pruned_step_s"].items()]
-    return "\n".join([*lines, "", f"A step that computes nothing takes {', '.join(steps)}."])
+    return "\n\n".join([head, table, f"A step that computes nothing takes {', '.join(steps)}."])
+
+
+def engine_rows(shape: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return one row of text per variant, also with what its memory and its arithmetic take alone."""
+    return [_engine_row(variant, row) for variant, row in shape["rows"].items()]
+
+
+def _engine_row(variant: str, row: Mapping[str, Any]) -> dict[str, str]:
+    arithmetic = row["f32_limit_s"]
+    return {
+        "variant": variant,
+        "p50, ms": f"{1e3 * row['p50_s']:.1f}",
+        "p10 – p90": f"{1e3 * row['p10_s']:.1f} – {1e3 * row['p90_s']:.1f}",
+        "× eager": f"{row['x_eager']:.1f}",
+        "× own dense": f"{row['x_dense']:.1f}",
+        "max error": f"{row['max_err']:.1e}",
+        "memory alone, ms": f"{1e3 * row['limit_s']:.1f}",
+        "f32 arithmetic alone, ms": "" if arithmetic is None else f"{1e3 * arithmetic:.1f}",
+    }
 
 
 def plot_engine_times(

@@ -178,7 +178,7 @@ def realtime_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def format_realtime(results: Mapping[str, Any]) -> str:
     """The table as markdown that also lines up in a terminal, and what it says."""
-    table = markdown_table(realtime_rows(results), left=("method", "latency"))
+    table = markdown_table(realtime_rows(results))
     return f"{table}\n\n{realtime_note(results)}"
 
 

@@ -152,7 +152,7 @@ def format_table(results: Mapping[str, Any]) -> str:
         ValueError: if ``results`` is not of the schema.
     """
     validate_results(results)
-    table = markdown_table(results_rows(results), left=("method", "verdict"))
+    table = markdown_table(results_rows(results))
     return f"{table}\n\n{results_note(results)}"
 
 
@@ -187,7 +187,7 @@ def format_pairs(
     pairs: Sequence[Sequence[str]],
     margin: float = DEFAULT_MARGIN,
 ) -> str:
-    """A table of differences in success between methods of which none need be dense, paired by seed.
+    """Return a table of differences in success between methods of which none need be dense, paired by seed.
 
     Args:
         episodes: method -> its episodes.
@@ -199,12 +199,18 @@ def format_pairs(
 
     >>> once = [EpisodeResult(0, True, 8, 1, 1.0, 0.0)]
     >>> print(format_pairs({"a": once, "b": once}, [("a", "b")]))
-    | method | against | success |  difference, points | verdict   |
-    |:-------|:--------|--------:|--------------------:|:----------|
-    | a      | b       |   1 : 1 | +0.0 [-79.3, +79.3] | undecided |
+    | method   | against   |   success |   difference, points | verdict   |
+    |:---------|:----------|----------:|---------------------:|:----------|
+    | a        | b         |     1 : 1 |  +0.0 [-79.3, +79.3] | undecided |
     """
-    rows = [_pair_row(episodes, pair, margin) for pair in pairs]
-    return markdown_table(rows, left=("method", "against", "verdict"))
+    return markdown_table(pair_rows(episodes, pairs, margin))
+
+
+def pair_rows(
+    episodes: Mapping[str, Sequence[EpisodeResult]], pairs: Sequence[Sequence[str]], margin: float
+) -> list[dict[str, str]]:
+    """Return the rows of `format_pairs`: column -> text."""
+    return [_pair_row(episodes, pair, margin) for pair in pairs]
 
 
 def _pair_row(
@@ -262,6 +268,15 @@ def _planning(methods: Mapping[str, Any]) -> Iterator[str]:
             seconds = method["planning_s"]["p50"]
             share = 100 * seconds / method["latency_s"]["p50"]
             yield f"{_milliseconds(seconds)} ms ({share:.1f} %) under {name}"
+
+
+def format_percent(k: int, n: int, rate: float, ci95: Sequence[float]) -> str:
+    """Return a success rate with its interval, in percent.
+
+    >>> format_percent(399, 400, 0.9975, (0.986, 0.9996))
+    '99.8 [99, 100]'
+    """
+    return f"{100 * rate:.1f} {_percent_range(ci95).removesuffix(' %')}"
 
 
 def _percent_range(interval: Sequence[float]) -> str:

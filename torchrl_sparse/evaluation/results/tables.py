@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
-__all__ = ["markdown_table"]
+from tabulate import tabulate
+
+__all__ = ["LEFT", "markdown_table", "select_columns"]
+
+LEFT = frozenset({"task", "method", "against", "verdict", "latency", "variant", "part of a dense query"})
+"""Columns of words, which are aligned to the left; those of numbers are aligned to the right."""
 
 
-def markdown_table(rows: Sequence[Mapping[str, str]], left: Collection[str]) -> str:
-    """Markdown that also lines up in a terminal.
+def markdown_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Return a table in Markdown that also lines up in a terminal.
 
     Args:
         rows: column -> text, at least one; the first says which columns there are.
-        left: columns that are aligned to the left, all others to the right.
 
-    >>> print(markdown_table([{"method": "dense", "p50": "128"}, {"method": "bac", "p50": "23"}], left=["method"]))
-    | method | p50 |
-    |:-------|----:|
-    | dense  | 128 |
-    | bac    |  23 |
+    >>> print(markdown_table([{"method": "dense", "p50": "128"}, {"method": "bac", "p50": "23"}]))
+    | method   |   p50 |
+    |:---------|------:|
+    | dense    |   128 |
+    | bac      |    23 |
     """
     columns = list(rows[0])
-    widths = {column: max(len(column), *(len(row[column]) for row in rows)) for column in columns}
+    aligned = ["left" if column in LEFT else "right" for column in columns]
+    cells = [[row[column] for column in columns] for row in rows]
+    return tabulate(cells, columns, tablefmt="pipe", colalign=aligned, disable_numparse=True)
 
-    def line(row: Mapping[str, str]) -> str:
-        cells = (
-            row[column].ljust(widths[column]) if column in left else row[column].rjust(widths[column])
-            for column in columns
-        )
-        return f"| {' | '.join(cells)} |"
 
-    rules = (f":{'-' * (widths[c] + 1)}" if c in left else f"{'-' * (widths[c] + 1)}:" for c in columns)
-    head = [line({column: column for column in columns}), f"|{'|'.join(rules)}|"]
-    return "\n".join([*head, *map(line, rows)])
+def select_columns(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> list[dict[str, str]]:
+    """Return the rows with these columns alone, in this order.
+
+    Raises:
+        ValueError: if a row lacks one of them.
+
+    >>> select_columns([{"method": "dense", "p50": "128"}], ["p50"])
+    [{'p50': '128'}]
+    """
+    for row in rows:
+        if missing := [column for column in columns if column not in row]:
+            raise ValueError(f"columns: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
+    return [{column: row[column] for column in columns} for row in rows]

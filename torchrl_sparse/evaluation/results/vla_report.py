@@ -32,6 +32,7 @@ from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json
 
 __all__ = ["format_vla_table", "measure_vla", "plot_vla_times", "save_vla_results"]
 
@@ -123,6 +124,11 @@ def save_vla_results(results: Mapping[str, Any], path: str | os.PathLike) -> Non
         temporary.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
 
 
+def load_vla_results(path: str | os.PathLike) -> dict[str, Any]:
+    """Read a ``vla_latency.json``."""
+    return read_json(path, dict[str, Any])
+
+
 def format_vla_table(results: Mapping[str, Any]) -> str:
     """The parts of a dense query and the methods, as two tables in Markdown."""
     shape, machine = results["shape"], results["machine"]
@@ -130,7 +136,13 @@ def format_vla_table(results: Mapping[str, Any]) -> str:
         f"{shape['name']}: {shape['parameters']:,} parameters, {shape['dtype']}, {shape['tokens']} tokens, "
         f"{shape['visual_tokens']} of them visual; {machine['device']}, {machine['cpu']}, threads {machine['threads']}"
     )
-    parts = [
+    tables = markdown_table(vla_part_rows(results)), markdown_table(vla_method_rows(results))
+    return "\n\n".join([about, *tables])
+
+
+def vla_part_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the rows of the table of parts: column -> text."""
+    return [
         {
             "part of a dense query": name,
             "p50, ms": f"{1e3 * row['p50_s']:.2f}",
@@ -138,9 +150,11 @@ def format_vla_table(results: Mapping[str, Any]) -> str:
         }
         for name, row in results["parts"].items()
     ]
-    methods = [_method_row(name, row) for name, row in results["methods"].items()]
-    tables = markdown_table(parts, left=("part of a dense query",)), markdown_table(methods, left=("method",))
-    return "\n\n".join([about, *tables])
+
+
+def vla_method_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the rows of the table of methods: column -> text."""
+    return [_method_row(name, row) for name, row in results["methods"].items()]
 
 
 def _method_row(name: str, row: Mapping[str, Any]) -> dict[str, str]:

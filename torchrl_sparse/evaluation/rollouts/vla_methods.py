@@ -15,7 +15,6 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens import (
@@ -27,6 +26,7 @@ from torchrl_sparse.tokens import (
     SpecPrune,
     VLACachePruner,
 )
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import replay
 
 __all__ = ["TokenMethod", "matching_share", "mid_episode_query", "seen_images"]

@@ -1,6 +1,6 @@
-"""The scheduler as five numbers for each denoising step, for loops without a scheduler.
+"""A sampler as six numbers for each denoising step, so that a loop needs no scheduler.
 
-With ``clip`` to [-1, 1], both samplers are one update, in diffusers' order of operations::
+With ``clip`` to [-1, 1], DDPM and DDIM are one update, in diffusers' order of operations::
 
     clean = clip((sample - noise_scale * eps) / signal_scale)
     next  = clean_weight * clean + sample_weight * sample + eps_weight * eps + spread * gaussian
@@ -11,14 +11,12 @@ DDPM (arXiv:2006.11239, Eq. 7) has ``eps_weight = 0``; DDIM (arXiv:2010.02502, E
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 __all__ = ["StepCoefficients", "step_coefficients"]
 
@@ -32,7 +30,7 @@ class StepCoefficients:
         signal_scale: sqrt(abar_t).
         clean_weight, sample_weight, eps_weight: of the clipped prediction, of the sample, of the predicted
             noise.
-        spread: standard deviation of the noise that is added; 0 in the last step.
+        spread: standard deviation of the noise that is added; 0 where none is.
         clip: largest absolute value of a clean action.
     """
 
@@ -44,46 +42,67 @@ class StepCoefficients:
     spread: Tensor
     clip: float
 
+    def reads_noise(self, step: int) -> bool:
+        """Return whether denoising step ``step`` adds noise."""
+        return bool(self.spread[step] > 0)
+
     def update(self, step: int, sample: Tensor, eps: Tensor, gaussian: Tensor | None) -> Tensor:
-        """The sample after denoising step ``step``, to the last bit that of ``Sampler.step``.
+        """Return the sample after denoising step ``step``.
 
         Args:
             step: in execution order.
             sample, eps: of one shape.
-            gaussian: of the same shape; not read by DDIM, None in the last step.
+            gaussian: standard normal of the same shape; None where :meth:`reads_noise` is False.
         """
         clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
         clean = clean.clamp(-self.clip, self.clip)
         result = self.clean_weight[step] * clean + self.sample_weight[step] * sample
         result = result + self.eps_weight[step] * eps
-        return result if gaussian is None else result + self.spread[step] * gaussian
+        return result + self.spread[step] * gaussian if self.reads_noise(step) else result
 
-    def columns(self) -> tuple[list[float], ...]:
-        """The first five fields as Python floats, which hold their float32 values exactly."""
-        fields = (self.noise_scale, self.signal_scale, self.clean_weight, self.sample_weight, self.eps_weight)
-        return tuple(field.tolist() for field in fields)
+    def table(self) -> Tensor:
+        """Return the six coefficients of every step, f32 [K, 6], in the order of the fields."""
+        return torch.stack(
+            [
+                self.noise_scale,
+                self.signal_scale,
+                self.clean_weight,
+                self.sample_weight,
+                self.eps_weight,
+                self.spread,
+            ],
+            dim=1,
+        )
 
 
-def step_coefficients(sampler: Sampler) -> StepCoefficients:
-    """Tabulate ``sampler``.
+def step_coefficients(
+    kind: Literal["ddpm", "ddim"],
+    alphas_cumprod: Tensor,
+    timesteps: Sequence[int],
+    previous_timesteps: Sequence[int],
+    *,
+    clip: float = 1.0,
+) -> StepCoefficients:
+    """Tabulate the steps of a sampler.
+
+    Args:
+        kind: of the sampler.
+        alphas_cumprod: abar of every diffusion timestep, f32 [T].
+        timesteps: of each denoising step, K of them.
+        previous_timesteps: the timestep that each of them leads to; -1 is the clean sample.
+        clip: largest absolute value of a clean action.
 
     Examples:
-        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
-        >>> coefficients = step_coefficients(Sampler("ddim", 10))
+        >>> coefficients = step_coefficients("ddim", torch.tensor([0.9, 0.5]), [1, 0], [0, -1])
         >>> coefficients.clean_weight[-1].item(), coefficients.eps_weight[-1].item()
         (1.0, 0.0)
     """
-    scheduler = sampler.scheduler
-    timesteps = sampler.timesteps.tolist()
-    one = torch.tensor(1.0)
-    # DDIM ends on diffusers' final_alpha_cumprod, which Sampler sets to one, as DDPM does.
-    alpha_prod = scheduler.alphas_cumprod[timesteps]
-    alpha_prod_prev = torch.stack(
-        [scheduler.alphas_cumprod[t] if t >= 0 else one for t in sampler.previous_timesteps]
-    )
+    alpha_prod = alphas_cumprod[list(timesteps)]
+    # The clean sample, which a sampler ends on, has abar = 1.
+    alpha_prod_prev = torch.cat([alphas_cumprod, torch.ones(1)])[list(previous_timesteps)]
     beta_prod, beta_prod_prev = 1 - alpha_prod, 1 - alpha_prod_prev
     zeros = torch.zeros(len(timesteps))
-    if sampler.kind == "ddim":
+    if kind == "ddim":
         weights = alpha_prod_prev**0.5, zeros, beta_prod_prev**0.5, zeros
     else:
         alpha = alpha_prod / alpha_prod_prev
@@ -96,6 +115,4 @@ def step_coefficients(sampler: Sampler) -> StepCoefficients:
             zeros,
             spread,
         )
-    return StepCoefficients(
-        beta_prod**0.5, alpha_prod**0.5, *weights, clip=scheduler.config.clip_sample_range
-    )
+    return StepCoefficients(beta_prod**0.5, alpha_prod**0.5, *weights, clip=clip)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
-    """i64, non-negative: one seed for each step of each episode, the same in every process and batch.
+    """Return one seed, i64 and non-negative, for each step of each episode, the same in every process and batch.
 
     A SplitMix64 round spreads neighbouring inputs over all 64 bits (Steele et al., OOPSLA 2014).
 
@@ -21,7 +21,7 @@ def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
 
 
 def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
-    """f32 [B, num_steps, H, A] standard normal, row i from ``seed[i]`` alone.
+    """Draw the noise of B queries, f32 [B, num_steps, H, A], row i from ``seed[i]`` alone.
 
     Entry 0 is the initial sample, whatever ``num_steps``: a ten-step and a hundred-step sampler start from the same point.
 
@@ -39,10 +39,10 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
 
 
 def _signed(unsigned: int) -> int:
-    """The int64 with the same bits: torch has no unsigned arithmetic."""
+    """Return the int64 with the same bits: torch has no unsigned arithmetic."""
     return unsigned - 2**64 if unsigned >= 2**63 else unsigned
 
 
 def _shift(value: Tensor, bits: int) -> Tensor:
-    """Logical right shift; torch's own is arithmetic."""
+    """Shift to the right logically; torch's own is arithmetic."""
     return (value >> bits) & ((1 << (64 - bits)) - 1)

@@ -1,4 +1,4 @@
-"""Denoising schedules: diffusers' DDPM and DDIM schedulers with every noise tensor handed in from outside.
+"""Samplers: diffusers' DDPM and DDIM with every noise tensor handed in from outside.
 
 Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta
 schedule (arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0)
@@ -19,14 +19,16 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
+from torchrl_sparse.networks.diffusion.coefficients import StepCoefficients, step_coefficients
+
 __all__ = ["Sampler", "split_sampler", "timesteps_fall"]
 
 
 class Sampler:
     """The denoising steps of one query, in execution order, and the noising of training.
 
-    Scheduler steps of diffusers draw their own noise; here the caller passes it, so that two methods can
-    share all noise of a query. The arithmetic is the scheduler's own.
+    The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
+    noise of a query. Results equal theirs to the last bit.
 
     Args:
         kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
@@ -38,6 +40,7 @@ class Sampler:
     Attributes:
         timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
         previous_timesteps: the timestep that each of them leads to; -1, the clean sample, in the end.
+        coefficients: the update of each denoising step in numbers, for loops without a sampler.
         scheduler: the diffusers scheduler.
 
     Raises:
@@ -91,12 +94,19 @@ class Sampler:
             self.scheduler.timesteps.clone() if timesteps is None else torch.tensor(self._chosen)
         )
         self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
+        self.coefficients: StepCoefficients = step_coefficients(
+            kind,
+            self.scheduler.alphas_cumprod,
+            self.timesteps.tolist(),
+            self.previous_timesteps,
+            clip=self.scheduler.config.clip_sample_range,
+        )
 
     @classmethod
     def from_name(
         cls, name: str, num_inference_steps: int | None = None, num_train_timesteps: int = 100
     ) -> Sampler:
-        """The sampler of that `name`; without ``num_inference_steps`` that of the constructor without it.
+        """Make the sampler of that `name`; without ``num_inference_steps`` that of the constructor without it.
 
         Raises:
             ValueError: if no sampler is called that, or not with so many steps.
@@ -120,7 +130,7 @@ class Sampler:
         return config if self._chosen is None else config | {"timesteps": self._chosen}
 
     def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
-        """The sample after denoising step ``k``.
+        """Return the sample after denoising step ``k``.
 
         Args:
             eps: predicted noise [B, H, A].
@@ -135,18 +145,12 @@ class Sampler:
         """
         if not 0 <= k < self.num_inference_steps:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
-        timestep = int(self.timesteps[k])
-        if self.kind == "ddim":
-            return _ddim_step(self.scheduler, eps, timestep, self.previous_timesteps[k], sample)
-        if timestep == 0:
-            # diffusers adds no noise at timestep 0, so the step is a pure function of its inputs.
-            return self.scheduler.step(eps, timestep, sample).prev_sample
-        if noise_k is None:
-            raise ValueError(f"DDPM step k={k} (timestep {timestep}) needs noise_k, got None")
-        return _ddpm_step(self.scheduler, eps, timestep, sample, noise_k)
+        if noise_k is None and self.coefficients.reads_noise(k):
+            raise ValueError(f"DDPM step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None")
+        return self.coefficients.update(k, sample, eps, noise_k)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
+        """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
 
         Args:
             clean: normalised actions [B, H, A].
@@ -171,7 +175,7 @@ class Sampler:
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
-    """Whether a sampler may take them in this order: each below the last, from under ``num_train_timesteps`` to at least 0.
+    """Return whether each timestep is below the last, from under ``num_train_timesteps`` down to at least 0.
 
     >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
     (True, False, False)
@@ -180,7 +184,7 @@ def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
 
 
 def split_sampler(name: str) -> tuple[str, list[int] | None]:
-    """Kind and chosen timesteps of a `Sampler.name`.
+    """Return the kind and the chosen timesteps of a `Sampler.name`.
 
     Raises:
         ValueError: if it is none.
@@ -193,38 +197,3 @@ def split_sampler(name: str) -> tuple[str, list[int] | None]:
     if match is None:
         raise ValueError(f"sampler: expected 'ddpm', 'ddim' or 'ddim_<t>_<t>...', got {name!r}")
     return match[1], [int(digits) for digits in match[2].split("_")[1:]] or None
-
-
-def _ddim_step(scheduler: DDIMScheduler, eps: Tensor, timestep: int, previous: int, sample: Tensor) -> Tensor:
-    """``DDIMScheduler.step`` (arXiv:2010.02502, Eq. 12, eta = 0) to any earlier timestep.
-
-    diffusers steps by a fixed stride; its expressions are repeated in their order, so that at that stride results are
-    equal to the last bit.
-    """
-    alpha_prod = scheduler.alphas_cumprod[timestep]
-    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.final_alpha_cumprod
-    clean = (sample - (1 - alpha_prod) ** (0.5) * eps) / alpha_prod ** (0.5)
-    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
-    return alpha_prod_prev ** (0.5) * clean + (1 - alpha_prod_prev) ** (0.5) * eps
-
-
-def _ddpm_step(scheduler: DDPMScheduler, eps: Tensor, timestep: int, sample: Tensor, noise: Tensor) -> Tensor:
-    """``DDPMScheduler.step`` (arXiv:2006.11239, Eq. 7) with the variance noise handed in.
-
-    diffusers draws the noise inside its step and offers no way to pass it; its expressions are repeated in
-    their order, so that results are equal to the last bit.
-    """
-    previous = scheduler.previous_timestep(timestep)
-    alpha_prod = scheduler.alphas_cumprod[timestep]
-    alpha_prod_prev = scheduler.alphas_cumprod[previous] if previous >= 0 else scheduler.one
-    beta_prod = 1 - alpha_prod
-    beta_prod_prev = 1 - alpha_prod_prev
-    alpha = alpha_prod / alpha_prod_prev
-    beta = 1 - alpha
-
-    clean = (sample - beta_prod ** (0.5) * eps) / alpha_prod ** (0.5)
-    clean = clean.clamp(-scheduler.config.clip_sample_range, scheduler.config.clip_sample_range)
-    clean_coeff = (alpha_prod_prev ** (0.5) * beta) / beta_prod
-    sample_coeff = alpha ** (0.5) * beta_prod_prev / beta_prod
-    mean = clean_coeff * clean + sample_coeff * sample
-    return mean + (scheduler._get_variance(timestep) ** 0.5) * noise

@@ -1,4 +1,4 @@
-"""The OpenVLA-OFT architecture at any size, and the interface of what prunes its tokens."""
+"""The OpenVLA-OFT architecture at any size, and the hooks around its decoder's layers."""
 
 import lazy_loader as lazy
 

@@ -10,7 +10,7 @@ from typing import Any
 from tensordict import NestedKey
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import VisualSpec
+from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["TransformerSize", "VLAConfig"]
 
@@ -111,14 +111,14 @@ class VLAConfig:
 
     @classmethod
     def tiny(cls, **changes: Any) -> VLAConfig:
-        """For tests: runs in milliseconds. ``changes`` are other attributes."""
+        """Return sizes for tests, which run in milliseconds; ``changes`` are other attributes."""
         tower = TransformerSize(16, 2, 2, 32)
         sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(32, 4, 2, 64), "vocab_size": 320}
         return cls(**{**sizes, "image_size": 28, "chunk_size": 2, **changes})
 
     @classmethod
     def small(cls, **changes: Any) -> VLAConfig:
-        """About 3 million parameters, 2 x 36 visual tokens: trainable on a CPU core. ``changes`` are other attributes."""
+        """Return sizes that a CPU core trains: 3 million parameters, 2 x 36 visual tokens; ``changes`` are other attributes."""
         tower = TransformerSize(96, 4, 4, 384)
         sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(128, 8, 4, 384), "vocab_size": 512}
         return cls(**{**sizes, "image_size": 84, **changes})
@@ -140,18 +140,18 @@ class VLAConfig:
 
     @property
     def visual_spec(self) -> VisualSpec:
-        """What a token pruner has to know."""
+        """The sizes that decide which visual tokens there are."""
         return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return all fields as JSON values, which `from_dict` reads."""
         fields = dataclasses.asdict(self)
         fields["cameras"] = [list(key) if isinstance(key, tuple) else key for key in self.cameras]
         return fields
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> VLAConfig:
-        """What `to_dict` gave, all of it.
+        """Return the sizes whose `to_dict` gave ``fields``, all of them.
 
         Raises:
             ValueError: if a field is missing, unknown or wrong.

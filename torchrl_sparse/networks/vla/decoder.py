@@ -1,8 +1,8 @@
 """A Llama decoder with bidirectional attention, whose visual tokens may be dropped before and between its layers.
 
 OpenVLA-OFT (arXiv:2502.19645) predicts all actions in one pass and therefore attends to every token in both directions. Stock
-Llama attends causally; here nothing is masked but padding. Attention is always PyTorch's fused kernel; where a pruner asks for
-scores, the few rows it names are multiplied with the keys once more beside it.
+Llama attends causally; here nothing is masked but padding. Attention is always PyTorch's fused kernel; where `LayerHooks` ask
+for scores, the few rows they name are multiplied with the keys once more beside it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchrl_sparse.networks.vla.backbones import (
     apply_rotary_pos_emb,
 )
 from torchrl_sparse.networks.vla.config import VLAConfig
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenPruner
+from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState
 
 __all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
 
@@ -30,7 +30,7 @@ _PER_TOKEN = ("hidden", "positions", "kind", "task")
 
 @dataclass
 class Decoded:
-    """What the decoder made of a sequence.
+    """The decoder's output, and on how many tokens its layers ran.
 
     Attributes:
         hidden: [B, S, d] after the final norm; a row's alive tokens are its first ones.
@@ -38,7 +38,7 @@ class Decoded:
         tokens: i64 [B, L], tokens on which each layer ran; 0 where it was skipped.
         depth: i64 [B, N], layers that ran on each visual token.
         scored: i64 [B], query-key pairs of all scores, rows times tokens.
-        visual: [B, N, d], the visual tokens that the decoder was given; None where no network says so.
+        visual: [B, N, d], the visual tokens that the decoder was given; None where the network does not add them.
     """
 
     hidden: Tensor
@@ -68,13 +68,18 @@ class BidirectionalLlama(nn.Module):
         self._head_dim = config.llm.dim // config.llm.heads
 
     def embed(self, ids: Tensor) -> Tensor:
-        """[..., d] of token ids i64 [...]."""
+        """Return the embeddings [..., d] of token ids i64 [...]."""
         return self.llama.embed_tokens(ids)
 
-    def forward(self, state: LayerState, pruner: TokenPruner) -> Decoded:
-        """Runs all layers on ``state.hidden``; what ``state.alive`` leaves out takes no part."""
-        layers = self.llama.layers
-        scored_layers, skipped = pruner.layers_scored(len(layers)), pruner.layers_skipped(len(layers))
+    def forward(self, state: LayerState, hooks: LayerHooks | None = None) -> Decoded:
+        """Run all layers on ``state.hidden``; what ``state.alive`` leaves out takes no part.
+
+        Args:
+            state: the whole sequence.
+            hooks: called around each layer; None is dense.
+        """
+        layers, hooks = self.llama.layers, LayerHooks() if hooks is None else hooks
+        scored_layers, skipped = hooks.layers_scored(len(layers)), hooks.layers_skipped(len(layers))
         state, mask = pack(state, state.alive)
         rotary, lengths, seen = self._rotary(state), state.alive.sum(1), state.visual_alive
         tokens, depth, scored = [], [], torch.zeros_like(lengths)
@@ -85,12 +90,12 @@ class BidirectionalLlama(nn.Module):
             tokens.append(lengths)
             depth.append(seen)
             state = replace(state, layer=index, scores=None, attention=None)
-            rows = pruner.score_rows(state) if index in scored_layers else None
+            rows = hooks.score_rows(state) if index in scored_layers else None
             state.hidden, query, key = _run_layer(layer, state.hidden, rotary, mask, self._head_dim)
             if rows is not None:
                 state.attention, state.scores = visual_scores(state, query, key, rows)
                 scored = scored + rows.sum(1) * lengths
-            keep = pruner.after_layer(index, state)
+            keep = hooks.after_layer(index, state)
             if keep is not None:
                 state, mask = pack(state, state.alive & (keep | ~state.is_visual))
                 rotary, lengths, seen = self._rotary(state), state.alive.sum(1), state.visual_alive
@@ -98,7 +103,7 @@ class BidirectionalLlama(nn.Module):
         return Decoded(self.llama.norm(state.hidden), lengths, torch.stack(tokens, 1), depth, scored)
 
     def _rotary(self, state: LayerState) -> tuple[Tensor, Tensor]:
-        """Cosine and sine, [B, S, head_dim] each, of the original positions (arXiv:2104.09864), computed in f32."""
+        """Return cosine and sine, [B, S, head_dim] each, of the original positions (arXiv:2104.09864), computed in f32."""
         exponent = torch.arange(0, self._head_dim, 2, device=state.hidden.device, dtype=torch.float32)
         angle = state.positions[..., None].float() * _ROPE_BASE ** (-exponent / self._head_dim)
         angle = torch.cat([angle, angle], dim=-1)
@@ -106,7 +111,7 @@ class BidirectionalLlama(nn.Module):
 
 
 def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
-    """Gathers the ``alive`` tokens, bool [B, S], to the front of each row, in order, and cuts off what no row needs.
+    """Gather the ``alive`` tokens, bool [B, S], at the front of each row, in order, and cut off what no row needs.
 
     Returns:
         The shorter sequence, and what its attention may see: bool [B, 1, 1, S'], or None for everything. A sequence that is
@@ -127,7 +132,7 @@ def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
 
 
 def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Tensor:
-    """Attention of some rows to all tokens, mean over heads: f32 [B, R, S], R the most rows that a sample has.
+    """Return the attention of some rows to all tokens, mean over heads: f32 [B, R, S], R the most rows that a sample has.
 
     Args:
         query, key: [B, heads, S, head_dim].
@@ -152,7 +157,12 @@ def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Te
 
 @torch.no_grad()
 def visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """``attention`` [B, R, N] and ``scores`` [B, N] of `LayerState`."""
+    """Return ``attention`` [B, R, N] and ``scores`` [B, N] of `LayerState`: Eq. 1 of SpecPrune-VLA (arXiv:2509.05614).
+
+    Args:
+        query, key: [B, heads, S, head_dim].
+        rows: bool [B, S], the tokens whose attention it is.
+    """
     rows = rows & state.alive
     weights = row_attention(query, key, rows, state.alive)
     ids = torch.where(state.is_visual, state.visual_ids, state.num_visual)
@@ -168,7 +178,7 @@ def _run_layer(
     mask: Tensor | None,
     head_dim: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The layer's output, and its queries and keys, [B, heads, S, head_dim]."""
+    """Run one layer; return its output, and its queries and keys, [B, heads, S, head_dim]."""
     attention = layer.self_attn
     normed = layer.input_layernorm(hidden)
     query, key, value = (

@@ -20,7 +20,7 @@ __all__ = ["decoder_flops", "fixed_flops", "query_flops", "score_flops"]
 
 
 def decoder_flops(config: VLAConfig, tokens: Tensor) -> Tensor:
-    """FLOPs [...] of the decoder, f64.
+    """Return the FLOPs [...] of the decoder, f64.
 
     Args:
         config: sizes.
@@ -37,12 +37,12 @@ def decoder_flops(config: VLAConfig, tokens: Tensor) -> Tensor:
 
 
 def score_flops(config: VLAConfig, pairs: Tensor) -> Tensor:
-    """FLOPs of scoring: ``pairs`` is the number of (row, token) pairs over all scored layers."""
+    """Return the FLOPs of scoring ``pairs`` (row, token) pairs, counted over all scored layers."""
     return 2.0 * config.llm.dim * pairs.double()
 
 
 def fixed_flops(config: VLAConfig) -> dict[str, float]:
-    """FLOPs of everything whose work no token pruning changes, by component.
+    """Return the FLOPs of everything whose work no token pruning changes, by component.
 
     Examples:
         >>> {name: round(value / 1e12, 3) for name, value in fixed_flops(VLAConfig()).items()}
@@ -62,7 +62,7 @@ def fixed_flops(config: VLAConfig) -> dict[str, float]:
 
 
 def query_flops(config: VLAConfig, tokens: Tensor, scored: Tensor) -> Tensor:
-    """FLOPs f32 [B] of whole queries, the scores of a pruner included.
+    """Return the FLOPs f32 [B] of whole queries, the scores that hooks ask for included.
 
     Args:
         config: sizes.

@@ -1,4 +1,4 @@
-"""What OpenVLA-OFT adds to OpenVLA (arXiv:2502.19645): a proprioception token and an L1 regression head for action chunks."""
+"""The additions of OpenVLA-OFT to OpenVLA (arXiv:2502.19645): a proprioception token and an L1 regression head for chunks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["L1ActionHead", "ProprioProjector"]
 
 
 class ProprioProjector(nn.Module):
-    """The normalised state as one token of the decoder."""
+    """Projects the normalised state to one token of the decoder."""
 
     def __init__(self, config: VLAConfig):
         super().__init__()
@@ -19,12 +19,12 @@ class ProprioProjector(nn.Module):
         self.fc2 = nn.Linear(config.llm.dim, config.llm.dim)
 
     def forward(self, state: Tensor) -> Tensor:
-        """[B, llm.dim] of [B, state_dim]."""
+        """Project states [B, state_dim] to [B, llm.dim]."""
         return self.fc2(functional.gelu(self.fc1(state)))
 
 
 class L1ActionHead(nn.Module):
-    """The decoder's read-outs as normalised actions: one residual network for each action of the chunk.
+    """Regresses normalised actions from the decoder's read-outs, with one residual network for all actions of the chunk.
 
     The A read-outs of an action are concatenated.
     """
@@ -42,7 +42,7 @@ class L1ActionHead(nn.Module):
         self.fc2 = nn.Linear(width, config.action_dim)
 
     def forward(self, readout: Tensor) -> Tensor:
-        """Actions [B, H, A] of read-outs [B, H * A, llm.dim]."""
+        """Return the actions [B, H, A] of read-outs [B, H * A, llm.dim]."""
         x = readout.reshape(len(readout), self.chunk_size, -1)
         x = functional.relu(self.fc1(self.layer_norm1(x)))
         for block in self.blocks:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, Decoded
 from torchrl_sparse.networks.vla.heads import L1ActionHead, ProprioProjector
-from torchrl_sparse.networks.vla.pruning import LayerState, TokenKind, TokenPruner
+from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
 from torchrl_sparse.networks.vla.text import BOS_ID, STOP_ID, Prompts
 from torchrl_sparse.networks.vla.vision import FusedProjector, VisionTowers
 
@@ -57,33 +57,33 @@ class VLANetwork(nn.Module):
         prompts: Prompts,
         *,
         keep_mask: Tensor | None = None,
-        pruner: TokenPruner | None = None,
+        hooks: LayerHooks | None = None,
         td: TensorDictBase | None = None,
     ) -> tuple[Tensor, Decoded]:
-        """Actions [B, H, A], f32, and what the decoder did.
+        """Return actions [B, H, A], f32, and the decoder's output.
 
         Args:
             images: u8 [B, cameras, 3, h, w], cropped where the model was trained so.
             state: f32 [B, state_dim], normalised.
             prompts: tokenised prompts of the B samples.
             keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
-            pruner: drops visual tokens between the layers; nothing by default.
-            td: the query that ``pruner`` sees, [B].
+            hooks: called around each layer of the decoder; None is dense.
+            td: the query that ``hooks`` are shown, [B].
         """
         td = TensorDict({}, [len(images)], device=images.device) if td is None else td
         visual = self.visual_tokens(images)
         sequence = self._sequence(visual, state, prompts, keep_mask, td)
-        decoded = replace(self.decoder(sequence, TokenPruner() if pruner is None else pruner), visual=visual)
+        decoded = replace(self.decoder(sequence, hooks), visual=visual)
         return self.head(self.readout(decoded)).float(), decoded
 
     def visual_tokens(self, images: Tensor) -> Tensor:
-        """[B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
+        """Return the visual tokens [B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
         return self.projector(self.vision(images.flatten(0, 1))).unflatten(0, images.shape[:2]).flatten(1, 2)
 
     def _sequence(
         self, visual: Tensor, state: Tensor, prompts: Prompts, keep_mask: Tensor | None, td: TensorDictBase
     ) -> LayerState:
-        """The decoder's input; tokens that are pruned already or pad a prompt are in it, but not alive."""
+        """Lay out the decoder's input; tokens that are pruned already or pad a prompt are in it, but not alive."""
         batch, num_visual, width = visual.shape
         slots, text, device = self.config.num_slots, prompts.mask, visual.device
         ends = self.decoder.embed(torch.tensor([BOS_ID, STOP_ID], device=device)).expand(batch, 2, width)
@@ -106,7 +106,7 @@ class VLANetwork(nn.Module):
         return LayerState(0, hidden, alive, positions, kind, task, num_visual, td)
 
     def _kinds(self, text: int, device: torch.device) -> Tensor:
-        """i64 [S], `TokenKind` of a sequence with ``text`` prompt tokens."""
+        """Return the `TokenKind`, i64 [S], of a sequence with ``text`` prompt tokens."""
         views = list(zip((TokenKind.PRIMARY, TokenKind.WRIST), self.config.visual_spec.views, strict=False))
         counts = [(TokenKind.BOS, 1), *((kind, view.stop - view.start) for kind, view in views)]
         counts += [(TokenKind.PROPRIO, 1), (TokenKind.TEXT, text)]
@@ -115,7 +115,7 @@ class VLANetwork(nn.Module):
         return kinds.repeat_interleave(repeats)
 
     def readout(self, decoded: Decoded) -> Tensor:
-        """What actions are read from, [B, H * A, d].
+        """Return the hidden states that actions are read from, [B, H * A, d].
 
         A row ends with last prompt token, slots, stop; all of these but the last two are read.
         """
@@ -128,7 +128,7 @@ class VLANetwork(nn.Module):
 def make_network(
     config: VLAConfig, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> VLANetwork:
-    """An untrained network whose weights are made as ``dtype`` on ``device``: the published size takes no room elsewhere.
+    """Make an untrained network with its weights as ``dtype`` on ``device``: the published size takes no room elsewhere.
 
     >>> make_network(VLAConfig.tiny(), dtype=torch.bfloat16).head.fc2.weight.dtype
     torch.bfloat16

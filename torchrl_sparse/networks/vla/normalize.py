@@ -53,29 +53,29 @@ class QuantileNormalizer(nn.Module):
 
     @classmethod
     def identity(cls, state_dim: int, action_dim: int) -> QuantileNormalizer:
-        """Leaves actions as they are, and states between -1 and 1."""
+        """Return a normaliser that leaves actions as they are, and states between -1 and 1."""
         state, action = torch.ones(state_dim), torch.ones(action_dim)
         return cls(-state, state, -action, action, torch.zeros(action_dim, dtype=torch.bool))
 
     @classmethod
     def fit(cls, state: Tensor, action: Tensor, *, gripper: Sequence[int] = (6,)) -> QuantileNormalizer:
-        """Normaliser of a data set: states [N, Ds], actions [N, A] with ``gripper`` dimensions from -1 (open) to 1 (close)."""
+        """Fit a normaliser to states [N, Ds] and actions [N, A], whose ``gripper`` dimensions are -1 (open) to 1 (close)."""
         ranges = [torch.quantile(x.double(), q, dim=0) for x in (state, action) for q in (0.01, 0.99)]
         is_gripper = torch.zeros(action.shape[1], dtype=torch.bool)
         is_gripper[list(gripper)] = True
         return cls(*ranges, is_gripper)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """States [..., Ds] in environment units to the policy's."""
+        """Map states [..., Ds] from environment units to the policy's."""
         return _to_unit(state, self.state_low, self.state_high).clamp(-1, 1)
 
     def normalize_action(self, action: Tensor) -> Tensor:
-        """Actions [..., A] in environment units to the policy's."""
+        """Map actions [..., A] from environment units to the policy's."""
         unit = _to_unit(action, self.action_low, self.action_high)
         return torch.where(self.gripper, (1 - action) / 2, unit.clamp(-1, 1))
 
     def unnormalize_action(self, action: Tensor) -> Tensor:
-        """Actions [..., A] of the policy to environment units; grippers become -1 or 1, 0 exactly between."""
+        """Map actions [..., A] of the policy to environment units; grippers become -1 or 1, 0 exactly between."""
         real = (action + 1) / 2 * (self.action_high - self.action_low + _EPS) + self.action_low
         return torch.where(self.gripper, (1 - 2 * action).sign(), real)
 

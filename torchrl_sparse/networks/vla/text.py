@@ -1,4 +1,4 @@
-"""Instructions as token ids of the published prompt ``In: What action should the robot take to {instruction}?\\nOut:``."""
+"""Tokenizers of instructions, in the published prompt ``In: What action should the robot take to {instruction}?\\nOut:``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Prompts:
     task: Tensor
 
     def to(self, device: torch.device) -> Prompts:
-        """The same on ``device``."""
+        """Return the same prompts on ``device``."""
         return Prompts(self.ids.to(device), self.mask.to(device), self.task.to(device))
 
 
@@ -46,7 +46,7 @@ class InstructionTokenizer(Protocol):
     vocab_size: int
 
     def encode(self, instructions: Sequence[str]) -> Prompts:
-        """Prompts of a batch of instructions."""
+        """Return the prompts of a batch of instructions."""
 
 
 class WordTokenizer:
@@ -69,7 +69,7 @@ class WordTokenizer:
         self.vocab_size = 3 + 256 + len(self._ids)
 
     def encode(self, instructions: Sequence[str]) -> Prompts:
-        """Prompts of ``instructions``, in lower case."""
+        """Return the prompts of ``instructions``, in lower case."""
         before, after = self._encode(_BEFORE), self._encode(_AFTER)
         rows = [self._encode(text) for text in instructions]
         return _pad([before + ids + after for ids in rows], [(len(before), len(ids)) for ids in rows])
@@ -82,7 +82,7 @@ class WordTokenizer:
         return ids
 
     def to_config(self) -> dict[str, Any]:
-        """For ``config.json``; `tokenizer_from_config` reads it."""
+        """Return JSON values that `tokenizer_from_config` reads."""
         return {"kind": "words", "words": self.words}
 
 
@@ -105,7 +105,7 @@ class LlamaTokenizer:
 
     @classmethod
     def from_file(cls, path: str | Path) -> LlamaTokenizer:
-        """The tokenizer in the file ``path``.
+        """Load the tokenizer in the file ``path``.
 
         Raises:
             FileNotFoundError, ValueError: naming the file.
@@ -119,7 +119,7 @@ class LlamaTokenizer:
             raise ValueError(f"{path}: {error}") from error
 
     def encode(self, instructions: Sequence[str]) -> Prompts:
-        """Prompts of ``instructions``, in lower case, as OpenVLA was trained on them."""
+        """Return the prompts of ``instructions``, in lower case, as OpenVLA was trained on them."""
         rows, spans = [], []
         for text in instructions:
             encoding = self._tokenizer.encode(f"{_BEFORE}{text.lower()}{_AFTER}", add_special_tokens=False)
@@ -131,12 +131,12 @@ class LlamaTokenizer:
         return _pad(rows, spans)
 
     def to_config(self) -> dict[str, Any]:
-        """For ``config.json``."""
+        """Return JSON values that `tokenizer_from_config` reads."""
         return {"kind": "llama", "definition": json.loads(self.definition)}
 
 
 def tokenizer_from_config(config: Any) -> InstructionTokenizer:
-    """The tokenizer whose ``to_config`` gave ``config``.
+    """Make the tokenizer whose ``to_config`` gave ``config``.
 
     Raises:
         ValueError: if it is none.
@@ -154,7 +154,7 @@ def _pieces(text: str) -> list[str]:
 
 
 def _pad(rows: list[list[int]], spans: list[tuple[int, int]]) -> Prompts:
-    """Prompts of rows of ids, where ``spans`` are start and length of the instruction in each."""
+    """Pad rows of ids to prompts; ``spans`` are start and length of the instruction in each."""
     lengths = torch.tensor([len(row) for row in rows])
     place = torch.arange(int(lengths.max()))
     ids = torch.tensor([row + [0] * (len(place) - len(row)) for row in rows])

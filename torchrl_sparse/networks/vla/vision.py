@@ -20,7 +20,7 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def center_crop(images: Tensor, area: float) -> Tensor:
-    """The central ``area`` (a share) of each image, scaled back bilinearly to the full size; pixel values stay whole numbers.
+    """Crop each image to its central ``area`` (a share) and scale it back, bilinearly and rounded, to the full size.
 
     Args:
         images: u8 [B, 3, h, w].
@@ -41,7 +41,7 @@ def center_crop(images: Tensor, area: float) -> Tensor:
 
 
 class VisionTowers(nn.Module):
-    """Patch features of DINOv2 (with registers) and SigLIP, each of its second-to-last layer and without a final norm.
+    """Computes patch features of DINOv2 (with registers) and SigLIP, each of its second-to-last layer and without a final norm.
 
     The last layer is not built, since nothing reads it.
     """
@@ -79,7 +79,7 @@ class VisionTowers(nn.Module):
         self._prefix = 1 + config.registers
 
     def forward(self, images: Tensor) -> Tensor:
-        """[B, patches, dino.dim + siglip.dim] of images u8 [B, 3, h, w]."""
+        """Return the features [B, patches, dino.dim + siglip.dim] of images u8 [B, 3, h, w]."""
         dtype = next(self.parameters()).dtype
         pixels = images.float() / 255
         mean, std = (pixels.new_tensor(value)[:, None, None] for value in (_IMAGENET_MEAN, _IMAGENET_STD))
@@ -89,7 +89,7 @@ class VisionTowers(nn.Module):
 
 
 class FusedProjector(nn.Module):
-    """Patch features to the decoder's width: three linear layers with GELU between them."""
+    """Projects patch features to the decoder's width: three linear layers with GELU between them."""
 
     def __init__(self, config: VLAConfig):
         super().__init__()
@@ -99,5 +99,5 @@ class FusedProjector(nn.Module):
         self.fc3 = nn.Linear(config.llm.dim, config.llm.dim)
 
     def forward(self, features: Tensor) -> Tensor:
-        """[B, patches, llm.dim] of [B, patches, features]."""
+        """Project [B, patches, features] to [B, patches, llm.dim]."""
         return self.fc3(functional.gelu(self.fc2(functional.gelu(self.fc1(features)))))

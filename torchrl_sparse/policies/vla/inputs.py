@@ -1,4 +1,4 @@
-"""What a vision-language-action policy reads from a flat TensorDict [B], checked: errors name key, expected and found."""
+"""Reading the inputs of a vision-language-action policy from a flat TensorDict [B]: errors name key, expected and found."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["read_images", "read_instructions", "read_keep_mask", "read_state"]
 
 
 def read_images(td: TensorDictBase, cameras: Sequence[NestedKey], size: int) -> Tensor:
-    """u8 [B, cameras, 3, size, size].
+    """Return the images, u8 [B, cameras, 3, size, size].
 
     Raises:
         KeyError: if a camera is missing.
@@ -28,7 +28,7 @@ def read_images(td: TensorDictBase, cameras: Sequence[NestedKey], size: int) -> 
 
 
 def read_state(td: TensorDictBase, key: NestedKey, size: int) -> Tensor:
-    """f32 [B, size].
+    """Return the state, f32 [B, size].
 
     Raises:
         KeyError: if it is missing.
@@ -43,7 +43,7 @@ def read_state(td: TensorDictBase, key: NestedKey, size: int) -> Tensor:
 
 
 def read_keep_mask(td: TensorDictBase, num_visual: int) -> Tensor | None:
-    """bool [B, num_visual], or None if there is none.
+    """Return the visual tokens to keep, bool [B, num_visual], or None if nobody has written a mask.
 
     Raises:
         ValueError: if it has another type or size.
@@ -55,7 +55,7 @@ def read_keep_mask(td: TensorDictBase, num_visual: int) -> Tensor | None:
 
 
 def read_instructions(td: TensorDictBase, key: NestedKey) -> list[str]:
-    """B instructions; one for all is repeated.
+    """Return B instructions; one for all is repeated.
 
     Raises:
         KeyError: if it is missing.

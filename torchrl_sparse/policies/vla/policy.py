@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ from torchrl_sparse.networks.vla.decoder import Decoded
 from torchrl_sparse.networks.vla.flops import query_flops
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, WordTokenizer
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
 from torchrl_sparse.runtime.clock import synchronised_clock
-from torchrl_sparse.storage.vla import read_vla, write_vla
+from torchrl_sparse.storage.published.openvla_oft import read_openvla_oft
+from torchrl_sparse.storage.vla import StoredVLA, read_vla, write_vla
+from torchrl_sparse.tokens.base import TokenPruner
 
 __all__ = ["VLAPolicy", "with_pruner"]
 
@@ -36,12 +38,11 @@ class VLAPolicy(VLAWrapperBase):
 
     Args:
         network: the network.
-        normalizer: of states and actions; by default none is done.
+        normalizer: of states and actions; by default they stay as they are.
         tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
 
     Attributes:
-        pruner: what drops visual tokens between the decoder's layers; None (dense) at first. Assign another to change the
-            method, see `torchrl_sparse.networks.vla.pruning`.
+        pruner: the `TokenPruner`. Assign another to change the method: ``vla.pruner = pruner``; None is dense.
 
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
@@ -86,10 +87,11 @@ class VLAPolicy(VLAWrapperBase):
         self.pruner = None
         self.eval()
 
-    # -- what prunes ---------------------------------------------------------------------------------------------------
+    # -- the pruner ----------------------------------------------------------------------------------------------------
 
     @property
     def pruner(self) -> TokenPruner | None:
+        """The method that drops visual tokens; None is dense."""
         return self._pruner
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -103,7 +105,7 @@ class VLAPolicy(VLAWrapperBase):
             self._update_keys()
 
     def _update_keys(self) -> None:
-        """TorchRL's keys, and ours beside them."""
+        """Declare the pruner's keys and ours beside TorchRL's."""
         super()._update_keys()
         pruner = getattr(self, "_pruner", None)
         wrist = self.tensor_keys.wrist_image
@@ -131,9 +133,9 @@ class VLAPolicy(VLAWrapperBase):
         return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
-        """Normalised actions f32 [B, H, A] of a query [B], and what the decoder did; the pruner writes into ``query``."""
+        """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
-        images = self.look(query)
+        images = self.crop_images(query)
         state = read_state(query, names.state, config.state_dim)
         prompts = self.tokenizer.encode(read_instructions(query, names.instruction))
         if self.pruner is not None:
@@ -143,15 +145,15 @@ class VLAPolicy(VLAWrapperBase):
             self.normalizer.normalize_state(state),
             prompts.to(images.device),
             keep_mask=read_keep_mask(query, config.num_visual),
-            pruner=self.pruner,
+            hooks=self.pruner,
             td=query,
         )
         if self.pruner is not None:
             self.pruner.end(query)
         return actions, decoded
 
-    def look(self, query: TensorDictBase) -> Tensor:
-        """The images, u8 [B, cameras, 3, h, w], cropped; in ``query`` too, where a pruner compares their patches."""
+    def crop_images(self, query: TensorDictBase) -> Tensor:
+        """Return the images, u8 [B, cameras, 3, h, w], cropped; replace those in ``query``, whose patches a pruner compares."""
         config, names = self.network.config, self.tensor_keys
         cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
         images = read_images(query, cameras, config.image_size)
@@ -162,7 +164,7 @@ class VLAPolicy(VLAWrapperBase):
         return images
 
     def _answer(self, query: TensorDictBase, actions: Tensor, decoded: Decoded) -> TensorDict:
-        """Everything but the latency, [B]."""
+        """Return everything that the policy writes but the latency, [B]."""
         answer = TensorDict({}, query.batch_size, device=query.device)
         answer.set(self.tensor_keys.action_chunk, self.normalizer.unnormalize_action(actions))
         answer.set(keys.TOKEN_DEPTH, decoded.depth)
@@ -176,12 +178,12 @@ class VLAPolicy(VLAWrapperBase):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Writes ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
-        write_vla(Path(path), network=self.network, normalizer=self.normalizer, tokenizer=self.tokenizer)
+        """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
+        write_vla(Path(path), StoredVLA(self.network, self.normalizer, self.tokenizer))
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, config: VLAConfig | None = None) -> VLAPolicy:
-        """Reads what `save_pretrained` wrote. Nothing in the files is executed.
+        """Load what `save_pretrained` wrote. Nothing in the files is executed.
 
         Args:
             path: the folder.
@@ -190,11 +192,50 @@ class VLAPolicy(VLAWrapperBase):
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        return cls(*read_vla(Path(path), config))
+        return cls._assemble(read_vla(Path(path), config))
+
+    @classmethod
+    def from_openvla_oft(
+        cls,
+        path: str | Path,
+        *,
+        unnorm_key: str | None = None,
+        cameras: int = 2,
+        heads: Sequence[int] = (16, 16, 32),
+        dtype: torch.dtype = torch.bfloat16,
+    ) -> VLAPolicy:
+        """Load a published OpenVLA-OFT checkpoint, a folder as on the Hugging Face hub. Nothing in its files is executed.
+
+        The policy reads upright images of the published size and crops them itself. What the published evaluation did to
+        LIBERO's images before that belongs to the environment: a turn by 180 degrees, and JPEG and Lanczos on the way to 224
+        pixels. The state is position, axis-angle and both fingers of the gripper.
+
+        Args:
+            path: the folder, see `torchrl_sparse.storage.published.openvla_oft`.
+            unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where
+                the file has it so); not needed where the file has one only.
+            cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
+            heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
+            dtype: of the network.
+
+        Raises:
+            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+
+        Examples:
+            >>> policy = VLAPolicy.from_openvla_oft("checkpoint", unnorm_key="libero_spatial")  # doctest: +SKIP
+        """
+        stored = read_openvla_oft(
+            Path(path), unnorm_key=unnorm_key, cameras=cameras, heads=heads, dtype=dtype
+        )
+        return cls._assemble(stored)
+
+    @classmethod
+    def _assemble(cls, stored: StoredVLA) -> VLAPolicy:
+        return cls(stored.network, stored.normalizer, stored.tokenizer)
 
 
 def with_pruner(policy: VLAPolicy, pruner: TokenPruner | None) -> VLAPolicy:
-    """The same model under another method, None for dense; ``policy`` stays as it is."""
+    """Return the same model under another method, None for dense; ``policy`` stays as it is."""
     other = VLAPolicy(policy.network, policy.normalizer, policy.tokenizer)
     other.pruner = pruner
     return other

@@ -2,4 +2,4 @@ from .diffusion_policy import (
     CheckpointError as CheckpointError,
     read_diffusion_policy as read_diffusion_policy,
 )
-from .openvla_oft import load_openvla_oft as load_openvla_oft
+from .openvla_oft import read_openvla_oft as read_openvla_oft

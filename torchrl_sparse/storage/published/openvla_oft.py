@@ -1,8 +1,8 @@
-"""Published OpenVLA-OFT checkpoints (arXiv:2502.19645), a folder as on the Hugging Face hub, as a `VLAPolicy`.
+"""Published OpenVLA-OFT checkpoints (arXiv:2502.19645), folders as on the Hugging Face hub, read as a `StoredVLA`.
 
 Read are ``config.json``, the safetensors shards, ``action_head--*_checkpoint.pt`` and ``proprio_projector--*_checkpoint.pt``
 (tensors only), ``dataset_statistics.json`` and ``tokenizer.json``. The Python files in such a folder are neither imported nor
-looked at.
+read.
 
 The towers carry timm's names there (``featurizer`` is DINOv2, ``fused_featurizer`` SigLIP), with LayerScale's ``gamma`` renamed
 to ``scale_factor``, and the two ``.pt`` files the prefix ``module.``. The towers' last blocks and final norms, SigLIP's pooling
@@ -12,6 +12,7 @@ head and the vocabulary projection take no part in OpenVLA-OFT and are left out.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,11 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
-from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.files import read_json, read_tensors
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+from torchrl_sparse.storage.vla import StoredVLA
 
-__all__ = ["load_openvla_oft"]
+__all__ = ["read_openvla_oft"]
 
 _DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 _LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
@@ -53,32 +54,14 @@ _SIGLIP_NAMES = {
 _HEAD_NAMES = {"mlp_resnet_blocks": "blocks", ".ffn.": ".", "model.": ""}
 
 
-def load_openvla_oft(
-    path: str | Path,
-    *,
-    unnorm_key: str | None = None,
-    cameras: int = 2,
-    heads: tuple[int, int, int] = (16, 16, 32),
-    dtype: torch.dtype = torch.bfloat16,
-) -> VLAPolicy:
-    """The policy in the folder ``path``. Nothing in its files is executed.
-
-    The policy reads upright images of the published size and crops them itself. What the published evaluation did to LIBERO's
-    images before that belongs to the environment: a turn by 180 degrees, and JPEG and Lanczos on the way to 224 pixels. The
-    state is position, axis-angle and both fingers of the gripper.
-
-    Args:
-        path: the folder.
-        unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where the
-            file has it so); not needed where the file has one only.
-        cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
-        heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
-        dtype: of the network.
+def read_openvla_oft(
+    path: Path, *, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype
+) -> StoredVLA:
+    """Read the policy in the folder ``path``; see `VLAPolicy.from_openvla_oft`.
 
     Raises:
         FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
     """
-    path = Path(path)
     if list(path.glob("vision_backbone*checkpoint*")):
         raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
     image_size = _image_size(path / "config.json")
@@ -91,7 +74,7 @@ def load_openvla_oft(
     check_shapes(str(path), weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
     check_finite(str(path), weights)
     network.load_state_dict(weights)
-    return VLAPolicy(network, normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
+    return StoredVLA(network.eval(), normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -128,7 +111,7 @@ def _read_shards(path: Path) -> dict[str, Tensor]:
 
 
 def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
-    """Tensors of the one file ``action_head--*`` or ``proprio_projector--*``, under ``prefix``."""
+    """Read the tensors of the one file ``action_head--*`` or ``proprio_projector--*``, under ``prefix``."""
     pattern = f"{prefix.rstrip('.')}*checkpoint*"
     files = sorted(path.glob(pattern))
     if len(files) != 1:
@@ -170,9 +153,9 @@ def _normalizer(path: Path, statistics: dict[str, Any], config: VLAConfig) -> Qu
 
 
 def _config(
-    path: Path, tensors: dict[str, Tensor], heads: tuple[int, int, int], image_size: int, cameras: tuple
+    path: Path, tensors: dict[str, Tensor], heads: Sequence[int], image_size: int, cameras: tuple
 ) -> VLAConfig:
-    """Sizes as the shapes of the weights say."""
+    """Infer the sizes from the shapes of the weights."""
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in tensors:
@@ -203,7 +186,7 @@ def _config(
 
 
 def _rename(tensors: dict[str, Tensor], config: VLAConfig) -> dict[str, Tensor]:
-    """The weights under the names of `VLANetwork`; ``tensors`` is used up."""
+    """Rename the weights to those of `VLANetwork`; ``tensors`` is used up."""
     dino, siglip = take(tensors, _DINO), take(tensors, _SIGLIP)
     # there, the class token has no position
     positions = torch.cat([torch.zeros_like(dino["pos_embed"][:, :1]), dino.pop("pos_embed")], dim=1)
@@ -226,7 +209,7 @@ def _rename(tensors: dict[str, Tensor], config: VLAConfig) -> dict[str, Tensor]:
 
 
 def _tower(tensors: dict[str, Tensor], names: dict[str, str], blocks: str, layers: int) -> dict[str, Tensor]:
-    """A tower's weights without those that nothing reads, with query, key and value apart."""
+    """Rename a tower's weights, without those that nothing reads, and with query, key and value apart."""
     unused = (f"{blocks}.{layers - 1}.", "norm.", "attn_pool.")
     renamed = {_replace(name, names): value for name, value in tensors.items()}
     renamed = {name: value for name, value in renamed.items() if not name.startswith(unused)}

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from torchrl_sparse.envs.benchmarks import Benchmark, find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.rotations import ABSOLUTE_DIM
 
 __all__ = ["PublishedShape", "published_network", "published_shape"]
 
@@ -68,6 +67,5 @@ def published_network(task: str, **changes: Any) -> TransformerForDiffusion:
     """
     found, sizes = find_task(task), asdict(published_shape(task))
     del sizes["n_action_steps"], sizes["weight_decay"]
-    action_dim = found.action_dim if isinstance(found, Benchmark) else ABSOLUTE_DIM * found.arms
-    dims = {"input_dim": action_dim, "output_dim": action_dim, "cond_dim": found.state_dim}
+    dims = {"input_dim": found.action_dim, "output_dim": found.action_dim, "cond_dim": found.state_dim}
     return TransformerForDiffusion(**(dims | sizes | changes))

@@ -98,7 +98,7 @@ class Grounding(nn.Module):
 
     def look(self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor) -> Tensor:
         """L1 loss, a scalar: ``positions`` f32 [B, n, 3] from the mean of each camera's visual tokens."""
-        return self._seen_loss(policy.network.visual_tokens(policy.look(batch)), positions)
+        return self._seen_loss(policy.network.visual_tokens(policy.crop_images(batch)), positions)
 
     def answer(
         self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor, instructions: Sequence[str]

@@ -18,9 +18,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.vla.pruning import TokenPruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 

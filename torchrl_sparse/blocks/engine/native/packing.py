@@ -29,7 +29,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.folding import after_norm
-from torchrl_sparse.networks.diffusion.coefficients import step_coefficients
 
 if TYPE_CHECKING:
     from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -176,7 +175,7 @@ class PackedNetwork:
             self.model = self._pack(network, sampler)
 
     def _pack(self, network, sampler) -> Model:
-        coefficients = step_coefficients(sampler)
+        coefficients = sampler.coefficients
         # What follows each other in the loop or before it does so in memory.
         loop = [self._pack_loop(layer) for layer in network.decoder.layers]
         layers = [
@@ -186,7 +185,6 @@ class PackedNetwork:
         positions = network.pos_emb[0].double()
         norm, head = network.ln_f, network.head
         valid = self._padded_width(torch.ones(network.n_emb))
-        columns = ("noise_scale", "signal_scale", "clean_weight", "sample_weight", "eps_weight", "spread")
         layer_array = (_Layer * len(layers))(*layers)
         self._arrays.append(layer_array)
         return Model(
@@ -205,9 +203,7 @@ class PackedNetwork:
             head=self._arena.matrix(*after_norm(norm, head.weight, head.bias)),
             encode_up=self._arena.matrix(*_embed_and_encode(network)),
             encode_down=self._matrix(network.encoder[2].weight, network.encoder[2].bias),
-            coefficients=self._arena.floats(
-                torch.stack([getattr(coefficients, name) for name in columns], dim=1)
-            ),
+            coefficients=self._arena.floats(coefficients.table()),
             valid=self._arena.floats(valid),
             **{name: self._arena.floats(table) for name, table in tables.items()},
         )

@@ -16,7 +16,6 @@ from torchrl_sparse.blocks.engine.program import slot_counts
 from torchrl_sparse.blocks.engine.torch.blocks import CrossAttention, FeedForward, SelfAttention
 from torchrl_sparse.blocks.engine.torch.linear import transposed
 from torchrl_sparse.blocks.mask import num_buffers
-from torchrl_sparse.networks.diffusion.coefficients import step_coefficients
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -58,9 +57,9 @@ class Tables:
         self.encoder = ConditionEncoder(network, sampler.timesteps)
         self.num_steps = sampler.num_inference_steps
         self.time = self._fold_time() if self.encoder.separable else None
-        coefficients = step_coefficients(sampler)
+        coefficients = sampler.coefficients
         self.clip, self.spread = coefficients.clip, coefficients.spread.to(self.stem_weight)
-        columns = torch.tensor(coefficients.columns()).T
+        columns = coefficients.table()[:, :-1].clone()
         columns[:, 0].neg_()
         self.coefficients = columns.to(self.stem_weight)
         self.weighs_eps = bool(coefficients.eps_weight.any())

@@ -1,0 +1,21 @@
+"""Writes every table of results on the pages anew, from the committed JSON that it shows.
+
+python recipes/pages.py
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_sparse.evaluation.results.pages import write_pages
+
+
+@hydra.main(version_base=None, config_path=".", config_name="pages")
+def main(config: DictConfig) -> None:
+    changed = write_pages(config.root)
+    print("\n".join(map(str, changed)) or "every table is as its JSON says")
+
+
+if __name__ == "__main__":
+    main()

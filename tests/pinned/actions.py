@@ -1,0 +1,130 @@
+"""What every shipped method answers to a few fixed queries."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.pinned import build
+
+ASSETS = Path(__file__).parents[2] / "assets"
+STORED = Path(__file__).with_name("actions.safetensors")
+ENGINES = ("native", "torch")
+# All shipped planners reuse by "block", so copies of two of lift's stand for the other rules.
+_COPIED = {"bac": "bac.json", "sag": "sag/config.json"}
+_RULES = ("type", "single")
+_OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
+_INSTRUCTION, _KEPT = "lift the green cube", 45.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One method of one policy, in one engine where the policy has engines, and perhaps under another rule of reuse."""
+
+    asset: str
+    method: str
+    engine: str = ""
+    reuse: str = ""
+
+    def __str__(self) -> str:
+        return "/".join(filter(None, (self.asset, self.method, self.reuse, self.engine)))
+
+    @property
+    def rounding(self) -> int:
+        """Blocks, in all masks together, that rounding may decide: a pruner compares numbers that may be nearly equal."""
+        return 2 if (ASSETS / self.asset / self.method.partition("@")[0]).is_dir() else 0
+
+    def answer(self) -> dict[str, Tensor]:
+        """Normalised chunk [Q, n, A], mask [Q, ...] and FLOPs [Q, 1] of the Q queries."""
+        torch.manual_seed(0)
+        return _vla_answers(self) if self.asset == "vla" else _diffusion_answers(self)
+
+
+def cases() -> Iterator[Case]:
+    """All of what is shipped, and copies under other rules of reuse."""
+    for folder in sorted(path.parent for path in ASSETS.glob("*/model.safetensors")):
+        for method in shipped_methods(folder):
+            for engine in ("",) if folder.name == "vla" else ENGINES:
+                yield Case(folder.name, method, engine)
+    for method, rule, engine in product(_COPIED, _RULES, ENGINES):
+        yield Case("lift", method, engine, rule)
+
+
+def shipped_methods(folder: Path) -> list[str]:
+    """Dense, uniform, the planners beside the policy, and what its tables name."""
+    tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
+    named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
+    files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
+    if folder.name == "vla":
+        return sorted(named | {path.name for path in files})
+    pruners = {path.parent.name for path in folder.glob("*/config.json")}
+    return sorted({"dense", "uniform"} | named | pruners | {path.stem for path in files})
+
+
+def _diffusion_answers(case: Case) -> dict[str, Tensor]:
+    """The first query on its own, the others as a batch: engines have a way for each."""
+    first, *others = (build.diffusion_query(**observation) for observation in _OBSERVATIONS[case.asset])
+    folder = ASSETS / case.asset
+    with tempfile.TemporaryDirectory() as copies:
+        planners = _reusing(folder, Path(copies), case.reuse) if case.reuse else folder
+        actor = build.diffusion_actor(folder, planners, case.method, case.engine)
+    answers = [build.diffusion_answer(actor, query) for query in (first[None], torch.stack(others))]
+    return {name: torch.cat([answer[name] for answer in answers]) for name in answers[0]}
+
+
+def _reusing(folder: Path, copies: Path, rule: str) -> Path:
+    """Copies of planners that reuse by ``rule``."""
+    shutil.copytree(
+        folder, copies, ignore=shutil.ignore_patterns("model.*", "episodes", "figures"), dirs_exist_ok=True
+    )
+    for name in _COPIED.values():
+        content = json.loads((folder / name).read_text(encoding="utf-8"))
+        (copies / name).write_text(json.dumps({**content, "reuse": rule}), encoding="utf-8")
+    return copies
+
+
+def _vla_answers(case: Case) -> dict[str, Tensor]:
+    """Two queries of an episode, the second in the knowledge of the first."""
+    actor = build.vla_actor(ASSETS / case.asset, case.method, _vla_queries(), _KEPT)
+    answers, last = [], None
+    for query in _vla_queries():
+        answers.append(build.vla_answer(actor, query, last))
+        last = query
+    return {name: torch.stack([answer[name] for answer in answers]) for name in answers[0]}
+
+
+def _vla_queries() -> list:
+    lift = _OBSERVATIONS["lift"]
+    return [
+        build.vla_query(
+            images,
+            state=observation["state"][-1][10:],
+            instruction=_INSTRUCTION,
+            eef_vel=observation["eef_vel"],
+            seed=observation["seed"],
+            step=observation["step"],
+        )
+        for images, observation in zip(_images(), (lift[0], lift[2]), strict=True)
+    ]
+
+
+@cache
+def _images() -> list[Tensor]:
+    """Coarse patterns of two cameras, u8 [2, 3, 84, 84], and the same with more and more change towards one corner."""
+    generator = np.random.default_rng(0)
+    coarse = generator.integers(40, 216, (2, 3, 12, 12)).repeat(7, axis=2).repeat(7, axis=3)
+    ramp = np.linspace(0, 1, 84)
+    change = generator.integers(-40, 41, coarse.shape) * ramp * ramp[:, None]
+    before = coarse + generator.integers(-5, 6, coarse.shape)
+    after = before + generator.integers(-1, 2, coarse.shape) + change
+    return [torch.from_numpy(images.clip(0, 255).astype(np.uint8)) for images in (before, after)]

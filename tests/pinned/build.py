@@ -1,0 +1,166 @@
+"""Every use that the pinned tests make of the library. Code that moves or is renamed is followed here and nowhere else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.evaluation.engine_report import format_engine_table
+from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.latency import summarize_latency
+from torchrl_sparse.evaluation.methods import MethodName, make_method
+from torchrl_sparse.evaluation.realtime import format_realtime, load_realtime
+from torchrl_sparse.evaluation.report import (
+    MethodRun,
+    build_results,
+    format_pairs,
+    format_table,
+    load_results,
+)
+from torchrl_sparse.evaluation.sweeps import Trial, merge_trials
+from torchrl_sparse.evaluation.tracking import trial_metrics
+from torchrl_sparse.evaluation.vla_methods import TokenMethod, matching_share
+from torchrl_sparse.evaluation.vla_report import format_vla_table
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.tokens.calibration import TokenBudget
+
+__all__ = [
+    "EpisodeResult",
+    "Trial",
+    "diffusion_actor",
+    "diffusion_answer",
+    "diffusion_query",
+    "episodes_of",
+    "format_engine_table",
+    "format_pairs",
+    "format_realtime",
+    "format_table",
+    "format_vla_table",
+    "load_realtime",
+    "load_results",
+    "merge_trials",
+    "native_available",
+    "results_of",
+    "trial_metrics",
+    "vla_actor",
+    "vla_answer",
+    "vla_query",
+]
+
+_NUM_UPDATES = 10  # M, as benchmark.yaml has it
+
+
+# -- diffusion policies ------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=2)  # one for each engine
+def _policy(folder: Path, engine: str) -> DiffusionPolicy:
+    return DiffusionPolicy.from_pretrained(folder, engine=engine)
+
+
+def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> ChunkExecutor:
+    """The method ``name`` as `recipes/benchmark.py` makes it, with a query at every step, from files in ``planners``."""
+
+    def calibration() -> None:
+        raise AssertionError(f"{name}: expected a shipped schedule, got one to compute")
+
+    policy = make_method(
+        name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=planners, calibration=calibration
+    )
+    return ChunkExecutor(policy, n_action_steps=1, gate=MethodName.parse(name).gate())
+
+
+def diffusion_query(state: Any, eef_vel: Any, seed: int, step: int) -> TensorDict:
+    """What the environment shows at a step, [], with what a gate remembers of the steps before."""
+    query = TensorDict({keys.HISTORY_STATE: torch.tensor(state), keys.EEF_VEL: torch.tensor(eef_vel)}, [])
+    return _at_step(query, seed, step)
+
+
+def diffusion_answer(actor: ChunkExecutor, query: TensorDictBase) -> dict[str, Tensor]:
+    """The normalised chunk [*B, n, A], the mask [*B, K, 3L], the FLOPs [*B, 1] and the seed [*B, 1] of a query [*B]."""
+    answer = actor(query)
+    return {
+        "chunk": actor.policy.normalizer.normalize_action(answer[keys.CHUNK]),
+        "mask": answer[keys.PRUNE_MASK],
+        "flops": answer[keys.FLOPS],
+        "seed": answer[keys.SEED],
+    }
+
+
+def _at_step(query: TensorDict, seed: int, step: int) -> TensorDict:
+    query.set(keys.EPISODE_SEED, torch.tensor([seed]))
+    query.set(keys.EPISODE_STEP, torch.tensor([step]))
+    query.set(keys.IS_INIT, torch.tensor([step == 0]))
+    return query.set(keys.CONTROL_STEP, torch.tensor([step - 1]))
+
+
+# -- vision-language-action policies -----------------------------------------------------------------------------------
+
+
+@cache
+def _vla(folder: Path) -> VLAPolicy:
+    return VLAPolicy.from_pretrained(folder)
+
+
+def vla_actor(folder: Path, name: str, recorded: Sequence[TensorDictBase], kept: float) -> ChunkExecutor:
+    """The method ``name`` as `recipes/benchmark_vla.py` makes it, with a query at every step.
+
+    A method that matches another keeps ``kept`` tokens on the ``recorded`` queries. ``NAME.json`` is a calibrated budget.
+    """
+    if name.endswith(".json"):
+        return ChunkExecutor(with_pruner(_vla(folder), TokenBudget.load(folder / name).pruner()), 1)
+    method = TokenMethod.parse(name)
+    number = method.number
+    if method.like is not None:
+        number = matching_share(method.pruner, _vla(folder), [recorded], kept)
+    return method.executor(with_pruner(_vla(folder), method.pruner(number, {})), n_action_steps=1)
+
+
+def vla_query(images: Tensor, state: Any, instruction: str, eef_vel: Any, seed: int, step: int) -> TensorDict:
+    """The same as `diffusion_query`, with images u8 [2, 3, h, w] and an instruction."""
+    query = TensorDict({keys.STATE: torch.tensor(state), keys.EEF_VEL: torch.tensor(eef_vel)}, [])
+    query.set(keys.IMAGE, images[0]).set(keys.WRIST_IMAGE, images[1])
+    return _at_step(query.set(keys.INSTRUCTION, instruction), seed, step)
+
+
+def vla_answer(actor: ChunkExecutor, query: TensorDictBase, last: TensorDictBase | None) -> dict[str, Tensor]:
+    """The same; the mask says how many layers ran on each visual token, and ``last`` is the step before."""
+    policy = actor.policy
+    if last is not None:
+        carried = [key for key in policy.out_keys if key in policy.in_keys]
+        query.update(last.select(*carried, keys.FINE, strict=False))
+    answer = actor(query)
+    return {
+        "chunk": policy.normalizer.normalize_action(answer[keys.CHUNK]),
+        "mask": answer[keys.TOKEN_DEPTH],
+        "flops": answer[keys.FLOPS],
+    }
+
+
+# -- episodes and results ----------------------------------------------------------------------------------------------
+
+
+def episodes_of(log: Path) -> list[EpisodeResult]:
+    """All episodes of a log, by seed."""
+    with log.open(encoding="utf-8") as lines:
+        identity = json.loads(next(lines))["identity"]
+    return [episode for _, episode in sorted(EpisodeLog(log, identity).episodes.items())]
+
+
+def results_of(episodes: dict[str, list[EpisodeResult]], like: dict[str, Any]) -> dict[str, Any]:
+    """The content of a ``results.json`` about them, as if every query took a second; the rest is that of ``like``."""
+    second = summarize_latency([1.0])
+    runs = {name: MethodRun(of_method, second, (0.0, 0.0)) for name, of_method in episodes.items()}
+    about = {name: like[name] for name in ("task", "seed", "machine", "policy")}
+    return build_results(runs, **about)

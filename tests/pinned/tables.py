@@ -1,0 +1,91 @@
+"""The tables that the library makes of every committed file of results and of the committed episodes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.pinned import build
+
+ASSETS = Path(__file__).parents[2] / "assets"
+STORED = Path(__file__).with_name("tables.json")
+_COUNTS = (200, 400)  # episodes that logs hold
+
+
+def names() -> Iterator[str]:
+    """The files and folders that tables are made of, relative to the assets."""
+    for path in sorted(ASSETS.rglob("*")):
+        if path.name == "episodes" or _maker(path) is not None:
+            yield path.relative_to(ASSETS).as_posix()
+
+
+def table(name: str) -> list[str]:
+    """The lines of the tables that are made of one."""
+    path = ASSETS / name
+    return "\n\n".join(_maker(path)(path)).splitlines()
+
+
+def _maker(path: Path):
+    makers = {
+        "*/sweep_*/results.json": _sweep,
+        "results*.json": _results,
+        "realtime.json": _realtime,
+        "engine/*.json": _engine,
+        "vla_latency.json": _vla_latency,
+        "episodes": _episodes,
+    }
+    return next((maker for pattern, maker in makers.items() if path.match(pattern)), None)
+
+
+def _results(path: Path) -> list[str]:
+    return [build.format_table(build.load_results(path))]
+
+
+def _realtime(path: Path) -> list[str]:
+    return [build.format_realtime(build.load_realtime(path))]
+
+
+def _engine(path: Path) -> list[str]:
+    shapes = json.loads(path.read_text(encoding="utf-8"))["shapes"]
+    return [build.format_engine_table(name, shape) for name, shape in shapes.items()]
+
+
+def _vla_latency(path: Path) -> list[str]:
+    return [build.format_vla_table(json.loads(path.read_text(encoding="utf-8")))]
+
+
+def _sweep(path: Path) -> list[str]:
+    """Also the merged table and the metrics of its trials: the dense method and another each."""
+    whole = build.load_results(path)
+    dense, *tested = whole["methods"]
+    trials = [
+        (
+            build.Trial(name, {"method": name}, finished=True),
+            {**whole, "methods": {each: whole["methods"][each] for each in (dense, name)}},
+        )
+        for name in tested
+    ]
+    metrics = [
+        _numbers({key: number for key, number in found.items() if key.startswith("tested/")})
+        for found in (build.trial_metrics(results) for _, results in trials)
+    ]
+    return [*_results(path), build.format_table(build.merge_trials(trials)), *metrics]
+
+
+def _episodes(folder: Path) -> list[str]:
+    """Tables of the logs that are long enough, numbers to more digits, and all methods against ddim10."""
+    logs = {log.stem: build.episodes_of(log) for log in sorted(folder.glob("*.jsonl"))}
+    made = []
+    for count in _COUNTS:
+        episodes = {name: log[:count] for name, log in logs.items() if len(log) >= count}
+        results = build.results_of(episodes, like=build.load_results(folder.parent / "results.json"))
+        made.append(build.format_table(results))
+        made += [f"{name}: {_numbers(method)}" for name, method in results["methods"].items()]
+        made.append(build.format_pairs(episodes, [(name, "ddim10") for name in episodes]))
+    return made
+
+
+def _numbers(value: object) -> str:
+    """JSON to nine digits: another version of a library may round the last ones otherwise."""
+    return json.dumps(json.loads(json.dumps(value), parse_float=lambda text: float(f"{float(text):.9g}")))

@@ -1,0 +1,163 @@
+"""One scripted demonstration, acted out step by step: what is meant, what is executed, and what is recorded of it.
+
+`torchrl_sparse.data.demos` runs the same loop over both kinds; a task says which is its own (`Task.demonstrator`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.envs.experts.disturbance import Disturbance, next_noise
+from torchrl_sparse.envs.experts.operators import draw_operator
+from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.simulator import controller_config, import_robosuite
+from torchrl_sparse.envs.tasks import RobosuiteTask, StateTask
+from torchrl_sparse.rotations import pose_to_absolute
+
+__all__ = ["Demonstrator", "RobosuiteDemonstrator", "StateDemonstrator", "StateExpert"]
+
+
+class Demonstrator(Protocol):
+    """Acts out one episode of an environment that was just reset.
+
+    Attributes:
+        operator: name of who demonstrates.
+        instruction: what the episode asks for; None where there is no choice.
+        model_file: the simulator's model, to restore the episode's start; empty where the state is enough.
+    """
+
+    operator: str
+    instruction: str | None
+    model_file: str
+
+    def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
+        """Return the simulator's state, f64 [S], and the observations by name, each f64 [n], before an action."""
+
+    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
+        """Return the action that the expert means and the one that is executed, as they are recorded."""
+
+    def command(self, executed: np.ndarray) -> np.ndarray:
+        """Convert a recorded action to the environment's."""
+
+
+class RobosuiteDemonstrator:
+    """Demonstrates a robosuite task with one of the operators of a quality; a `Demonstrator`.
+
+    Args:
+        task: what is demonstrated.
+        env: its environment, of absolute actions.
+        rng: draws the operator, their style and every disturbance.
+        quality: see `torchrl_sparse.envs.experts.operators`.
+
+    Raises:
+        ValueError: if the task has no expert or the quality is unknown.
+    """
+
+    def __init__(self, task: RobosuiteTask, env: RobosuiteEnv, rng: np.random.Generator, quality: str):
+        operator = draw_operator(quality, rng)
+        start = env.get_initial_state()
+        self.operator, self.instruction, self.model_file = operator.name, start.instruction, start.model_xml
+        self._env, self._arms = env, range(task.arms)
+        self._expert = task.load_expert()(env.sim_env, operator.draw(rng))
+        self._disturb = Disturbance(operator, task.arms, rng)
+
+    def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
+        """See `Demonstrator.record`."""
+        observed = self._env.raw_observation()
+        return self._env.sim_env.sim.get_state().flatten(), observed
+
+    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
+        """See `Demonstrator.act`; f64 [7 * arms] each."""
+        clean = self._expert.command()
+        hands = np.stack([self._expert.hand(arm).position for arm in self._arms])
+        return clean, self._disturb(clean, hands)
+
+    def command(self, executed: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.command`."""
+        return pose_to_absolute(executed)
+
+    @staticmethod
+    def env_args(task: RobosuiteTask) -> dict[str, Any]:
+        """Describe, as robomimic does, the environment that demonstrations are made in."""
+        return {
+            "env_name": task.name,
+            "env_version": import_robosuite().__version__,
+            "type": 1,  # robomimic's EnvType.ROBOSUITE_TYPE
+            "env_kwargs": {
+                "robots": ["Panda"] * task.arms,
+                "controller_configs": controller_config(absolute=True),
+                "control_freq": 20,
+                "has_renderer": False,
+                "has_offscreen_renderer": False,
+                "use_camera_obs": False,
+                "reward_shaping": False,
+            },
+        }
+
+
+class StateExpert(Protocol):
+    """A scripted expert that sees what a policy observes; what it draws or plans is hidden from the policy.
+
+    Made for one episode from a random generator.
+
+    Attributes:
+        noise: standard deviation of what is added to its actions while demonstrating, in their units.
+    """
+
+    noise: float
+
+    def command(self, state: np.ndarray) -> np.ndarray:
+        """Return the action, f64 [A], in a state [Ds]."""
+
+
+class StateDemonstrator:
+    """Demonstrates a task outside robosuite, with noise on what is done and clean labels, as in DART (arXiv:1703.09327).
+
+    Args:
+        task: what is demonstrated.
+        env: its environment.
+        rng: draws the expert's preferences and the noise.
+        quality: "proficient"; these experts have no other.
+
+    Raises:
+        ValueError: if the task has no expert, or not of that quality.
+    """
+
+    instruction, model_file = None, ""
+
+    def __init__(self, task: StateTask, env: EnvBase, rng: np.random.Generator, quality: str):
+        if quality != "proficient":
+            raise ValueError(f"quality: expected 'proficient' for {task.name}, got {quality!r}")
+        self.operator = quality
+        self._expert: StateExpert = task.load_expert()(rng)
+        self._rng, self._noise = rng, np.zeros(task.action_dim)
+
+    def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
+        """See `Demonstrator.record`."""
+        state = _state(present)
+        return state, {"state": state}
+
+    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
+        """See `Demonstrator.act`; f64 [A] each."""
+        clean = self._expert.command(_state(present))
+        self._noise = next_noise(self._noise, self._rng)
+        return clean, clean + self._expert.noise * self._noise
+
+    def command(self, executed: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.command`."""
+        return executed
+
+    @staticmethod
+    def env_args(task: StateTask) -> dict[str, Any]:
+        """Describe, as robomimic does, the environment that demonstrations are made in."""
+        return {"env_name": task.name, "env_kwargs": {}, "type": 2}  # robomimic's EnvType.GYM_TYPE
+
+
+def _state(present: TensorDictBase) -> np.ndarray:
+    return present[keys.STATE].double().numpy()

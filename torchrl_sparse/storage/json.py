@@ -1,0 +1,148 @@
+"""Every JSON file of this package, read into a dataclass and written from one.
+
+The dataclass is the schema: its fields are the only keys, its annotations their types, and its ``__post_init__`` checks what
+types cannot say, with messages that begin with the field (``"rate: expected k / n, got 2"``). A field with the default None
+is left out of the file where it is None; ``format: Literal["name/1"]`` comes first, so that a file of another format is
+named as such.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from torchrl_sparse.storage.atomic import atomic_path
+
+__all__ = ["parse_json", "read_json", "to_plain", "write_json"]
+
+T = TypeVar("T")
+MAX_BYTES = 64 << 20  # the largest file of ours, the words of a Llama tokenizer, has a few million
+
+
+def read_json(path: str | os.PathLike, kind: type[T]) -> T:
+    """Read a file as ``kind``: a dataclass, or any type with JSON values, such as ``dict[str, Any]``.
+
+    Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep.
+
+    Examples:
+        >>> import tempfile
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Rate:
+        ...     solved: int
+        ...     of: int
+        >>> file = write_json(Path(tempfile.mkdtemp()) / "rate.json", Rate(3, 4))
+        >>> read_json(file, Rate)
+        Rate(solved=3, of=4)
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a file {path}, got none")
+    _check_size(path.stat().st_size, str(path))
+    return parse_json(path.read_bytes(), kind, str(path))
+
+
+def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
+    """Parse what a file or a line of one holds, as `read_json` does.
+
+    Args:
+        text: the JSON.
+        kind: what to make of it.
+        where: names the text in errors.
+
+    Raises:
+        ValueError: ``WHERE: key: expected …, got …``.
+
+    >>> parse_json('{"solved": true}', dict[str, int], "line 3")
+    Traceback (most recent call last):
+    ...
+    ValueError: line 3: solved: expected a valid integer, got True
+    """
+    from pydantic import ValidationError
+    from pydantic_core import from_json
+
+    data = text.encode() if isinstance(text, str) else text
+    _check_size(len(data), where)
+    try:
+        from_json(data, allow_inf_nan=False)  # also where a field may hold anything
+    except ValueError as error:
+        raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
+    try:
+        return _adapter(kind).validate_json(b"[%b]" % data)[0]
+    except ValidationError as error:
+        raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+
+
+def write_json(path: str | os.PathLike, value: Any) -> Path:
+    """Write a dataclass, or plain JSON values, in one piece or not at all; return the path.
+
+    Raises:
+        TypeError: if ``value`` holds something that JSON cannot.
+        ValueError: naming file and key, if `read_json` would refuse the file.
+    """
+    path = Path(path)
+    try:
+        text = json.dumps(to_plain(value), indent=1, allow_nan=False) + "\n"
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{path}: {error}") from error
+    parse_json(text, type(value) if is_dataclass(value) else Any, str(path))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def to_plain(value: Any) -> Any:
+    """Turn dataclasses, mappings and sequences into the dicts and lists that a file holds.
+
+    >>> from dataclasses import make_dataclass
+    >>> to_plain(make_dataclass("Note", ["text", ("by", str, None)])(text=("a", "b")))
+    {'text': ['a', 'b']}
+    """
+    if is_dataclass(value):
+        entries = ((field, getattr(value, field.name)) for field in fields(value))
+        return {f.name: to_plain(entry) for f, entry in entries if entry is not None or f.default is not None}
+    if isinstance(value, Mapping):
+        return {key: to_plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(entry) for entry in value]
+    return value
+
+
+@cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import ConfigDict, TypeAdapter
+
+    # Of a dataclass alone pydantic takes no configuration; within a tuple the dataclass, and those in it, follow the tuple's.
+    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    return TypeAdapter(tuple[kind], config=config)
+
+
+def _check_size(size: int, where: str) -> None:
+    if size > MAX_BYTES:
+        raise ValueError(f"{where}: expected at most {MAX_BYTES} bytes of JSON, got {size}")
+
+
+def _fault(error: Mapping[str, Any]) -> str:
+    """What pydantic found, in this package's words."""
+    key = ".".join(str(part) for part in error["loc"][1:])
+    place = f"{key}: " if key else ""
+    got = repr(error["input"])
+    got = got if len(got) <= 80 else f"{got[:77]}..."
+    if error["type"] == "missing":
+        return f"{place}expected this key, got nothing"
+    if error["type"] == "unexpected_keyword_argument":
+        return f"{place}expected no such key, got {got}"
+    if error["type"] == "value_error":
+        return f"{key}.{error['ctx']['error']}" if key else str(error["ctx"]["error"])
+    expected = re.sub(r"^\w+ should (be|have) ", "", error["msg"])
+    return f"{place}expected {expected}, got {got}"

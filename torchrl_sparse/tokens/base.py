@@ -1,0 +1,64 @@
+"""The base of every method that prunes visual tokens, and the two ways to prune them.
+
+* *Before the decoder.* Whoever runs earlier writes ``("tokens", "keep_mask")``, bool [*B, N], True = kept; a pruner may do so
+  in `TokenPruner.begin`.
+* *Between decoder layers.* ``vla.pruner`` is a `TokenPruner` (None is dense), which each query calls like this::
+
+      pruner.bind(spec)     # once, when assigned: sizes to check budgets against
+      pruner.begin(td)      # td: TensorDict [B], the query
+      ...                   # the decoder's layers, see `torchrl_sparse.networks.vla.hooks`
+      pruner.end(td)
+
+**State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
+environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
+`begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
+in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a query,
+such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key; it is missing at the first query of all, and
+rows with ``"is_init"`` start afresh.
+"""
+
+from __future__ import annotations
+
+from tensordict import NestedKey, TensorDictBase
+
+from torchrl_sparse.networks.vla.hooks import LayerHooks, VisualSpec
+
+__all__ = ["TokenPruner"]
+
+
+class TokenPruner(LayerHooks):
+    """Base of everything that prunes visual tokens; this one keeps all. See the module for the order of calls.
+
+    Attributes:
+        in_keys: what `begin` reads beside what the policy reads; keys that the environment lacks are left out.
+        out_keys: what `end` leaves in its TensorDict for the environment; all of them, at every query.
+
+    Examples:
+        >>> class KeepHalf(TokenPruner):
+        ...     def layers_scored(self, num_layers):
+        ...         return {1}
+        ...
+        ...     def after_layer(self, index, state):
+        ...         if index != 1:
+        ...             return None
+        ...         best = state.scores.topk(state.num_visual // 2).indices
+        ...         return state.keep_visual(torch.zeros_like(state.scores, dtype=torch.bool).scatter(1, best, True))
+        >>> sorted(KeepHalf().layers_scored(4))
+        [1]
+    """
+
+    in_keys: list[NestedKey] = []
+    out_keys: list[NestedKey] = []
+
+    def bind(self, spec: VisualSpec) -> None:
+        """Take note of the model that the pruner is assigned to.
+
+        Raises:
+            ValueError: if the pruner does not fit it, for instance a budget larger than its tokens.
+        """
+
+    def begin(self, td: TensorDictBase) -> None:
+        """Prepare a query before the decoder runs, from its inputs in ``td`` [B]."""
+
+    def end(self, td: TensorDictBase) -> None:
+        """Write ``out_keys`` into ``td`` after the decoder."""
