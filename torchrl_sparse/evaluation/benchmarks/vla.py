@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -12,7 +11,6 @@ from tensordict import TensorDictBase
 from torchrl_sparse import keys
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
-from torchrl_sparse.evaluation.figures.tokens import plot_tokens_per_layer
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.evaluation.results.report import MethodRun
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
@@ -20,3 +18,68 @@ from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.vla.token_budget import replay
+
+__all__ = ["check_references", "matched_number", "measure_methods", "replay_all"]
+
+
+def check_references(methods: Mapping[str, TokenMethod]) -> None:
+    """Raise ValueError if a method matches one that is not asked for, or that matches another itself."""
+    plain = [text for text, method in methods.items() if method.like is None]
+    for text, method in methods.items():
+        if method.like is not None and method.like not in plain:
+            raise ValueError(
+                f"methods: {text}: expected one of {', '.join(plain)} after @, got {method.like!r}"
+            )
+
+
+def matched_number(
+    method: TokenMethod,
+    dense: VLAPolicy,
+    recorded: Sequence[Sequence[TensorDictBase]],
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+) -> float | None:
+    """Return the method's number: its own, or the share at which it keeps as many tokens as the method that it matches.
+
+    Args:
+        recorded: queries of dense episodes, see `recorded_queries`.
+        episodes: name -> episodes, those of the method that is matched among them.
+    """
+    if method.like is None:
+        return method.number
+    return matching_share(method.pruner, dense, recorded, token_totals(episodes[method.like]).mean)
+
+
+def measure_methods(
+    policies: Mapping[str, VLAPolicy],
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    recorded: Sequence[Sequence[TensorDictBase]],
+    answers: Mapping[str, TensorDictBase],
+    *,
+    repeats: int,
+    threads: int,
+    device: str,
+) -> dict[str, MethodRun]:
+    """Measure latency and action error of all methods on the same queries, and add them to the episodes.
+
+    Args:
+        policies: name -> policy, ``"dense"`` among them.
+        episodes: name -> its episodes.
+        recorded: queries of dense episodes; the middle one of the first is timed.
+        answers: name -> its answers to all of them, see `replay_all`.
+        repeats, threads, device: see `measure_latency`.
+    """
+    calls = {name: partial(answer, p, mid_episode_query(p, recorded[0])) for name, p in policies.items()}
+    with progress("latency", "round", repeats) as show:
+        latency = measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=show)
+    return {
+        name: MethodRun(
+            episodes[name], latency[name], error_to_dense(policy, answers[name], answers["dense"])
+        )
+        for name, policy in policies.items()
+    }
+
+
+def replay_all(policy: VLAPolicy, recorded: Sequence[Sequence[TensorDictBase]]) -> TensorDictBase:
+    """Return the policy's answers to all queries of all episodes, [Q]: chunks, and how deep each token went."""
+    wanted = (keys.CHUNK, keys.TOKEN_DEPTH)
+    return torch.cat([replay(policy, queries, policy.pruner).select(*wanted) for queries in recorded])

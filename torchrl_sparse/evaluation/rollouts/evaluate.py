@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -13,7 +14,7 @@ from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.runtime.progress import progress
 
-__all__ = ["evaluate", "success_rate"]
+__all__ = ["episode_log", "evaluate", "success_rate"]
 
 
 def evaluate(
@@ -60,3 +61,14 @@ def success_rate(episodes: Sequence[EpisodeResult]) -> float:
     0.5
     """
     return sum(episode.success for episode in episodes) / len(episodes)
+
+
+def episode_log(out: str | os.PathLike, name: str, dense_log: str | os.PathLike | None = None) -> Path:
+    """Return the path of a method's log in the folder ``out``; ``dense_log`` takes the place of that of ``"dense"``.
+
+    >>> episode_log("outputs/lift", "bac").as_posix()
+    'outputs/lift/episodes/bac.jsonl'
+    """
+    if name == "dense" and dense_log is not None:
+        return Path(dense_log)
+    return Path(out) / "episodes" / f"{name}.jsonl"
