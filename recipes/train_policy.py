@@ -20,8 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.robomimic import Demonstrations, read_demos
-from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder

@@ -92,7 +92,9 @@ def untrained_policy(demos: InstructedDemonstrations, config: DictConfig) -> VLA
 def read_objects(config: DictConfig) -> ObjectPositions:
     """Where the objects are that the task's instructions name, in the order of these."""
     positions = read_demos(config.demos, ["object_positions"]).data[keys.STATE]
-    return ObjectPositions(positions.unflatten(1, (-1, 3)), find_robosuite_task(config.task).instructions).standardised()
+    return ObjectPositions(
+        positions.unflatten(1, (-1, 3)), find_robosuite_task(config.task).instructions
+    ).standardised()
 
 
 def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:

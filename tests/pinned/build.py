@@ -15,25 +15,25 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.evaluation.engine_report import format_engine_table
-from torchrl_sparse.evaluation.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.latency import summarize_latency
-from torchrl_sparse.evaluation.methods import MethodName, make_method
-from torchrl_sparse.evaluation.realtime import format_realtime, load_realtime
-from torchrl_sparse.evaluation.report import (
+from torchrl_sparse.evaluation.latency.measure import summarize_latency
+from torchrl_sparse.evaluation.results.engine_report import format_engine_table
+from torchrl_sparse.evaluation.results.realtime import format_realtime, load_realtime
+from torchrl_sparse.evaluation.results.report import (
     MethodRun,
     build_results,
     format_pairs,
     format_table,
     load_results,
 )
-from torchrl_sparse.evaluation.sweeps import Trial, merge_trials
-from torchrl_sparse.evaluation.tracking import trial_metrics
-from torchrl_sparse.evaluation.vla_methods import TokenMethod, matching_share
-from torchrl_sparse.evaluation.vla_report import format_vla_table
+from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
+from torchrl_sparse.evaluation.results.tracking import trial_metrics
+from torchrl_sparse.evaluation.results.vla_report import format_vla_table
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.rollouts.methods import MethodName, make_method
+from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching_share
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
-from torchrl_sparse.tokens.calibration import TokenBudget
+from torchrl_sparse.training.vla.token_budget import TokenBudget
 
 __all__ = [
     "EpisodeResult",
@@ -78,7 +78,7 @@ def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> Chu
     policy = make_method(
         name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=planners, calibration=calibration
     )
-    return ChunkExecutor(policy, n_action_steps=1, gate=MethodName.parse(name).gate())
+    return ChunkExecutor(policy, n_action_steps=1, controller=MethodName.parse(name).controller())
 
 
 def diffusion_query(state: Any, eef_vel: Any, seed: int, step: int) -> TensorDict:

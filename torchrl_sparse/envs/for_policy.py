@@ -8,8 +8,7 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.envs.tasks import find_robosuite_task, find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
