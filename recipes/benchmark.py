@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
-from torchrl_sparse.envs.benchmarks import find_task
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import (
     draw_methods,
     make_methods,

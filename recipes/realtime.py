@@ -18,7 +18,7 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, distinct_delays
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
-from torchrl_sparse.envs.tasks import get_task
+from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
@@ -40,7 +40,7 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 @hydra.main(version_base=None, config_path=".", config_name="realtime")
 def main(config: DictConfig) -> None:
-    out, task, planners = Path(config.out), get_task(config.task), Path(config.planners)
+    out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
@@ -80,7 +80,7 @@ def evaluate_delayed(
     name: str, policy: DiffusionPolicy, steps: int, make_env, seeds: range, config: DictConfig
 ) -> list[EpisodeResult]:
     """Episodes of one method whose answers come ``steps`` late."""
-    hold = HoldPose(get_task(config.task).pose_slices)
+    hold = HoldPose(find_robosuite_task(config.task).pose_slices)
     actor = RealtimeExecutor(
         policy,
         hold,
