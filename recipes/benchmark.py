@@ -30,8 +30,7 @@ from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.report import build_results, save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.evaluation.rollouts.methods import method_identity
-from torchrl_sparse.methods.diffusion import check_method, make_controller
+from torchrl_sparse.methods.diffusion import check_method, make_controller, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -76,9 +75,7 @@ def main(config: DictConfig) -> None:
         }
     settle_rates(methods, episodes)
     queries = record_queries(actors["dense"], make_env, seeds[: config.probe_episodes])
-    runs = measure_methods(
-        methods, episodes, queries, repeats=config.latency_repeats, threads=config.threads
-    )
+    runs = measure_methods(methods, episodes, queries, repeats=config.latency_repeats, threads=config.threads)
     results = build_results(
         runs,
         task=task.name,

@@ -11,11 +11,12 @@ from functools import cache, partial
 from pathlib import Path
 
 import hydra
+import torch
 from omegaconf import DictConfig
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
-from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, distinct_delays
+from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
@@ -31,8 +32,7 @@ from torchrl_sparse.evaluation.results.realtime import (
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.evaluation.rollouts.methods import method_identity
-from torchrl_sparse.methods.diffusion import check_method
+from torchrl_sparse.methods.diffusion import check_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -57,9 +57,10 @@ def main(config: DictConfig) -> None:
     runs = {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all runs
         for name, method in methods.items():
-            delays = distinct_delays([latency[name].p50, *config.latencies], config.control_freq)
+            delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), config.control_freq)
             episodes = {
-                steps: evaluate_delayed(name, method, steps, make_env, seeds, config) for steps in delays
+                steps: evaluate_delayed(name, method, steps, make_env, seeds, config)
+                for steps in delays.unique().tolist()
             }
             runs[name] = RealtimeRun(latency[name].p50, episodes)
     results = build_realtime(

@@ -8,8 +8,8 @@ import pytest
 from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.results.report import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
-from torchrl_sparse.evaluation.rollouts.methods import make_method, method_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
+from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -29,7 +29,7 @@ def outcomes(log: Path) -> dict[int, bool]:
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
     policy = DiffusionPolicy.from_pretrained(folder)
     for log in (folder / "episodes").glob("*.jsonl"):
-        method = make_method(log.stem, policy, num_updates=10, schedules=folder, calibration=pytest.fail)
+        method = make_method(log.stem, policy, num_updates=10, planners=folder, calibration=pytest.fail)
         published = identity(log)
         assert published | method_identity(log.stem, method) == published, log
 

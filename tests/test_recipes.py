@@ -124,7 +124,7 @@ def test_image_policies_go_the_same_way(work, demos):
 def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
-        "task=lift", f"policy={policy}", f"schedules={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
+        "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
         "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "wandb=true", f"out={out}",
     )  # fmt: skip
     output = run("benchmark", *options)
@@ -284,7 +284,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
     methods = ("dense", "l2c", "fixed", "sag@0.5", "sag@0.6-0.4")
     output = run(
-        "benchmark", f"policy={policy}", f"schedules={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
+        "benchmark", f"policy={policy}", f"planners={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
         "episodes=1", "horizon=16", "latency_repeats=2", "probe_episodes=1", "videos=[sag@0.5]", f"out={work}/sparse",
     )  # fmt: skip
     entries = load_results(work / "sparse" / "results.json")["methods"]
@@ -298,7 +298,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
     output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=1)
-    assert "methods: expected dense, ddim<N>, ddim_<t>_<t>..., uniform" in output
+    assert "methods: expected dense, ddim10, ddim<N>, ddim_<t>_<t>..., uniform" in output
     assert "got 'magic'" in output
     assert not (work / "none").exists()
     assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=1)
@@ -311,7 +311,7 @@ def test_a_schedule_of_another_policy_is_refused(work, policy, schedules):
     (work / "foreign" / "bac.json").write_text(json.dumps(foreign))
     options = (
         f"policy={policy}",
-        f"schedules={work}/foreign",
+        f"planners={work}/foreign",
         "num_updates=7",
         "methods=[bac]",
         f"out={work}/none",

@@ -29,8 +29,8 @@ from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.rollouts.methods import MethodName, make_method
 from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching_share
+from torchrl_sparse.methods.diffusion import make_controller, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
 from torchrl_sparse.training.vla.token_budget import TokenBudget
@@ -76,13 +76,13 @@ def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> Chu
         raise AssertionError(f"{name}: expected a shipped schedule, got one to compute")
 
     policy = make_method(
-        name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=planners, calibration=calibration
+        name, _policy(folder, engine), num_updates=_NUM_UPDATES, planners=planners, calibration=calibration
     )
-    return ChunkExecutor(policy, n_action_steps=1, controller=MethodName.parse(name).controller())
+    return ChunkExecutor(policy, n_action_steps=1, controller=make_controller(name))
 
 
 def diffusion_query(state: Any, eef_vel: Any, seed: int, step: int) -> TensorDict:
-    """What the environment shows at a step, [], with what a gate remembers of the steps before."""
+    """What the environment shows at a step, [], with what a controller remembers of the steps before."""
     query = TensorDict({keys.HISTORY_STATE: torch.tensor(state), keys.EEF_VEL: torch.tensor(eef_vel)}, [])
     return _at_step(query, seed, step)
 

@@ -8,6 +8,7 @@ from PIL import Image
 
 from tests.evaluation import synthetic
 from torchrl_sparse.evaluation.figures import labels, plots
+from torchrl_sparse.methods import METHODS
 
 
 def read(path):
@@ -31,8 +32,8 @@ def test_pareto(tmp_path):
     path = plots.plot_pareto(results, tmp_path / "pareto.png")
     assert os.listdir(tmp_path) == ["pareto.png"]
     pixels = read(path)
-    for color in plots._METHOD_COLORS.values():
-        assert has_color(pixels, color)
+    for name in results["methods"]:
+        assert has_color(pixels, METHODS[name].color)
 
 
 def test_pareto_of_the_reference_alone(tmp_path):
@@ -97,7 +98,7 @@ def test_error_surge(tmp_path):
     masks = synthetic.make_masks()
     pixels = read(plots.plot_error_surge(synthetic.make_errors(), masks, tmp_path / "error_surge.png"))
     for name in masks:
-        assert has_color(pixels, plots._METHOD_COLORS[name])
+        assert has_color(pixels, METHODS[name].color)
 
 
 def test_block_labels():

@@ -59,7 +59,7 @@ def film_masks(
 def film_tokens(
     name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path
 ) -> None:
-    """Film what a vision-language-action policy sees and keeps in an episode; besides, a strip of it and the controller's timeline.
+    """Film what a vision-language-action policy sees and keeps in an episode; draw a strip of it, and when motion was fine.
 
     Args:
         name: of the method; the files are ``out/rollout_NAME.mp4``, ``strip_NAME.png`` and ``control_NAME.png``.

@@ -64,6 +64,4 @@ def format_benchmark(
         episodes: method -> its episodes.
         pairs, margin: see `format_pairs`.
     """
-    return "\n\n".join(
-        [format_table(results), *([format_pairs(episodes, pairs, margin)] if pairs else [])]
-    )
+    return "\n\n".join([format_table(results), *([format_pairs(episodes, pairs, margin)] if pairs else [])])

@@ -15,6 +15,7 @@ import numpy as np
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.labels import place_labels
 from torchrl_sparse.evaluation.results.schema import REFERENCE, validate_results
+from torchrl_sparse.methods.diffusion import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,16 +27,7 @@ BLOCK_TYPES = ("SA", "CA", "FFN")
 TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
 REUSED_COLOR = "#E9E9EC"
 _FRONT_COLOR = "#B5B5BA"
-# Okabe and Ito's colours, which stay apart for colour-blind readers. The methods of the standard benchmark
-# have the same one in every figure; others take what is left.
-_METHOD_COLORS = {
-    REFERENCE: "#333333",
-    "ddim10": "#E69F00",
-    "uniform": "#56B4E9",
-    "bac_unified": "#CC79A7",
-    "bac_blockwise": "#D55E00",
-    "bac": "#0072B2",
-}
+# For methods whose table names no colour.
 _OTHER_COLORS = (
     *("#009E73", "#8C6BB1", "#A6761D", "#B2182B", "#4D4D4D", "#66A61E"),
     *("#E7298A", "#1B7F79", "#BCBD22", "#3F2A8C", "#F46D43", "#74A9CF"),
@@ -79,7 +71,7 @@ def plot_pareto(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
     margin = 100 * methods[REFERENCE]["paired_vs_dense"]["margin"]
     axes.axhline(
         rate[REFERENCE] - margin,
-        color=_METHOD_COLORS[REFERENCE],
+        color=METHODS[REFERENCE].color,
         linewidth=1,
         linestyle=(0, (4, 3)),
         alpha=0.6,
@@ -298,9 +290,10 @@ def _plain_log_axis(axes: "Axes", low: float, high: float) -> None:
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """name -> colour, the same one in every figure for the methods of the standard benchmark."""
+    """Return name -> colour: that of `METHODS`, the same one in every figure, or one that is left."""
     others = itertools.cycle(_OTHER_COLORS)
-    return {name: _METHOD_COLORS.get(name) or next(others) for name in methods}
+    named = {name: METHODS[name].color for name in methods if name in METHODS}
+    return {name: named.get(name) or next(others) for name in methods}
 
 
 def _check_mask(mask: Any, name: str) -> np.ndarray:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.results.engine_report import engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import format_percent, load_results, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["Row", "Table", "read_table"]

@@ -170,7 +170,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
+        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
         digest = hashlib.sha256()
         for part in (self.network, self.vision):
             if part is not None:
