@@ -52,7 +52,7 @@ def film_masks(
         env.base_env.reset()
         env.base_env.render(_CAMERA, _SIZE, _SIZE)  # fails here where there is no GL library
         steps = env.rollout(env.base_env.horizon, actor, callback=photograph)
-        photograph(env, steps[-1])
+        photograph(env, steps[-1])  # a rollout does not call back after its last step
     write_video(frames, out / f"rollout_{name}.mp4", captions=captions(name, steps))
 
 
@@ -68,11 +68,9 @@ def film_tokens(
     with closing(make_env(seeds=[seed])) as env:
         steps = env.rollout(env.base_env.horizon, actor, auto_cast_to_device=True).cpu()
     draw = partial(draw_tokens, num_layers=actor.policy.network.config.llm.layers, scale=_ZOOM)
-    depths = steps[keys.TOKEN_DEPTH].numpy()
-    seen = [*steps.unbind(0), steps[-1]["next"]]
     pictures = [
-        draw(seen_images(actor.policy, step).numpy(), depth)
-        for step, depth in zip(seen, [*depths, depths[-1]], strict=True)
+        draw(seen_images(actor.policy, step).numpy(), step[keys.TOKEN_DEPTH].numpy())
+        for step in steps.unbind(0)
     ]
     write_video(pictures, out / f"rollout_{name}.mp4", captions=captions(name, steps))
     queries = steps[keys.QUERIED].flatten().nonzero().flatten().tolist()
@@ -90,16 +88,15 @@ def film_tokens(
 
 
 def captions(name: str, steps: TensorDictBase) -> list[Caption]:
-    """Return what to write under the pictures of an episode [T]: one before each step, and one after the last.
+    """Return what to write under the picture of each step of an episode [T].
 
     Args:
         name: of the method.
-        steps: [T], whose first one queries the policy.
+        steps: [T], of which the first queries the policy.
     """
     made, latency = [], None
     for index, step in enumerate(steps.unbind(0)):
         queried = bool(step[keys.QUERIED])
         latency = float(step[keys.LATENCY]) if queried else latency
-        made.append(Caption(name, index, queried, latency, bool(step[keys.SUCCESS])))
-    solved = bool(steps["next", keys.SUCCESS][-1])
-    return [*made, Caption(name, len(made), False, latency, solved)]
+        made.append(Caption(name, index, queried, latency, bool(step["next", keys.SUCCESS])))
+    return made
