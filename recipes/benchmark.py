@@ -27,7 +27,8 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.report import build_results, save_results
+from torchrl_sparse.evaluation.results.report import build_results
+from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, make_controller, method_identity

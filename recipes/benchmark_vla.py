@@ -25,10 +25,11 @@ from torchrl_sparse.evaluation.benchmarks.vla import (
     measure_methods,
     replay_all,
 )
-from torchrl_sparse.evaluation.figures.plots import plot_pareto
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import plot_tokens_per_layer
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.report import build_results, save_results
+from torchrl_sparse.evaluation.results.report import build_results
+from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, method_identity

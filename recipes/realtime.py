@@ -21,13 +21,13 @@ from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
+from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
     format_realtime,
-    plot_realtime,
     save_realtime,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult

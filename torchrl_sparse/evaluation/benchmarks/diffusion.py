@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from tensordict import TensorDictBase
 
@@ -13,14 +12,15 @@ from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
 from torchrl_sparse.evaluation.figures.masks import plot_mask_statistics, plot_mask_strip
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.plots import (
     plot_error_surge,
-    plot_pareto,
     plot_schedule,
     plot_similarity,
 )
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 from torchrl_sparse.evaluation.results.report import MethodRun
+from torchrl_sparse.evaluation.results.schema import Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.statistics.fidelity import block_errors
 from torchrl_sparse.methods.diffusion import MethodName, make_method
@@ -91,7 +91,7 @@ def measure_methods(
 
 
 def draw_methods(
-    results: Mapping[str, Any],
+    results: Results,
     methods: Mapping[str, DiffusionPolicy],
     queries: TensorDictBase,
     calibration: Calibration,
@@ -110,7 +110,7 @@ def draw_methods(
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
     masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
     for name, mask in masks.items():
-        ratio = results["methods"][name]["flops"]["ratio_to_dense"]
+        ratio = results.methods[name].flops.ratio_to_dense
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
     for name, method in _adaptive(methods).items():
         _draw_masks(name, method, queries, out)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.results.report import format_pairs, format_table
+from torchrl_sparse.evaluation.results.schema import PolicyShape, Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.fidelity import action_error
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -17,24 +17,24 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 __all__ = ["describe_policy", "error_to_dense", "format_benchmark"]
 
 
-def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) -> dict[str, int]:
-    """Return the ``policy`` object of ``results.json``.
+def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) -> PolicyShape:
+    """Return what ``results.json`` says of the policy.
 
     Args:
         policy: the dense policy.
         n_action_steps: actions of a chunk that are executed.
 
     Examples:
-        >>> describe_policy(DiffusionPolicy.from_pretrained("assets/lift"), 8)["num_inference_steps"]
+        >>> describe_policy(DiffusionPolicy.from_pretrained("assets/lift"), 8).num_inference_steps
         100
     """
-    return {
-        "params": sum(parameter.numel() for parameter in policy.network.parameters()),
-        "num_inference_steps": policy.num_inference_steps,
-        "horizon": policy.horizon,
-        "n_obs_steps": policy.n_obs_steps,
-        "n_action_steps": n_action_steps,
-    }
+    return PolicyShape(
+        params=sum(parameter.numel() for parameter in policy.network.parameters()),
+        num_inference_steps=policy.num_inference_steps,
+        horizon=policy.horizon,
+        n_obs_steps=policy.n_obs_steps,
+        n_action_steps=n_action_steps,
+    )
 
 
 def error_to_dense(
@@ -52,7 +52,7 @@ def error_to_dense(
 
 
 def format_benchmark(
-    results: Mapping[str, Any],
+    results: Results,
     episodes: Mapping[str, Sequence[EpisodeResult]],
     pairs: Sequence[Sequence[str]],
     margin: float,
