@@ -14,14 +14,15 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.benchmarks.film import film_tokens
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
 from torchrl_sparse.evaluation.benchmarks.vla import (
-    check_references,
     matched_number,
+    matches_last,
     measure_methods,
     replay_all,
 )
@@ -32,31 +33,32 @@ from torchrl_sparse.evaluation.results.report import build_results
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, method_identity
-from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
+from torchrl_sparse.methods.vla import check_matches, make_controller, make_pruner
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.vla.token_budget import recorded_queries
 
 
 @hydra.main(version_base=None, config_path=".", config_name="benchmark_vla")
 def main(config: DictConfig) -> None:
-    out, options = Path(config.out), OmegaConf.to_container(config.specprune)
-    methods = {text: TokenMethod.parse(text) for text in dict.fromkeys(["dense", *config.methods])}
-    check_references(methods)
+    out, options = Path(config.out), {"specprune": OmegaConf.to_container(config.specprune)}
+    methods = [*dict.fromkeys(["dense", *config.methods])]
+    check_matches(methods)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
     make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     seeds = evaluation_seeds(config.seed, config.episodes)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
-    probed, actor = seeds[: config.probe_episodes], methods["dense"].executor(dense, config.n_action_steps)
-    recorded = recorded_queries(dense, actor, make_env, probed)
+    probed = seeds[: config.probe_episodes]
+    recorded = recorded_queries(dense, ChunkExecutor(dense, config.n_action_steps), make_env, probed)
     recorded = [*tqdm(recorded, total=len(probed), unit="episode", desc="recording")]
 
     actors, episodes = {}, {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all methods
-        for name, method in sorted(methods.items(), key=lambda item: item[1].like is not None):
-            number = matched_number(method, dense, recorded, episodes)
-            policy = with_pruner(dense, method.pruner(number, options))
-            actors[name] = method.executor(policy, config.n_action_steps)
+        for name in matches_last(methods):
+            number = matched_number(name, dense, recorded, episodes, options)
+            policy = dense.with_pruner(make_pruner(name, number=number, settings=options))
+            actors[name] = ChunkExecutor(policy, config.n_action_steps, make_controller(name))
             episodes[name] = evaluate(
                 name,
                 actors[name],

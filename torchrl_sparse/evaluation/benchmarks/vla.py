@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 
 import torch
@@ -14,39 +14,43 @@ from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.evaluation.results.report import MethodRun
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
-from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching_share, mid_episode_query
+from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share, mid_episode_query
+from torchrl_sparse.methods.vla import Settings, TokenMethodName, make_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.vla.token_budget import replay
 
-__all__ = ["check_references", "matched_number", "measure_methods", "replay_all"]
-
-
-def check_references(methods: Mapping[str, TokenMethod]) -> None:
-    """Raise ValueError if a method matches one that is not asked for, or that matches another itself."""
-    plain = [text for text, method in methods.items() if method.like is None]
-    for text, method in methods.items():
-        if method.like is not None and method.like not in plain:
-            raise ValueError(
-                f"methods: {text}: expected one of {', '.join(plain)} after @, got {method.like!r}"
-            )
+__all__ = ["matched_number", "matches_last", "measure_methods", "replay_all"]
 
 
 def matched_number(
-    method: TokenMethod,
+    text: str,
     dense: VLAPolicy,
     recorded: Sequence[Sequence[TensorDictBase]],
     episodes: Mapping[str, Sequence[EpisodeResult]],
+    settings: Settings,
 ) -> float | None:
-    """Return the method's number: its own, or the share at which it keeps as many tokens as the method that it matches.
+    """Return a method's number: its own, or the share at which it keeps as many tokens as the method that it matches.
 
     Args:
+        text: the method, see `torchrl_sparse.methods.vla`.
+        dense: the dense policy.
         recorded: queries of dense episodes, see `recorded_queries`.
         episodes: name -> episodes, those of the method that is matched among them.
+        settings: see `make_pruner`.
     """
-    if method.like is None:
-        return method.number
-    return matching_share(method.pruner, dense, recorded, token_totals(episodes[method.like]).mean)
+    written = TokenMethodName.parse(text)
+    if written.like is None:
+        return written.number
+    kept = token_totals(episodes[written.like]).mean
+    return matching_share(
+        lambda share: make_pruner(text, number=share, settings=settings), dense, recorded, kept
+    )
+
+
+def matches_last(texts: Iterable[str]) -> list[str]:
+    """Return methods in the order in which they can run: those that match another after all others."""
+    return sorted(texts, key=lambda text: TokenMethodName.parse(text).like is not None)
 
 
 def measure_methods(

@@ -11,6 +11,7 @@ from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
 
+
 @dataclass(frozen=True)
 class EpisodeResult:
     """One finished episode.
