@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from torchrl_sparse.methods.diffusion import METHODS
+from torchrl_sparse.methods import METHODS, TOKEN_METHODS
 
 __all__ = ["OTHER_COLORS", "REUSED_COLOR", "TYPE_COLORS", "method_colors"]
 
@@ -23,11 +23,12 @@ OTHER_COLORS = (
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """Give every method a colour: that of `METHODS`, the same one in every figure, or one that is left.
+    """Give every method a colour: that of its table, the same one in every figure, or one that is left.
 
     >>> method_colors(["mine", "bac"])
     {'mine': '#009E73', 'bac': '#0072B2'}
     """
-    others = itertools.cycle(OTHER_COLORS)
-    known = {name: method.color for name, method in METHODS.items()}
-    return {name: known.get(name) or next(others) for name in methods}
+    methods, tables = list(methods), {**TOKEN_METHODS, **METHODS}
+    known = {name: tables[name].color for name in methods if name in tables and tables[name].color}
+    left = itertools.cycle([color for color in OTHER_COLORS if color not in known.values()] or OTHER_COLORS)
+    return {name: known.get(name) or next(left) for name in methods}
