@@ -42,7 +42,7 @@ Settings = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class TokenMethod:
-    """How to make a method.
+    """One entry of the table: how a method is made, controlled and drawn.
 
     Attributes:
         make: called with keyword arguments; returns the pruner, or None for the dense policy.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 
-from torchrl_sparse.methods import METHODS, TOKEN_METHODS
+from torchrl_sparse.methods.diffusion import METHODS
+from torchrl_sparse.methods.vla import TOKEN_METHODS
 
 __all__ = ["OTHER_COLORS", "REUSED_COLOR", "TYPE_COLORS", "method_colors"]
 
@@ -25,10 +26,19 @@ OTHER_COLORS = (
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
     """Give every method a colour: that of its table, the same one in every figure, or one that is left.
 
-    >>> method_colors(["mine", "bac"])
-    {'mine': '#009E73', 'bac': '#0072B2'}
+    A method is looked up without what follows ``@``; of several that differ in that alone, the first has the table's colour.
+
+    >>> method_colors(["mine", "bac", "fastv@0.3", "fastv@0.5"])
+    {'mine': '#009E73', 'bac': '#0072B2', 'fastv@0.3': '#4D4D4D', 'fastv@0.5': '#8C6BB1'}
     """
-    methods, tables = list(methods), {**TOKEN_METHODS, **METHODS}
-    known = {name: tables[name].color for name in methods if name in tables and tables[name].color}
-    left = itertools.cycle([color for color in OTHER_COLORS if color not in known.values()] or OTHER_COLORS)
-    return {name: known.get(name) or next(left) for name in methods}
+    methods, known = (
+        list(methods),
+        {name: method.color for name, method in {**TOKEN_METHODS, **METHODS}.items()},
+    )
+    named: dict[str, str] = {}
+    for name in methods:
+        color = known.get(name.partition("@")[0])
+        if color is not None and color not in named.values():
+            named[name] = color
+    left = itertools.cycle(color for color in OTHER_COLORS if color not in named.values())
+    return {name: named.get(name) or next(left) for name in methods}
