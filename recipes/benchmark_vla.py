@@ -66,7 +66,9 @@ def main(config: DictConfig) -> None:
     methods = [*dict.fromkeys(["dense", *config.methods])]
     check_matches(methods)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
-    environment = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
+    environment = instructed_env(
+        config.task, dense.network.config, chosen_cameras(config.cameras), config.horizon
+    )
     seeds = range(EVALUATION_SEED + config.seed, EVALUATION_SEED + config.seed + config.episodes)
     actor = executor("dense", dense, config)
     recorded = recorded_queries(dense, actor, environment, seeds[: config.probe_episodes])
