@@ -46,7 +46,8 @@ def main(config: DictConfig) -> None:
     methods = [*dict.fromkeys(["dense", *config.methods])]
     check_matches(methods)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
-    make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
+    cameras = chosen_cameras(config.cameras)
+    make_env = instructed_env(config.task, dense.network.config, cameras, config.horizon)
     seeds = evaluation_seeds(config.seed, config.episodes)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = seeds[: config.probe_episodes]

@@ -14,15 +14,12 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
+from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.figures.latency import plot_vla_times
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.schema import DENSE
-from torchrl_sparse.evaluation.results.vla_report import (
-    format_vla_table,
-    measure_vla,
-    save_vla_results,
-)
+from torchrl_sparse.evaluation.results.vla_report import format_vla_table, save_vla_results
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune

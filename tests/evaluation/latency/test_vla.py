@@ -12,9 +12,10 @@ import torch
 pytest.importorskip("transformers")
 
 from torchrl_sparse import keys
+from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import SHAPES, VLACase, make_policy
-from torchrl_sparse.evaluation.results.vla_report import load_vla_results, measure_vla
+from torchrl_sparse.evaluation.results.vla_report import load_vla_results
 from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops
 from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
 
