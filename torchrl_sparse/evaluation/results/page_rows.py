@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.results.engine_report import engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import format_percent, load_results, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.methods import EVALUATION_SEED
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["Row", "Table", "read_table"]
@@ -105,8 +105,7 @@ def _vla(path: Path) -> dict[str, Table]:
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
     dense = next(iter(results["methods"].values()))
-    first = EVALUATION_SEED + results["seed"]
-    seeds = range(first, first + dense["success"]["n"])
+    seeds = evaluation_seeds(results["seed"], dense["success"]["n"])
     names = {name for pair in pairs for name in pair}
     episodes = {name: list(_episodes(path.parent / "episodes" / f"{name}.jsonl", seeds)) for name in names}
     rows = pair_rows(episodes, pairs, dense["paired_vs_dense"]["margin"])
