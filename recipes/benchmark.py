@@ -19,16 +19,15 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer, record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.masks import mask_panel, plot_mask_statistics, plot_mask_strip
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.plots import (
     plot_error_surge,
-    plot_pareto,
     plot_schedule,
     plot_similarity,
 )
@@ -40,18 +39,19 @@ from torchrl_sparse.evaluation.results.report import (
     build_results,
     format_pairs,
     format_table,
-    save_results,
 )
+from torchrl_sparse.evaluation.results.schema import PolicyShape, Results, save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.rollouts.methods import (
+from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
+from torchrl_sparse.methods.diffusion import (
     MethodName,
     check_method,
+    make_controller,
     make_method,
     method_identity,
 )
-from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
-from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -66,7 +66,7 @@ def main(config: DictConfig) -> None:
     if config.n_action_steps is None:
         config.n_action_steps = published_shape(task.name).n_action_steps
     for name in config.methods:
-        check_method(name, Path(config.schedules))
+        check_method(name, Path(config.planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = diffusion_env(task.name, policy, config.horizon)
 
@@ -81,7 +81,7 @@ def main(config: DictConfig) -> None:
             name,
             policy,
             num_updates=config.num_updates,
-            schedules=Path(config.schedules),
+            planners=Path(config.planners),
             calibration=calibration,
         )
         for name in names
@@ -103,9 +103,7 @@ def main(config: DictConfig) -> None:
             threads=config.threads,
             on_round=lambda done, total: bar.update(done - bar.n),
         )
-    adaptive = {
-        name: method for name, method in methods.items() if not isinstance(method.plan, StaticPlanner)
-    }
+    adaptive = {name: method for name, method in methods.items() if not method.plan.is_static}
     planning = time_planning(adaptive, queries, threads=config.threads)
     errors = {name: error_to_dense(method, queries) for name, method in methods.items()}
 
@@ -132,9 +130,7 @@ def main(config: DictConfig) -> None:
 
 
 def executor(name: str, policy: DiffusionPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(
-        policy, n_action_steps=config.n_action_steps, controller=MethodName.parse(name).controller()
-    )
+    return ChunkExecutor(policy, n_action_steps=config.n_action_steps, controller=make_controller(name))
 
 
 def evaluate(
@@ -182,25 +178,25 @@ def error_to_dense(method: DiffusionPolicy, queries: TensorDictBase) -> tuple[fl
     return action_error(normalize(answer(method, queries)[keys.CHUNK]), normalize(queries[keys.CHUNK]))
 
 
-def describe(policy: DiffusionPolicy, config: DictConfig) -> dict[str, int]:
-    return {
-        "params": sum(parameter.numel() for parameter in policy.network.parameters()),
-        "num_inference_steps": policy.num_inference_steps,
-        "horizon": policy.horizon,
-        "n_obs_steps": policy.n_obs_steps,
-        "n_action_steps": config.n_action_steps,
-    }
+def describe(policy: DiffusionPolicy, config: DictConfig) -> PolicyShape:
+    return PolicyShape(
+        params=sum(parameter.numel() for parameter in policy.network.parameters()),
+        num_inference_steps=policy.num_inference_steps,
+        horizon=policy.horizon,
+        n_obs_steps=policy.n_obs_steps,
+        n_action_steps=config.n_action_steps,
+    )
 
 
-def draw(results: dict, methods: dict[str, DiffusionPolicy], calibration, queries, out: Path) -> None:
+def draw(results: Results, methods: dict[str, DiffusionPolicy], calibration, queries, out: Path) -> None:
     plot_pareto(results, out / "pareto.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
     masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
     for name, mask in masks.items():
-        ratio = results["methods"][name]["flops"]["ratio_to_dense"]
+        ratio = results.methods[name].flops.ratio_to_dense
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
     for name, method in methods.items():
-        if not isinstance(method.plan, StaticPlanner):
+        if not method.plan.is_static:
             draw_masks(name, method, queries, out)
     surging = {name: masks[name] for name in SURGE_METHODS if name in masks}
     if surging:
@@ -234,7 +230,7 @@ def film(
             continue
         env = environment(seeds=[seed])
         try:
-            adaptive = not isinstance(methods[name].plan, StaticPlanner)
+            adaptive = not methods[name].plan.is_static
             frames, captions = follow(name, executor(name, methods[name], config), env, adaptive)
         except RuntimeError as error:
             print(f"no video: {error}")

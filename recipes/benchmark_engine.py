@@ -15,11 +15,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_sparse.blocks.bac import BAC
+from torchrl_sparse.evaluation.figures.latency import plot_engine_times
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
+    SCHEMA,
+    EngineResults,
+    EngineShape,
     format_engine_table,
-    plot_engine_times,
     save_engine_results,
     shape_results,
 )
@@ -33,20 +36,20 @@ QUICK_STEPS = 20
 @hydra.main(version_base=None, config_path=".", config_name="benchmark_engine")
 def main(config: DictConfig) -> None:
     out = Path(config.out)
-    results = {"schema": 1, "machine": describe_machine(threads=config.threads), "shapes": {}}
+    results = EngineResults(SCHEMA, describe_machine(threads=config.threads), {})
     for entry in config.cases:
         name = f"{entry.shape}_b{entry.batch}"
         with num_threads(config.threads):
-            results["shapes"][name] = run_case(name, entry, config)
+            results.shapes[name] = run_case(name, entry, config)
         # After each case, so that a run that is stopped leaves what it has.
         save_engine_results(results, out / "engine.json")
-        shape = results["shapes"][name]
-        plot_engine_times(name, shape, results["machine"], out / f"engine_{name}.png")
+        shape = results.shapes[name]
+        plot_engine_times(name, shape, results.machine, out / f"engine_{name}.png")
         print(f"\n{format_engine_table(name, shape)}\n")
     print(f"files are in {out}")
 
 
-def run_case(name: str, entry: DictConfig, config: DictConfig) -> dict:
+def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
     network, bac_mask = make_network(entry.shape, quick=config.quick), None
     if entry.shape == "low_dim" and config.policy is not None and not config.quick:
         network, bac_mask = load_trained(Path(config.policy))

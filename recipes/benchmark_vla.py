@@ -24,7 +24,7 @@ from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
 from torchrl_sparse.envs.seeds import EVALUATION_SEED
-from torchrl_sparse.evaluation.figures.plots import plot_pareto
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import (
     draw_tokens,
     plot_control,
@@ -38,8 +38,8 @@ from torchrl_sparse.evaluation.results.report import (
     build_results,
     format_pairs,
     format_table,
-    save_results,
 )
+from torchrl_sparse.evaluation.results.schema import PolicyShape, save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
@@ -164,14 +164,14 @@ def error_to_dense(dense: VLAPolicy, ours: TensorDictBase, theirs: TensorDictBas
     return action_error(normalize(ours[keys.CHUNK]), normalize(theirs[keys.CHUNK]))
 
 
-def describe(policy: VLAPolicy, config: DictConfig) -> dict[str, int]:
-    return {
-        "params": sum(parameter.numel() for parameter in policy.network.parameters()),
-        "num_inference_steps": 1,
-        "horizon": policy.network.config.chunk_size,
-        "n_obs_steps": 1,
-        "n_action_steps": config.n_action_steps,
-    }
+def describe(policy: VLAPolicy, config: DictConfig) -> PolicyShape:
+    return PolicyShape(
+        params=sum(parameter.numel() for parameter in policy.network.parameters()),
+        num_inference_steps=1,
+        horizon=policy.network.config.chunk_size,
+        n_obs_steps=1,
+        n_action_steps=config.n_action_steps,
+    )
 
 
 def film(name: str, policy: VLAPolicy, env: EnvBase, config: DictConfig) -> None:

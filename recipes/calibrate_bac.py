@@ -25,7 +25,7 @@ def main(config: DictConfig) -> None:
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
     for name in config.methods:
-        options = {"top_k": config.top_k, "transitive": config.transitive} if name == "bac" else {}
+        options = {"top_k": config.top_k} if name == "bac" else {}
         schedule = SCHEDULES[name](
             calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
         )

@@ -15,13 +15,13 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_sparse.evaluation.figures.latency import plot_vla_times
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
+from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.vla_report import (
-    DENSE,
     format_vla_table,
     measure_vla,
-    plot_vla_times,
     save_vla_results,
 )
 from torchrl_sparse.runtime.threads import num_threads
@@ -35,15 +35,14 @@ def main(config: DictConfig) -> None:
         policy = make_policy(config.shape, dtype=getattr(torch, config.dtype), device=config.device)
         case = VLACase(policy, make_pruners(config))
         with tqdm(total=config.repeats, unit="round") as bar:
-            measured = measure_vla(
+            results = measure_vla(
                 case,
+                name=config.shape,
+                machine=describe_machine(config.device, config.threads),
                 repeats=config.repeats,
                 warmup=config.warmup,
                 on_round=lambda done, total: bar.update(done - bar.n),
             )
-    machine = describe_machine(config.device, config.threads)
-    results = {"schema": 1, "machine": machine, **measured}
-    results["shape"] = {"name": config.shape, **measured["shape"]}
     out = Path(config.out)
     save_vla_results(results, out / "vla_latency.json")
     plot_vla_times(results, out / "vla_latency.png")

@@ -21,22 +21,18 @@ from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor,
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, EVALUATION_SEED
 from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
     format_realtime,
-    plot_realtime,
     save_realtime,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.methods import (
-    check_method,
-    make_method,
-    method_identity,
-)
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.methods.diffusion import check_method, make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -46,7 +42,7 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 def main(config: DictConfig) -> None:
     out, task = Path(config.out), find_robosuite_task(config.task)
     for name in config.methods:
-        check_method(name, Path(config.schedules))
+        check_method(name, Path(config.planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     environment = diffusion_env(task.name, policy, config.horizon)
     first = EVALUATION_SEED + config.seed
@@ -61,7 +57,7 @@ def main(config: DictConfig) -> None:
         make_method,
         policy=policy,
         num_updates=config.num_updates,
-        schedules=Path(config.schedules),
+        planners=Path(config.planners),
         calibration=calibration,
     )
     methods = {name: make(name) for name in dict.fromkeys(["dense", *config.methods])}

@@ -9,28 +9,24 @@ The same file works with `wandb sweep recipes/sweeps/rho_lift.yaml` and `wandb a
 
 from __future__ import annotations
 
-import csv
-import fcntl
 import os
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_sparse.evaluation.figures.plots import plot_pareto
-from torchrl_sparse.evaluation.results.report import format_table, save_results
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
+from torchrl_sparse.evaluation.results.report import format_table
+from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
-    Trial,
+    lock_folder,
     merge_trials,
     read_sweep,
-    trial_command,
+    run_trial,
+    write_trials,
 )
-from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.storage.atomic import atomic_path
 
 RECIPES = Path(__file__).parent
@@ -57,21 +53,8 @@ def main(config: DictConfig) -> None:
         summarise(sweep)
 
 
-@contextmanager
-def lock_folder(out: Path) -> Iterator[int]:
-    """Waits until nothing else works in the folder; the trial inherits the lock, since it outlives a sweep that is killed."""
-    out.mkdir(parents=True, exist_ok=True)
-    with open(out / ".lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print(f"waiting for a trial that still runs in {out}", flush=True)
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield file.fileno()
-
-
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
-    """Creates the sweep, unless an earlier call did, and runs its trials here."""
+    """Create the sweep, unless an earlier call did, and run its trials here."""
     import wandb
 
     note = out / "sweep_id"
@@ -81,38 +64,14 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     wandb.agent(note.read_text(), project=config.project, count=config.count)
 
 
-def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
-    environment = os.environ | {
-        "WANDB_MODE": "offline",
-        "WANDB_RUN_ID": trial.id,
-        "WANDB_RUN_GROUP": sweep.out.name,
-    }
-    command = trial_command(sweep.config, trial)
-    code = subprocess.run(command, env=environment, pass_fds=[lock]).returncode
-    if code:
-        raise RuntimeError(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
-    sweep.finish(trial)
-
-
 def summarise(sweep: LocalSweep) -> None:
-    """A table and a Pareto picture of all trials."""
+    """Write a table and a Pareto picture of all trials."""
     trials = sweep.results()
     results = merge_trials(trials)
     save_results(results, sweep.out / "results.json")
     plot_pareto(results, sweep.out / "pareto.png")
-    rows = [{**t.parameters, **select(trial_metrics(r)), "run": t.id} for t, r in trials]
-    with atomic_path(sweep.out / "trials.csv") as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"\n{format_table(results)}\n\n{len(rows)} trials; files are in {sweep.out}")
-
-
-def select(metrics: dict[str, float]) -> dict[str, float]:
-    """What was tested, without the prefix."""
-    return {
-        name.removeprefix("tested/"): value for name, value in metrics.items() if name.startswith("tested/")
-    }
+    write_trials(trials, sweep.out / "trials.csv")
+    print(f"\n{format_table(results)}\n\n{len(trials)} trials; files are in {sweep.out}")
 
 
 if __name__ == "__main__":

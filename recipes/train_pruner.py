@@ -100,14 +100,7 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED
 
     task, schedules = find_task(config.task), initial_schedules(config)
-    played = DiffusionPolicy(
-        policy.network,
-        policy.normalizer,
-        vision=policy.vision,
-        sampler=policy.sampler,
-        plan=SchedulePlanner.from_pretrained(schedules[0]) if schedules else None,
-        engine=policy.engine,
-    )
+    played = policy.with_plan(SchedulePlanner.from_pretrained(schedules[0]) if schedules else None)
     actor = ChunkExecutor(played, n_action_steps=published_shape(task.name).n_action_steps)
     seeds = range(CLOSED_LOOP_SEED, CLOSED_LOOP_SEED + config.rollouts)
     return record_queries(actor, diffusion_env(task.name, policy), seeds)

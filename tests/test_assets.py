@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from torchrl_sparse.envs.seeds import EVALUATION_SEED
-from torchrl_sparse.evaluation.results.report import load_results
+from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
-from torchrl_sparse.evaluation.rollouts.methods import make_method, method_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
+from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -29,7 +29,7 @@ def outcomes(log: Path) -> dict[int, bool]:
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
     policy = DiffusionPolicy.from_pretrained(folder)
     for log in (folder / "episodes").glob("*.jsonl"):
-        method = make_method(log.stem, policy, num_updates=10, schedules=folder, calibration=pytest.fail)
+        method = make_method(log.stem, policy, num_updates=10, planners=folder, calibration=pytest.fail)
         published = identity(log)
         assert published | method_identity(log.stem, method) == published, log
 
@@ -40,15 +40,15 @@ def test_tables_count_the_episodes(folder):
     tabled = set()
     for path in sorted(folder.glob("results*.json")):
         results = load_results(path)
-        for name in results["methods"].keys() & logs.keys():
-            entry = results["methods"][name]
-            first = EVALUATION_SEED + results["seed"]
-            seeds = range(first, first + entry["success"]["n"])
+        for name in results.methods.keys() & logs.keys():
+            success, paired = results.methods[name].success, results.methods[name].paired_vs_dense
+            first = EVALUATION_SEED + results.seed
+            seeds = range(first, first + success.n)
             ours, dense = ([logs[method][seed] for seed in seeds] for method in (name, "dense"))
-            assert entry["success"]["k"] == sum(ours), (path, name)
+            assert success.k == sum(ours), (path, name)
             if name != "dense":
-                difference = paired_difference(ours, dense, entry["paired_vs_dense"]["margin"])
-                assert entry["paired_vs_dense"]["diff"] == pytest.approx(difference.diff)
-                assert entry["paired_vs_dense"]["verdict"] == difference.verdict
+                difference = paired_difference(ours, dense, paired.margin)
+                assert paired.diff == pytest.approx(difference.diff)
+                assert paired.verdict == difference.verdict
             tabled.add(name)
     assert tabled == logs.keys()

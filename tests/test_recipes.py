@@ -79,9 +79,7 @@ def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
         "benchmark", f"policy={policy}", f"methods=[dense,{path.stem}]", "episodes=1", "horizon=16", "latency_repeats=2",
         "probe_episodes=1", f"out={work}/few",
     )  # fmt: skip
-    assert (
-        load_results(work / "few" / "results.json")["methods"][path.stem]["flops"]["ratio_to_dense"] == 0.02
-    )
+    assert load_results(work / "few" / "results.json").methods[path.stem].flops.ratio_to_dense == 0.02
 
 
 def test_training_exports_a_policy(policy):
@@ -124,15 +122,15 @@ def test_image_policies_go_the_same_way(work, demos):
 def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
-        "task=lift", f"policy={policy}", f"schedules={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
+        "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
         "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "wandb=true", f"out={out}",
     )  # fmt: skip
     output = run("benchmark", *options)
     results = load_results(out / "results.json")
-    assert tuple(results["methods"]) == METHODS
-    assert results["methods"]["dense"]["success"]["n"] == 2
-    assert results["methods"]["dense"]["action_error_vs_dense"]["max"] < 1e-5
-    assert results["methods"]["uniform"]["flops"]["ratio_to_dense"] < 0.5
+    assert tuple(results.methods) == METHODS
+    assert results.dense.success.n == 2
+    assert results.dense.action_error_vs_dense.max < 1e-5
+    assert results.methods["uniform"].flops.ratio_to_dense < 0.5
     assert all(name in output for name in METHODS)
     pictures = ["pareto", "similarity", "error_surge", *(f"schedule_{name}" for name in METHODS)]
     for name in pictures:
@@ -160,11 +158,11 @@ def test_realtime_leaves_a_curve_per_method(work, policy):
     )  # fmt: skip
     output = run("realtime", *options)
     results = load_realtime(out / "realtime.json")
-    assert list(results["methods"]) == ["dense", "ddim2"]
-    for name, method in results["methods"].items():
+    assert list(results.methods) == ["dense", "ddim2"]
+    for name, method in results.methods.items():
         assert name in output
-        assert {0, 2} <= {point["delay_steps"] for point in method["points"]}
-        assert sum(point["own"] for point in method["points"]) == 1
+        assert {0, 2} <= {point.delay_steps for point in method.points}
+        assert sum(point.own for point in method.points) == 1
     assert iio.imread(out / "realtime.png").std() > 5
 
 
@@ -231,7 +229,7 @@ def test_a_sweep_of_eight_survives_a_kill_and_an_interrupt(work):
     assert [trial["id"] for trial in trials()][:6] == [trial["id"] for trial in interrupted]
     assert [trial["parameters"]["num_updates"] for trial in trials()] == list(range(1, 9))
     labels = [f"num_updates={number}" for number in range(1, 9)]
-    assert list(load_results(work / "sweep" / "results.json")["methods"]) == ["dense", *labels]
+    assert list(load_results(work / "sweep" / "results.json").methods) == ["dense", *labels]
     assert len((work / "sweep" / "trials.csv").read_text().splitlines()) == 1 + 8
     assert iio.imread(work / "sweep" / "pareto.png").std() > 5
 
@@ -284,12 +282,12 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
     methods = ("dense", "l2c", "fixed", "sag@0.5", "sag@0.6-0.4")
     output = run(
-        "benchmark", f"policy={policy}", f"schedules={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
+        "benchmark", f"policy={policy}", f"planners={plans}", "num_updates=7", f"methods=[{','.join(methods)}]",
         "episodes=1", "horizon=16", "latency_repeats=2", "probe_episodes=1", "videos=[sag@0.5]", f"out={work}/sparse",
     )  # fmt: skip
-    entries = load_results(work / "sparse" / "results.json")["methods"]
+    entries = load_results(work / "sparse" / "results.json").methods
     assert tuple(entries) == methods
-    assert [name for name in methods if "planning_s" in entries[name]] == list(methods[3:])
+    assert [name for name in methods if entries[name].planning_s] == list(methods[3:])
     for name in methods[3:]:
         assert iio.imread(work / "sparse" / f"strip_{name}.png").std() > 5
         assert iio.imread(work / "sparse" / f"masks_{name}.png").std() > 5
@@ -298,7 +296,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
     output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=1)
-    assert "methods: expected dense, ddim<N>, ddim_<t>_<t>..., uniform" in output
+    assert "methods: expected dense, ddim10, ddim<N>, ddim_<t>_<t>..., uniform" in output
     assert "got 'magic'" in output
     assert not (work / "none").exists()
     assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=1)
@@ -311,7 +309,7 @@ def test_a_schedule_of_another_policy_is_refused(work, policy, schedules):
     (work / "foreign" / "bac.json").write_text(json.dumps(foreign))
     options = (
         f"policy={policy}",
-        f"schedules={work}/foreign",
+        f"planners={work}/foreign",
         "num_updates=7",
         "methods=[bac]",
         f"out={work}/none",

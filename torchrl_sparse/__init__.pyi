@@ -12,6 +12,7 @@ from .blocks import (
     Uniform as Uniform,
     bac_schedule as bac_schedule,
     calibrate as calibrate,
+    load_planner as load_planner,
     make_engine as make_engine,
 )
 from .control import (
@@ -28,6 +29,11 @@ from .envs import (
 from .evaluation import (
     measure_latency as measure_latency,
     rollout_episodes as rollout_episodes,
+)
+from .methods import (
+    METHODS as METHODS,
+    Method as Method,
+    make_method as make_method,
 )
 from .networks import (
     Normalizer as Normalizer,

@@ -22,6 +22,7 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+``REUSE``                         i64 [*B, 1]            the rule by which pruned blocks reuse, an index of ``REUSE_RULES``
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
 ``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
@@ -67,6 +68,7 @@ IS_INIT = "is_init"
 COND = ("diffusion", "cond")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
+REUSE = ("diffusion", "reuse")
 PRUNE_RATE = ("diffusion", "prune_rate")
 
 KEEP_MASK = ("tokens", "keep_mask")

@@ -153,16 +153,15 @@ def test_bubbling_union_by_hand():
     assert bubbling_union(schedules, errors, top_k=0) == tuple(map(tuple, schedules))
 
 
-@pytest.mark.parametrize("transitive", [False, True])
 @pytest.mark.parametrize("top_k", [0, 1, 2, 5, 12])
 @pytest.mark.parametrize("seed", range(5))
-def test_after_bua_selected_blocks_contain_every_downstream_ffn(seed, top_k, transitive):
+def test_after_bua_selected_blocks_contain_every_downstream_ffn(seed, top_k):
     generator = torch.Generator().manual_seed(seed)
     mask = torch.rand(12, 20, generator=generator) < 0.3
     mask[:, 0] = True
     before = [row.nonzero().flatten().tolist() for row in mask]
     errors = torch.rand(12, generator=generator)
-    after = bubbling_union(before, errors, top_k, transitive)
+    after = bubbling_union(before, errors, top_k)
     upstream = upstream_blocks(errors, top_k)
     assert len(upstream) == top_k
     for block in range(12):
@@ -174,7 +173,6 @@ def test_after_bua_selected_blocks_contain_every_downstream_ffn(seed, top_k, tra
         for ffn in downstream:
             assert set(after[block]) >= set(after[ffn])
         assert set(after[block]) == set(before[block]).union(*(before[ffn] for ffn in downstream))
-    assert after == bubbling_union(before, errors, top_k, not transitive)
 
 
 def test_upstream_blocks_are_the_highest_scores_and_the_shallower_of_equals():

@@ -144,5 +144,5 @@ def test_the_planner_writes_the_schedule_for_every_observation(schedule, path, f
     ],
 )
 def test_a_schedule_made_for_another_policy_is_refused_naming_both(schedule, spec, message):
-    with pytest.raises(ValueError, match=f"schedule 'bac': made for {message}"):
+    with pytest.raises(ValueError, match=f"SchedulePlanner: made for {message}"):
         SchedulePlanner(schedule).bind(spec)

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from torchrl_sparse.evaluation.latency.measure import summarize_latency
+from torchrl_sparse.evaluation.latency.measure import Machine, summarize_latency
 from torchrl_sparse.evaluation.results.report import MethodRun, build_results
+from torchrl_sparse.evaluation.results.schema import PolicyShape
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
 # name: success rate, prune rate, FLOPs ratio, latency (s), mean action error, episode length
@@ -15,9 +16,8 @@ METHODS = {
     "bac_blockwise": (0.62, 0.89, 0.134, 0.162, 0.21, 190),
     "bac": (0.98, 0.85, 0.169, 0.191, 0.009, 42),
 }
-MACHINE = {"cpu": "Imaginary CPU @ 2.5 GHz", "threads": 1, "device": "cpu", "torch": "2.13.0"}
-MACHINE["date"] = "2026-01-31T12:00:00+00:00"
-POLICY = {"params": 8967434, "num_inference_steps": 100, "horizon": 10, "n_obs_steps": 2, "n_action_steps": 8}
+MACHINE = Machine("Imaginary CPU @ 2.5 GHz", 1, "cpu", "2.13.0", "2026-01-31T12:00:00+00:00")
+POLICY = PolicyShape(params=8967434, num_inference_steps=100, horizon=10, n_obs_steps=2, n_action_steps=8)
 DENSE_FLOPS = 15.74e9
 
 
@@ -42,7 +42,7 @@ def make_runs(episodes=100, names=tuple(METHODS), seed=0):
 
 
 def make_results(episodes=100, **kwargs):
-    """A whole `results.json`."""
+    """The content of a `results.json`."""
     return build_results(make_runs(episodes, **kwargs), task="lift", seed=0, machine=MACHINE, policy=POLICY)
 
 

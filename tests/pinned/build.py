@@ -16,23 +16,24 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
-from torchrl_sparse.evaluation.results.engine_report import format_engine_table
+from torchrl_sparse.evaluation.results.engine_report import format_engine_table, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import format_realtime, load_realtime
 from torchrl_sparse.evaluation.results.report import (
     MethodRun,
     build_results,
     format_pairs,
     format_table,
-    load_results,
 )
+from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
-from torchrl_sparse.evaluation.results.vla_report import format_vla_table
+from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.rollouts.methods import MethodName, make_method
 from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching_share
+from torchrl_sparse.methods.diffusion import make_controller, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.storage.json import to_plain
 from torchrl_sparse.training.vla.token_budget import TokenBudget
 
 __all__ = [
@@ -47,11 +48,14 @@ __all__ = [
     "format_realtime",
     "format_table",
     "format_vla_table",
+    "load_engine_results",
     "load_realtime",
     "load_results",
+    "load_vla_results",
     "merge_trials",
     "native_available",
     "results_of",
+    "to_plain",
     "trial_metrics",
     "vla_actor",
     "vla_answer",
@@ -76,9 +80,9 @@ def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> Chu
         raise AssertionError(f"{name}: expected a shipped schedule, got one to compute")
 
     policy = make_method(
-        name, _policy(folder, engine), num_updates=_NUM_UPDATES, schedules=planners, calibration=calibration
+        name, _policy(folder, engine), num_updates=_NUM_UPDATES, planners=planners, calibration=calibration
     )
-    return ChunkExecutor(policy, n_action_steps=1, controller=MethodName.parse(name).controller())
+    return ChunkExecutor(policy, n_action_steps=1, controller=make_controller(name))
 
 
 def diffusion_query(state: Any, eef_vel: Any, seed: int, step: int) -> TensorDict:
@@ -158,9 +162,9 @@ def episodes_of(log: Path) -> list[EpisodeResult]:
     return [episode for _, episode in sorted(EpisodeLog(log, identity).episodes.items())]
 
 
-def results_of(episodes: dict[str, list[EpisodeResult]], like: dict[str, Any]) -> dict[str, Any]:
+def results_of(episodes: dict[str, list[EpisodeResult]], like: Results) -> Results:
     """The content of a ``results.json`` about them, as if every query took a second; the rest is that of ``like``."""
     second = summarize_latency([1.0])
     runs = {name: MethodRun(of_method, second, (0.0, 0.0)) for name, of_method in episodes.items()}
-    about = {name: like[name] for name in ("task", "seed", "machine", "policy")}
+    about = {name: getattr(like, name) for name in ("task", "seed", "machine", "policy")}
     return build_results(runs, **about)

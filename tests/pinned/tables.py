@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from tests.pinned import build
@@ -23,7 +25,17 @@ def names() -> Iterator[str]:
 def table(name: str) -> list[str]:
     """The lines of the tables that are made of one."""
     path = ASSETS / name
-    return "\n\n".join(_maker(path)(path)).splitlines()
+    return [_normalise(line) for line in "\n\n".join(_maker(path)(path)).splitlines()]
+
+
+def _normalise(line: str) -> str:
+    """A line of a table without what only makes its columns line up."""
+    if not line.startswith("|"):
+        return line
+    return "|".join(
+        re.sub("-+", "-", cell.strip()) if set(cell) <= set(" :-") else cell.strip()
+        for cell in line.split("|")
+    )
 
 
 def _maker(path: Path):
@@ -47,22 +59,22 @@ def _realtime(path: Path) -> list[str]:
 
 
 def _engine(path: Path) -> list[str]:
-    shapes = json.loads(path.read_text(encoding="utf-8"))["shapes"]
+    shapes = build.load_engine_results(path).shapes
     return [build.format_engine_table(name, shape) for name, shape in shapes.items()]
 
 
 def _vla_latency(path: Path) -> list[str]:
-    return [build.format_vla_table(json.loads(path.read_text(encoding="utf-8")))]
+    return [build.format_vla_table(build.load_vla_results(path))]
 
 
 def _sweep(path: Path) -> list[str]:
     """Also the merged table and the metrics of its trials: the dense method and another each."""
     whole = build.load_results(path)
-    dense, *tested = whole["methods"]
+    dense, *tested = whole.methods
     trials = [
         (
             build.Trial(name, {"method": name}, finished=True),
-            {**whole, "methods": {each: whole["methods"][each] for each in (dense, name)}},
+            replace(whole, methods={each: whole.methods[each] for each in (dense, name)}),
         )
         for name in tested
     ]
@@ -81,7 +93,7 @@ def _episodes(folder: Path) -> list[str]:
         episodes = {name: log[:count] for name, log in logs.items() if len(log) >= count}
         results = build.results_of(episodes, like=build.load_results(folder.parent / "results.json"))
         made.append(build.format_table(results))
-        made += [f"{name}: {_numbers(method)}" for name, method in results["methods"].items()]
+        made += [f"{name}: {_numbers(build.to_plain(method))}" for name, method in results.methods.items()]
         made.append(build.format_pairs(episodes, [(name, "ddim10") for name in episodes]))
     return made
 

@@ -22,6 +22,10 @@ from .sag import (
     PrunerNetwork as PrunerNetwork,
     SAGPruner as SAGPruner,
 )
+from .saved import (
+    PLANNERS as PLANNERS,
+    load_planner as load_planner,
+)
 from .schedule import (
     CacheSchedule as CacheSchedule,
     SchedulePlanner as SchedulePlanner,

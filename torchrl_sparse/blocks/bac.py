@@ -119,21 +119,17 @@ def bubbling_union(
     schedules: Sequence[Sequence[int]],
     errors: Tensor | Sequence[float],
     top_k: int = 5,
-    transitive: bool = False,
 ) -> tuple[tuple[int, ...], ...]:
     """BUA: let the blocks of highest error compute whenever a downstream FFN does.
 
     ``C(u) ← C(u) ∪ ⋃_{v∈D(u)} C(v)`` for every u in U, the ``top_k`` blocks of highest error (FFNs included);
-    D(u) are the FFNs of u's own layer and deeper. Afterwards C(u) ⊇ C(v) for every v in D(u).
+    D(u) are the FFNs of u's own layer and deeper. Afterwards C(u) ⊇ C(v) for every v in D(u). The order does not
+    matter: D(v) ⊂ D(u) for every v in D(u), so that u copies all that v could gain anyway.
 
     Args:
         schedules: computed steps of the 3L blocks in column order.
         errors: error scores [3L], see :func:`~torchrl_sparse.blocks.calibration.block_error`.
         top_k: size of U; 0 changes nothing.
-        transitive: process deep → shallow, so that a block copies the *enlarged* schedules of deeper FFNs, as
-            one public implementation does; False is shallow → deep, the order of the authors' release. Since
-            D(v) ⊂ D(u) for every v in D(u), u copies all that v could gain anyway: both orders give the same
-            schedules.
 
     Returns:
         the new schedules, in column order.
@@ -150,8 +146,7 @@ def bubbling_union(
             f"errors: expected one score per schedule (3L), got {len(errors)} for {len(schedules)} schedules"
         )
     merged = [set(steps) for steps in schedules]
-    upstream = upstream_blocks(errors, top_k)
-    for block in reversed(upstream) if transitive else upstream:
+    for block in upstream_blocks(errors, top_k):
         own_ffn = block - block % len(BLOCK_TYPES) + _FFN
         merged[block] = merged[block].union(*merged[own_ffn :: len(BLOCK_TYPES)])
     return tuple(tuple(sorted(steps)) for steps in merged)
@@ -202,7 +197,6 @@ def bac_schedule(
     objective: Objective = "anchor",
     force_last: bool = True,
     top_k: int = 5,
-    transitive: bool = False,
 ) -> CacheSchedule:
     """The method itself, ``bac``: ACS for every block, then BUA.
 
@@ -215,7 +209,6 @@ def bac_schedule(
         force_last: also compute the last denoising step, as the release does: then a block is computed up to
             M+1 times.
         top_k: blocks that BUA enlarges; the paper's value is 5.
-        transitive: order of :func:`bubbling_union`.
 
     Raises:
         ValueError: as :func:`acs` and :func:`bubbling_union` do.
@@ -223,9 +216,9 @@ def bac_schedule(
     alone = bac_blockwise_schedule(
         calibration, num_updates, policy=policy, objective=objective, force_last=force_last
     )
-    steps = bubbling_union(alone.computed_steps, calibration.errors, top_k, transitive)
+    steps = bubbling_union(alone.computed_steps, calibration.errors, top_k)
     upstream = [block_name(block) for block in upstream_blocks(calibration.errors, top_k)]
-    settings = {**alone.settings, "top_k": top_k, "transitive": transitive, "upstream_blocks": upstream}
+    settings = {**alone.settings, "top_k": top_k, "upstream_blocks": upstream}
     return _schedule("bac", calibration, policy, steps, settings)
 
 

@@ -22,22 +22,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = [
     "BLOCK_TYPES",
+    "REUSE_RULES",
+    "MaskError",
     "NetworkSizes",
     "Reuse",
     "block_macs",
     "block_name",
+    "check_form",
     "check_reuse",
     "fixed_macs",
+    "mask_flops",
     "mask_from_steps",
     "num_buffers",
     "prune_rate",
@@ -49,16 +52,21 @@ __all__ = [
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
 Reuse = Literal["block", "type", "single"]
+REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)  # a TensorDict holds a rule as its index here
 
 
 def block_name(column: int) -> str:
-    """Name of a mask column, as in the BAC paper.
+    """Return the name of a mask column, as in the BAC paper.
 
     >>> block_name(17)
     'layers.5.FFN'
     """
     layer, kind = divmod(column, len(BLOCK_TYPES))
     return f"layers.{layer}.{BLOCK_TYPES[kind]}"
+
+
+class MaskError(ValueError):
+    """A tensor that is no prune mask: its message names what was expected and what came."""
 
 
 def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
@@ -71,38 +79,46 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
         batch: expected leading dimensions; None accepts any.
 
     Raises:
-        ValueError: naming what was expected and what came, if ``mask`` is no bool tensor [*batch, K, 3L] or
-            if its first row prunes.
+        MaskError: if ``mask`` is no bool tensor [*batch, K, 3L] or if its first row prunes.
 
     >>> validate_mask(torch.zeros(4, 10, 6, dtype=torch.bool), num_steps=10, num_layers=2)
+    """
+    check_form(mask, num_steps, num_layers, batch)
+    first = mask.select(-2, 0)
+    if first.any():  # one operation where nothing is wrong: every query of every method comes through here
+        pruned = first.reshape(-1, first.shape[-1]).any(dim=0).nonzero().flatten().tolist()
+        names = ", ".join(block_name(column) for column in pruned)
+        raise MaskError(
+            f"prune mask: expected row 0 (the first denoising step) to prune nothing, got True for {names}"
+        )
+
+
+def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
+    """Refuse what does not have the type and shape of a prune mask, without reading it; see :func:`validate_mask`.
+
+    Raises:
+        MaskError: if ``mask`` is no bool tensor [*batch, K, 3L].
     """
     tail = (num_steps, len(BLOCK_TYPES) * num_layers)
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         came = f"dtype {mask.dtype}" if isinstance(mask, Tensor) else type(mask).__name__
-        raise ValueError(f"prune mask: expected a tensor of dtype torch.bool, got {came}")
+        raise MaskError(f"prune mask: expected a tensor of dtype torch.bool, got {came}")
     lead = "*B, " if batch is None else "".join(f"{size}, " for size in batch)
     if mask.shape[-2:] != tail or (batch is not None and mask.shape[:-2] != tuple(batch)):
-        raise ValueError(
+        raise MaskError(
             f"prune mask: expected shape [{lead}{tail[0]}, {tail[1]}] (K={num_steps} denoising steps, "
             f"3L={tail[1]} blocks), got {list(mask.shape)}"
-        )
-    first = mask.select(-2, 0)
-    if first.any():  # one operation where nothing is wrong: every query of every method comes through here
-        pruned = first.reshape(-1, tail[1]).any(dim=0).nonzero().flatten().tolist()
-        names = ", ".join(block_name(column) for column in pruned)
-        raise ValueError(
-            f"prune mask: expected row 0 (the first denoising step) to prune nothing, got True for {names}"
         )
 
 
 def check_reuse(reuse: str) -> None:
     """Raise ValueError unless ``reuse`` names a reuse rule."""
-    if reuse not in get_args(Reuse):
-        raise ValueError(f"reuse: expected one of {list(get_args(Reuse))}, got {reuse!r}")
+    if reuse not in REUSE_RULES:
+        raise ValueError(f"reuse: expected one of {list(REUSE_RULES)}, got {reuse!r}")
 
 
 def num_buffers(reuse: Reuse, num_blocks: int) -> int:
-    """Outputs that a reuse rule keeps; block ``b`` writes and reads number ``b % num_buffers``.
+    """Return the number of outputs that a reuse rule keeps; block ``b`` writes and reads number ``b % num_buffers``.
 
     >>> num_buffers("type", num_blocks=24)
     3
@@ -111,7 +127,7 @@ def num_buffers(reuse: Reuse, num_blocks: int) -> int:
 
 
 def prune_rate(mask: Tensor) -> Tensor:
-    """Prune rate ρ f32 [*B], the mean of a mask bool [*B, K, 3L] over all steps (row 0 too) and blocks.
+    """Return the prune rate ρ f32 [*B], the mean of a mask bool [*B, K, 3L] over all steps (row 0 too) and blocks.
 
     >>> prune_rate(torch.tensor([[False] * 3, [True, True, True]])).item()
     0.5
@@ -120,7 +136,7 @@ def prune_rate(mask: Tensor) -> Tensor:
 
 
 def mask_from_steps(steps: Sequence[Iterable[int]], num_steps: int) -> Tensor:
-    """Mask bool [K, 3L] from the computed steps of every block, in column order.
+    """Make a mask bool [K, 3L] from the computed steps of every block, in column order.
 
     >>> mask_from_steps([[0, 2], [0], [0, 1]], num_steps=3).int().tolist()
     [[0, 0, 0], [1, 1, 0], [0, 1, 1]]
@@ -132,12 +148,12 @@ def mask_from_steps(steps: Sequence[Iterable[int]], num_steps: int) -> Tensor:
 
 
 def steps_from_mask(mask: Tensor) -> tuple[tuple[int, ...], ...]:
-    """Computed steps of every block of a mask bool [K, 3L]: the inverse of :func:`mask_from_steps`."""
+    """Return the computed steps of every block of a mask bool [K, 3L]: the inverse of :func:`mask_from_steps`."""
     return tuple(tuple((~column).nonzero().flatten().tolist()) for column in mask.unbind(dim=1))
 
 
 def reuse_source(mask: Tensor, reuse: Reuse = "block") -> tuple[Tensor, Tensor]:
-    """Which evaluation produced the output that a block adds: its own, or an earlier one if it is pruned.
+    """Find which evaluation produced the output that a block adds: its own, or an earlier one if it is pruned.
 
     Args:
         mask: bool [*B, K, 3L], row 0 all False.
@@ -187,7 +203,7 @@ class NetworkSizes:
 
     @classmethod
     def of(cls, network: TransformerForDiffusion) -> NetworkSizes:
-        """The sizes of ``network``."""
+        """Read the sizes of ``network``."""
         return cls(
             num_layers=network.n_layer,
             horizon=network.horizon,
@@ -201,7 +217,7 @@ class NetworkSizes:
 
 
 def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
-    """Multiply-accumulates of one SA, one CA and one FFN block in one call, batch 1.
+    """Count the multiply-accumulates of one SA, one CA and one FFN block in one call, batch 1.
 
     >>> lift = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
     >>> [round(macs / sum(block_macs(lift)), 3) for macs in block_macs(lift)]
@@ -215,7 +231,7 @@ def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
 
 
 def fixed_macs(sizes: NetworkSizes) -> int:
-    """Multiply-accumulates of one call outside the blocks: stems, condition encoder, head; never pruned."""
+    """Count the multiply-accumulates of one call outside the blocks: stems, condition encoder, head; never pruned."""
     d, memory = sizes.width, 1 + sizes.n_obs_steps
     encoder = 8 * d * d * memory
     if sizes.num_cond_layers:
@@ -227,7 +243,7 @@ def fixed_macs(sizes: NetworkSizes) -> int:
 
 
 def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -> Tensor:
-    """FLOPs (2 · MAC) of one query under ``mask``, over all K calls of the denoiser.
+    """Count the FLOPs (2 · MAC) of one query under ``mask``, over all K calls of the denoiser.
 
     Args:
         network: the denoiser or its sizes.
@@ -246,6 +262,12 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
     sizes = network if isinstance(network, NetworkSizes) else NetworkSizes.of(network)
     num_steps = mask.shape[-2] if isinstance(mask, Tensor) and mask.ndim >= 2 else 1
     validate_mask(mask, num_steps, sizes.num_layers)
+    return mask_flops(sizes, mask)
+
+
+def mask_flops(sizes: NetworkSizes, mask: Tensor) -> Tensor:
+    """Return :func:`query_flops` of a mask that was validated before."""
+    num_steps = mask.shape[-2]
     # Summed as whole numbers: a query exceeds what float32 counts exactly.
     skipped = (mask.sum(dim=-2) * _block_flops(sizes).to(mask.device)).sum(dim=-1)
     dense = 2 * num_steps * (sizes.num_layers * sum(block_macs(sizes)) + fixed_macs(sizes))
@@ -254,5 +276,5 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
 
 @lru_cache(maxsize=16)
 def _block_flops(sizes: NetworkSizes) -> Tensor:
-    """FLOPs of every block, i64 [3L]."""
+    """Count the FLOPs of every block, i64 [3L]."""
     return 2 * torch.tensor(block_macs(sizes)).repeat(sizes.num_layers)

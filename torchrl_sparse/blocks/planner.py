@@ -1,4 +1,4 @@
-"""Planners: TensorDict modules that write the prune mask of a query, and nothing else.
+"""Planners: TensorDict modules that write the prune mask of a query and its reuse rule, and nothing else.
 
 A planner of one's own subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
 does not) and writes one method; ``policy.plan = Mine()`` is all that using it takes. One that is kept in a file gets a
@@ -17,8 +17,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, validate_mask
-from torchrl_sparse.keys import COND, PRUNE_MASK, read
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSE_RULES, MaskError, Reuse, check_form, validate_mask
+from torchrl_sparse.keys import COND, PRUNE_MASK, REUSE, read
 
 __all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
 
@@ -61,13 +61,14 @@ class PlanSpec:
 class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
-    Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
+    Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L] and
+    ``("diffusion", "reuse")`` i64 [*B, 1].
     A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that was made for
     one policy sets ``made_for``. ``policy.plan = planner`` binds it.
 
     Attributes:
         reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see
-            :mod:`torchrl_sparse.blocks.mask`).
+            :mod:`torchrl_sparse.blocks.mask`); written for every observation.
         is_static: True where the mask does not depend on the observation.
         made_for: the only spec that it can be bound to; None serves every policy.
         rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
@@ -88,7 +89,7 @@ class Planner(TensorDictModuleBase):
     """
 
     in_keys = [COND]
-    out_keys = [PRUNE_MASK]
+    out_keys = [PRUNE_MASK, REUSE]
     reuse: Reuse = "block"
     is_static = False
     made_for: PlanSpec | None = None
@@ -139,11 +140,11 @@ class Planner(TensorDictModuleBase):
         return {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the mask of every observation.
+        """Write the mask and the reuse rule of every observation; the engine validates what the mask says.
 
         Raises:
             RuntimeError: if the planner is not bound.
-            ValueError: if :meth:`masks` returns anything but masks for the bound spec.
+            ValueError: if :meth:`masks` returns anything but bool tensors [B, K, 3L] for the bound spec.
         """
         spec = self.spec
         cond = read(tensordict, COND)
@@ -154,11 +155,12 @@ class Planner(TensorDictModuleBase):
             cond = cond.reshape(rows, *cond.shape[-2:])
         masks = self.masks(cond, **self.options(tensordict, rows))
         try:
-            validate_mask(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
-        except ValueError as error:
+            check_form(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
+        except MaskError as error:
             raise ValueError(f"{type(self).__name__}.masks: {error}") from error
         tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
-        return tensordict
+        rule = REUSE_RULES.index(self.reuse)
+        return tensordict.set(REUSE, torch.full((*batch, 1), rule, device=cond.device))
 
 
 def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:

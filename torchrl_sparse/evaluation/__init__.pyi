@@ -8,22 +8,27 @@ from .figures import (
     plot_similarity as plot_similarity,
     plot_token_strip as plot_token_strip,
     plot_tokens_per_layer as plot_tokens_per_layer,
+    write_report as write_report,
     write_video as write_video,
 )
 from .latency import (
     Latency as Latency,
+    Machine as Machine,
     describe_machine as describe_machine,
     measure_latency as measure_latency,
     summarize_latency as summarize_latency,
 )
 from .results import (
+    MethodEntry as MethodEntry,
     MethodRun as MethodRun,
+    PolicyShape as PolicyShape,
+    Results as Results,
     build_results as build_results,
     format_pairs as format_pairs,
     format_table as format_table,
     load_results as load_results,
     save_results as save_results,
-    validate_results as validate_results,
+    write_pages as write_pages,
 )
 from .rollouts import (
     EpisodeLog as EpisodeLog,

@@ -4,5 +4,6 @@ from .diffusion import (
     MethodInputs as MethodInputs,
     MethodName as MethodName,
     check_method as check_method,
+    make_controller as make_controller,
     make_method as make_method,
 )

@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -212,6 +213,22 @@ def make_controller(text: str) -> TensorDictModuleBase | None:
     return (_lookup(written.name) or SAVED).controller(written.rates)
 
 
+def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
+    """Return all that makes the episodes of one method its own, as JSON values for an `EpisodeLog`.
+
+    Args:
+        text: the method.
+        policy: as :func:`make_method` returned it.
+    """
+    return {
+        "method": text,
+        "policy": policy.fingerprint,
+        "engine": policy.engine,
+        "sampler": policy.sampler.config,
+        "planner": policy.plan.fingerprint,
+    }
+
+
 def _find(text: str, planners: Path) -> Method:
     name = MethodName.parse(text).name
     if (method := _lookup(name)) is not None:
@@ -231,8 +248,10 @@ def _lookup(name: str) -> Method | None:
 
 
 def _saved_path(planners: Path, name: str) -> Path | None:
-    candidates = (planners / f"{name}.json", planners / name / "config.json")
-    return next((path for path in candidates if path.is_file()), None)
+    file, folder = planners / f"{name}.json", planners / name
+    if file.is_file():
+        return file
+    return folder if (folder / "config.json").is_file() else None
 
 
 def _ask_for(planner: Planner, written: MethodName) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.blocks.conftest import ACTION_DIM, HORIZON, NUM_STEPS, random_mask
-from torchrl_sparse.blocks.engine import factory, make_engine
+from torchrl_sparse.blocks.engine import ENGINES, make_engine
 from torchrl_sparse.blocks.engine.costs import engine_block_costs
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.factory import EngineSlot
@@ -17,7 +17,8 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 @pytest.fixture
 def no_native(monkeypatch):
-    monkeypatch.setattr(factory, "native_supports", lambda network: (False, "it was not built"))
+    entry = ENGINES["native"]._replace(applies=lambda network: (False, "it was not built"))
+    monkeypatch.setitem(ENGINES, "native", entry)
 
 
 def test_auto_takes_torch_where_native_does_not_apply_and_says_why(network, ddpm, no_native):
@@ -29,7 +30,7 @@ def test_auto_takes_torch_where_native_does_not_apply_and_says_why(network, ddpm
 
 
 def test_unknown_engines_are_refused(network, ddpm):
-    message = r"engine: expected one of \['auto', 'reference', 'torch', 'native'\], got 'turbo'"
+    message = r"engine: expected one of \['auto', 'native', 'torch', 'reference'\], got 'turbo'"
     with pytest.raises(ValueError, match=message):
         make_engine("turbo", network, ddpm)
     with pytest.raises(ValueError, match=message):
@@ -59,7 +60,7 @@ def test_a_slot_can_be_copied_and_pickled(network, ddpm):
 
 @pytest.mark.parametrize("name", ["reference", "torch"])
 def test_block_costs_are_measured_and_counted(network, ddpm, name):
-    costs = engine_block_costs(make_engine(name, network, ddpm), network)
+    costs = engine_block_costs(make_engine(name, network, ddpm))
     assert list(costs) == ["SA", "CA", "FFN"]
     assert all(0 < cost.seconds < 0.1 for cost in costs.values())
     width, memory = 32, 3

@@ -149,7 +149,7 @@ def test_a_rate_out_of_range_is_refused(rate):
     ],
 )
 def test_another_policy_or_sampler_is_refused(spec, message):
-    with pytest.raises(ValueError, match=f"SAG pruner: trained for {message}"):
+    with pytest.raises(ValueError, match=f"SAGPruner: made for {message}"):
         make_pruner().bind(spec)
 
 

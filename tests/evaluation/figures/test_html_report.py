@@ -1,6 +1,7 @@
 """The page holds everything, asks for nothing, and takes nothing that it reads for markup."""
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -10,7 +11,7 @@ from tests.evaluation.results.test_realtime import DENSE, FAST, build
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
 from torchrl_sparse.evaluation.results.realtime import save_realtime
-from torchrl_sparse.evaluation.results.report import save_results
+from torchrl_sparse.evaluation.results.schema import save_results
 
 
 class Page(HTMLParser):
@@ -66,7 +67,8 @@ def test_everything_is_in_one_file_that_asks_for_nothing(runs, tmp_path):
 def test_names_are_text_and_never_markup(tmp_path):
     evil = '<img src=x onerror=alert(1)>"&'
     results = synthetic.make_results(20, names=("dense", "bac"))
-    results["task"], results["methods"][evil] = evil, results["methods"].pop("bac")
+    methods = {"dense": results.dense, evil: results.methods["bac"]}
+    results = replace(results, task=evil, methods=methods)
     folder = tmp_path / "runs" / "<b>bold"
     save_results(results, folder / "results.json")
     (folder / "<i>.mp4").write_bytes(b"")

@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 
 from tests.evaluation import synthetic
-from torchrl_sparse.evaluation.figures import labels, plots
+from torchrl_sparse.evaluation.figures import labels, pareto, plots
+from torchrl_sparse.evaluation.figures.colors import OTHER_COLORS
+from torchrl_sparse.methods import METHODS
 
 
 def read(path):
@@ -28,21 +30,21 @@ def has_color(pixels, color):
 
 def test_pareto(tmp_path):
     results = synthetic.make_results(100)
-    path = plots.plot_pareto(results, tmp_path / "pareto.png")
+    path = pareto.plot_pareto(results, tmp_path / "pareto.png")
     assert os.listdir(tmp_path) == ["pareto.png"]
     pixels = read(path)
-    for color in plots._METHOD_COLORS.values():
-        assert has_color(pixels, color)
+    for name in results["methods"]:
+        assert has_color(pixels, METHODS[name].color)
 
 
-def test_pareto_of_the_reference_alone(tmp_path):
-    read(plots.plot_pareto(synthetic.make_results(20, names=("dense",)), tmp_path / "pareto.png"))
+def test_pareto_of_dense_alone(tmp_path):
+    read(pareto.plot_pareto(synthetic.make_results(20, names=("dense",)), tmp_path / "pareto.png"))
 
 
 def test_pareto_takes_unknown_methods(tmp_path, monkeypatch):
     monkeypatch.setitem(synthetic.METHODS, "mine", (0.9, 0.5, 0.5, 0.4, 0.1, 50))
     results = synthetic.make_results(20, names=("dense", "mine"))
-    assert has_color(read(plots.plot_pareto(results, tmp_path / "p.png")), plots._OTHER_COLORS[0])
+    assert has_color(read(pareto.plot_pareto(results, tmp_path / "p.png")), OTHER_COLORS[0])
 
 
 def test_labels_of_crowded_points_do_not_overlap(tmp_path, monkeypatch):
@@ -59,8 +61,8 @@ def test_labels_of_crowded_points_do_not_overlap(tmp_path, monkeypatch):
             if text.get_text() in points:
                 boxes[text.get_text()] = labels.text_box(text, renderer)
 
-    monkeypatch.setattr(plots, "place_labels", spy)
-    plots.plot_pareto(synthetic.make_results(100, names=names), tmp_path / "pareto.png")
+    monkeypatch.setattr(pareto, "place_labels", spy)
+    pareto.plot_pareto(synthetic.make_results(100, names=names), tmp_path / "pareto.png")
     assert sorted(boxes) == sorted(names)
     together = [(a, b) for a in names for b in names if a < b and boxes[a].overlaps(boxes[b])]
     assert together == []
@@ -97,7 +99,7 @@ def test_error_surge(tmp_path):
     masks = synthetic.make_masks()
     pixels = read(plots.plot_error_surge(synthetic.make_errors(), masks, tmp_path / "error_surge.png"))
     for name in masks:
-        assert has_color(pixels, plots._METHOD_COLORS[name])
+        assert has_color(pixels, METHODS[name].color)
 
 
 def test_block_labels():
@@ -107,7 +109,6 @@ def test_block_labels():
 @pytest.mark.parametrize(
     ("draw", "message"),
     [
-        (lambda p: plots.plot_pareto({"schema": 1}, p), "task: expected this key"),
         (lambda p: plots.plot_schedule(np.zeros((4, 6)), p, name="x"), r"bool array .*got float64 \[4, 6\]"),
         (lambda p: plots.plot_schedule(np.zeros((4, 5), bool), p, name="x"), r"\[K, 3L\], got bool \[4, 5\]"),
         (lambda p: plots.plot_similarity(np.ones((3, 4, 5)), p), r"\[3L, K, K\], got \[3, 4, 5\]"),

@@ -72,17 +72,16 @@ def test_progress():
 def test_percentiles():
     latency = summarize_latency([float(i) for i in range(101)])
     assert (latency.p50, latency.p95, latency.n) == (50.0, 95.0, 101)
-    assert latency.to_json() == {"p50": 50.0, "p95": 95.0, "n": 101}
 
 
 def test_machine_description():
     machine = describe_machine()
-    assert machine["cpu"]
-    assert machine["threads"] == torch.get_num_threads()
-    assert machine["device"] == "cpu"
-    assert machine["torch"] == torch.__version__
-    assert datetime.fromisoformat(machine["date"]).tzinfo is not None
-    assert describe_machine(threads=7)["threads"] == 7
+    assert machine.cpu
+    assert machine.threads == torch.get_num_threads()
+    assert machine.device == "cpu"
+    assert machine.torch == torch.__version__
+    assert datetime.fromisoformat(machine.date).tzinfo is not None
+    assert describe_machine(threads=7).threads == 7
 
 
 @pytest.mark.parametrize(

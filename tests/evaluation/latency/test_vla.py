@@ -1,6 +1,5 @@
 """The latency benchmark of vision-language-action models at toy size: what it runs, what it writes, what it draws."""
 
-import json
 import os
 import subprocess
 import sys
@@ -13,8 +12,9 @@ import torch
 pytest.importorskip("transformers")
 
 from torchrl_sparse import keys
+from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import SHAPES, VLACase, make_policy
-from torchrl_sparse.evaluation.results.vla_report import measure_vla
+from torchrl_sparse.evaluation.results.vla_report import load_vla_results, measure_vla
 from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops
 from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
 
@@ -77,22 +77,20 @@ def test_replayed_helpers_do_what_the_query_did(case):
 
 def test_numbers_are_those_of_the_medians(case):
     with torch.no_grad():
-        results = measure_vla(case, repeats=3, warmup=0)
-    parts, methods = results["parts"], results["methods"]
-    assert sum(part["p50_s"] for part in parts.values()) >= methods["dense"]["p50_s"] * 0.999
-    assert (
-        methods["dense"]["speedup"] == methods["dense"]["flops_speedup"] == methods["dense"]["realised"] == 1
-    )
-    assert methods["dense"]["helper_share"] == 0
-    for name, row in methods.items():
-        assert row["speedup"] == pytest.approx(methods["dense"]["p50_s"] / row["p50_s"])
-        assert row["flops_speedup"] == pytest.approx(methods["dense"]["flops"] / row["flops"])
-        assert row["realised"] == pytest.approx(row["speedup"] / row["flops_speedup"])
-        assert row["helper_share"] == pytest.approx(sum(part["share"] for part in row["helpers"].values()))
-        assert sum(row["tokens_per_layer"]) / len(row["tokens_per_layer"]) == pytest.approx(row["kept"])
-        assert (row["flops_speedup"] > 1) == (name != "dense")
+        results = measure_vla(case, name="toy", machine=describe_machine(), repeats=3, warmup=0)
+    dense = results.methods["dense"]
+    assert sum(part.p50_s for part in results.parts.values()) >= dense.p50_s * 0.999
+    assert dense.speedup == dense.flops_speedup == dense.realised == 1
+    assert dense.helper_share == 0
+    for name, row in results.methods.items():
+        assert row.speedup == pytest.approx(dense.p50_s / row.p50_s)
+        assert row.flops_speedup == pytest.approx(dense.flops / row.flops)
+        assert row.realised == pytest.approx(row.speedup / row.flops_speedup)
+        assert row.helper_share == pytest.approx(sum(helper.share for helper in row.helpers.values()))
+        assert sum(row.tokens_per_layer) / len(row.tokens_per_layer) == pytest.approx(row.kept)
+        assert (row.flops_speedup > 1) == (name != "dense")
     # BOS, proprio and stop; the slots of two actions; the prompt, of which 17 words are the instruction's
-    assert results["shape"]["tokens"] == SPEC.num_visual + 3 + 14 + (9 + 17 + 4)
+    assert results.shape.tokens == SPEC.num_visual + 3 + 14 + (9 + 17 + 4)
 
 
 def test_the_recipe_leaves_json_table_and_chart(tmp_path):
@@ -108,11 +106,11 @@ def test_the_recipe_leaves_json_table_and_chart(tmp_path):
     ]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr[-3000:]
-    results = json.loads((tmp_path / "vla_latency.json").read_text())
-    assert results["machine"]["threads"] == 1
-    assert results["shape"]["name"] == "toy"
-    assert list(results["methods"]) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
-    assert all(f"| {name} " in done.stdout for name in [*results["methods"], *results["parts"]])
+    results = load_vla_results(tmp_path / "vla_latency.json")
+    assert results.machine.threads == 1
+    assert results.shape.name == "toy"
+    assert list(results.methods) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
+    assert all(f"| {name} " in done.stdout for name in [*results.methods, *results.parts])
     assert iio.imread(tmp_path / "vla_latency.png").std() > 5
 
 

@@ -1,6 +1,5 @@
 """The benchmark of the engines at toy size: what it runs, what it writes, what it draws."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -14,17 +13,16 @@ from tests.recipe_modules import RECIPES, load_recipe
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
+from torchrl_sparse.evaluation.latency.limits import measure_bandwidth, measure_multiply_adds
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
     format_engine_table,
-    measure_bandwidth,
-    measure_multiply_adds,
+    load_engine_results,
     shape_results,
 )
 
 RECIPE = RECIPES / "benchmark_engine.py"
 ASSETS = RECIPES.parent / "assets"
-ROW = {"p50_s", "p10_s", "p90_s", "n", "x_eager", "x_dense", "max_err", "limit_s", "f32_limit_s"}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +36,7 @@ def test_rows_of_a_batch_have_masks_of_their_own_at_the_rate_that_the_name_says(
     assert (masks[0] != masks[1]).any()
     assert prune_rate(case.queries["ddim10-random50"].mask).tolist() == pytest.approx([0.5, 0.5], abs=0.01)
     assert case.queries["all-pruned"].mask[:, 1:].all()
-    assert case.queries["ddim8"].schedule.num_inference_steps == 8
+    assert case.queries["ddim8"].sampler.num_inference_steps == 8
 
 
 def test_a_schedule_of_bac_can_be_given():
@@ -76,21 +74,20 @@ def test_results_compare_with_eager_and_own_dense(case):
     variants = case.variants()
     latency = measure_latency({name: variant.call for name, variant in variants.items()}, repeats=3, warmup=1)
     shape = shape_results(case, variants, latency, threads=1)
-    assert set(shape["rows"]) == set(variants)
-    for name, row in shape["rows"].items():
-        assert set(row) == ROW, name
-        assert row["p10_s"] <= row["p50_s"] <= row["p90_s"]
-        assert row["n"] == 3
-    dense, pruned = shape["rows"]["torch dense"], shape["rows"]["torch random91"]
-    assert pruned["x_dense"] == pytest.approx(dense["p50_s"] / pruned["p50_s"])
-    assert pruned["limit_s"] < dense["limit_s"]
+    assert set(shape.rows) == set(variants)
+    for row in shape.rows.values():
+        assert row.p10_s <= row.p50_s <= row.p90_s
+        assert row.n == 3
+    dense, pruned = shape.rows["torch dense"], shape.rows["torch random91"]
+    assert pruned.x_dense == pytest.approx(dense.p50_s / pruned.p50_s)
+    assert pruned.limit_s < dense.limit_s
     # Two rows, of each of which all steps but the first are pruned by 91 % of all.
-    assert pruned["f32_limit_s"] / dense["f32_limit_s"] == pytest.approx(products(case) / (20 * 2), rel=1e-6)
-    native = shape["rows"].get("native-bf16 dense")
-    assert native is None or native["f32_limit_s"] is None
+    assert pruned.f32_limit_s / dense.f32_limit_s == pytest.approx(products(case) / (20 * 2), rel=1e-6)
+    native = shape.rows.get("native-bf16 dense")
+    assert native is None or native.f32_limit_s is None
     table = format_engine_table("toy", shape)
-    assert "| torch random91 |" in table
-    assert f"{1e6 * shape['all_pruned_step_s']['torch']:.1f} µs in torch" in table
+    assert "| torch random91 " in table
+    assert f"{1e6 * shape.all_pruned_step_s['torch']:.1f} µs in torch" in table
 
 
 def products(case):
@@ -124,10 +121,9 @@ def test_recipe_writes_results_and_charts(tmp_path):
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    results = json.loads((tmp_path / "engine.json").read_text())
-    assert results["schema"] == 1
-    assert list(results["shapes"]) == ["low_dim_b1", "kitchen_b2"]
-    assert "eager-ifs random91" in results["shapes"]["low_dim_b1"]["rows"]
-    for name in results["shapes"]:
+    results = load_engine_results(tmp_path / "engine.json")
+    assert list(results.shapes) == ["low_dim_b1", "kitchen_b2"]
+    assert "eager-ifs random91" in results.shapes["low_dim_b1"].rows
+    for name in results.shapes:
         assert iio.imread(tmp_path / f"engine_{name}.png").std() > 5
         assert f"{name}: batch" in done.stdout

@@ -7,7 +7,7 @@ import yaml
 
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, EVALUATION_SEED
-from torchrl_sparse.evaluation.results.report import save_results
+from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
     Trial,
@@ -80,11 +80,8 @@ def test_what_wandb_would_refuse_is_named(tmp_path):
 def test_metrics_have_names_that_do_not_depend_on_the_method():
     results = make_results(20, names=("dense", "ddim10"))
     metrics = trial_metrics(results)
-    assert (
-        metrics["tested/success"]
-        == metrics["ddim10/success"]
-        == results["methods"]["ddim10"]["success"]["rate"]
-    )
+    rate = results.methods["ddim10"].success.rate
+    assert metrics["tested/success"] == metrics["ddim10/success"] == rate
     assert metrics["dense/speedup"] == 1
 
 
@@ -94,7 +91,7 @@ def test_trials_go_by_what_they_tested_or_else_by_their_parameters():
             (Trial(str(i), {"seed": i}), make_results(20, names=("dense", name)))
             for i, name in enumerate(tested)
         ]
-        return list(merge_trials(pairs)["methods"])
+        return list(merge_trials(pairs).methods)
 
     assert merged("ddim10", "bac") == ["dense", "ddim10", "bac"]
     assert merged("bac", "bac") == ["dense", "seed=0", "seed=1"]

@@ -5,8 +5,14 @@ import copy
 import pytest
 import torch
 
-from torchrl_sparse import DiffusionPolicy, Uniform, keys
-from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse import DiffusionPolicy, Sampler, TransformerForDiffusion, Uniform, keys
+from torchrl_sparse.blocks.engine import (
+    ENGINES as ENGINE_TABLE,
+    EngineEntry,
+    ReferenceEngine,
+    make_engine,
+    native_available,
+)
 
 from .test_policy import request
 
@@ -47,6 +53,81 @@ def test_weights_that_change_change_the_actions(policy, engine, through_data):
     changed = policy(request(2))[keys.CHUNK]
     policy.engine = "reference"
     torch.testing.assert_close(changed, policy(request(2))[keys.CHUNK], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_refresh_reads_weights_that_were_written_behind_all_records(policy, engine):
+    policy.engine = engine
+    before = policy(request(2))[keys.CHUNK]
+    policy.network.decoder.layers[1].linear2.bias.data[20:] += 1.0
+    policy.refresh()
+    changed = policy(request(2))[keys.CHUNK]
+    policy.engine = "reference"
+    torch.testing.assert_close(changed, policy(request(2))[keys.CHUNK], atol=1e-5, rtol=0)
+    assert (changed - before).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_weights_that_were_moved_to_no_device_are_refused_by_name(policy, engine):
+    policy.engine = engine
+    policy(request(2))
+    td = policy.module["plan"](policy.module["encode"](request(2)))
+    policy.network.to("meta")
+    with pytest.raises(ValueError, match=r"on the meta device|the network is on meta"):
+        policy.module["denoise"](td)
+
+
+@pytest.mark.parametrize("made_within", [False, True])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_autocast_around_a_policy_works(policy, engine, made_within):
+    """Engines compute in the weights' own type whatever autocast says; the reference is PyTorch and follows it."""
+    policy.engine, policy.plan = engine, Uniform(3)
+    with torch.no_grad():
+        expected = None if made_within else policy(request(3))[keys.CHUNK]
+        with torch.autocast("cpu"):
+            within = policy(request(3))[keys.CHUNK]
+        if expected is None:
+            expected = policy(request(3))[keys.CHUNK]
+    assert within.dtype == torch.float32
+    torch.testing.assert_close(within, expected, atol=0.3 if engine == "reference" else 0, rtol=0)
+
+
+class HalfWay:
+    """An engine from outside the package: half of what the reference answers."""
+
+    name, detail = "half", "a toy"
+
+    def __init__(self, network, sampler):
+        self._reference = ReferenceEngine(network, sampler)
+
+    def denoise(self, *query):
+        return 0.5 * self._reference.denoise(*query)
+
+
+@pytest.fixture
+def half_engine(monkeypatch):
+    def only_small(network):
+        return network.n_emb <= 32, "it is for small networks"
+
+    monkeypatch.setitem(ENGINE_TABLE, "half", EngineEntry(HalfWay, only_small))
+
+
+def test_an_engine_from_outside_is_one_line_in_the_table(policy, half_engine):
+    policy.engine = "reference"
+    td = policy(request(3))
+    policy.engine = "half"
+    half = policy.normalizer.normalize_action(policy(request(3))[keys.CHUNK])
+    torch.testing.assert_close(half, 0.5 * policy.normalizer.normalize_action(td[keys.CHUNK]))
+    assert policy.engine == "half"
+    assert policy.engine_info() == "half: a toy"
+    policy.engine = "auto"
+    assert "half" not in policy.engine_info()
+
+
+def test_where_an_engine_from_outside_does_not_apply_it_says_why(half_engine):
+    sizes = {"input_dim": 4, "output_dim": 4, "horizon": 6, "n_obs_steps": 2, "cond_dim": 5}
+    with pytest.raises(ValueError, match="half engine: it is for small networks"):
+        make_engine("half", TransformerForDiffusion(**sizes, n_layer=1, n_emb=64), Sampler())
 
 
 def test_gradients_flow_in_training_mode_and_to_the_observations(policy):

@@ -46,6 +46,23 @@ def test_plans_that_prune_nothing_are_bit_exactly_dense(policy, plan):
     assert torch.equal(policy(request(2))[keys.CHUNK], dense)
 
 
+def test_no_plan_is_dense(policy):
+    dense = policy(request(2))[keys.CHUNK]
+    policy.plan = Uniform(4)
+    assert not torch.equal(policy(request(2))[keys.CHUNK], dense)
+    policy.plan = None
+    assert isinstance(policy.plan, Dense)
+    assert torch.equal(policy(request(2))[keys.CHUNK], dense)
+
+
+def test_another_plan_leaves_the_policy_as_it_is(policy):
+    other = policy.with_plan(Uniform(2), Sampler("ddim", 4))
+    assert other.network is policy.network
+    assert (other.num_inference_steps, other.plan.interval) == (4, 2)
+    assert policy.num_inference_steps == 8
+    assert isinstance(policy.plan, Dense)
+
+
 def test_rows_with_different_masks_equal_the_rows_alone(policy):
     class Alternate(Planner):
         def masks(self, cond):

@@ -71,7 +71,7 @@ CONFIG_FAULTS = {
     "size": (lambda c: c["network"].update(n_emb=30), "n_emb must be a multiple of n_head"),
     "timesteps": (
         lambda c: c["schedule"].update(kind="ddim", num_inference_steps=2, timesteps=[10, 90]),
-        r"config.json: sampler: timesteps: expected 2 .* got \[10, 90\]",
+        r"config.json: schedule: timesteps: expected 2 .* got \[10, 90\]",
     ),
     "depth": (lambda c: c["network"].update(n_layer=3), "missing"),
 }

@@ -1,9 +1,8 @@
-from .base import (
-    Engine as Engine,
-    ReferenceEngine as ReferenceEngine,
-)
+from .base import Engine as Engine
 from .costs import BlockCost as BlockCost
 from .factory import (
+    ENGINES as ENGINES,
+    EngineEntry as EngineEntry,
     EngineName as EngineName,
     make_engine as make_engine,
 )
@@ -13,6 +12,7 @@ from .native import (
 )
 from .reference import (
     FeatureRecorder as FeatureRecorder,
+    ReferenceEngine as ReferenceEngine,
     denoise as denoise,
 )
 from .torch import TorchEngine as TorchEngine

@@ -1,31 +1,27 @@
-"""What every engine offers: one query, from its noise and its mask to the actions."""
+"""The contract of every engine: one query, from its noise and its mask to the actions."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.costs import time_blocks
-from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
+from torchrl_sparse.blocks.mask import Reuse, check_reuse, validate_mask
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-
-__all__ = ["Engine", "ReferenceEngine"]
+__all__ = ["Engine", "check_query"]
 
 
 class Engine(Protocol):
-    """Runs queries of one network with one sampler; made by
-    :func:`torchrl_sparse.blocks.engine.make_engine`.
+    """Runs queries of one network with one sampler; made by :func:`torchrl_sparse.blocks.engine.make_engine`.
 
-    An engine answers for the weights that its network has when it is asked.
+    An engine answers for the weights that its network has when it is asked. It sees optimiser steps,
+    ``load_state_dict``, moves, and parameters or modules that were exchanged. Writes through ``parameter.data`` that
+    leave the first values of the parameter as they were it cannot see: call :meth:`refresh` after those.
 
     Attributes:
-        name: ``"reference"``, ``"torch"`` or ``"native"``.
+        name: its name in :data:`~torchrl_sparse.blocks.engine.ENGINES`.
         detail: in a few words, what of the machine it uses.
     """
 
@@ -35,54 +31,54 @@ class Engine(Protocol):
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
     ) -> Tensor:
-        """Normalised actions f32 [B, H, A], as :func:`torchrl_sparse.blocks.engine.reference.denoise` defines
-        them.
+        """Return normalised actions f32 [B, H, A], those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
         Args:
             noise: f32 [B, K, H, A], standard normal.
             cond: f32 [B, To, D], encoded observations.
-            mask: bool [B, K, 3L], True = pruned, row 0 all False; None prunes nothing.
-            reuse: what a pruned block adds, ``"block"`` or ``"type"``.
+            mask: bool [B, K, 3L], True = pruned, row 0 all False; None prunes nothing. It is checked here, once a
+                query.
+            reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`.
 
         Raises:
-            ValueError: naming what was expected and what came.
+            ValueError: naming what was expected and what came (:func:`check_query`).
         """
         ...
 
+    def refresh(self) -> None:
+        """Read the network's weights anew in the next query."""
+        ...
+
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
-        """Measured seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``, batch 1."""
+        """Measure the seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``, batch 1."""
+        ...
+
+    def block_macs(self) -> tuple[int, int, int]:
+        """Return the multiply-accumulates that one SA, one CA and one FFN block take here, batch 1."""
         ...
 
 
-class ReferenceEngine:
-    """The definition: eager and differentiable; reads the network's weights anew in every query.
+def check_query(
+    network: TransformerForDiffusion,
+    sampler: Sampler,
+    noise: Tensor,
+    cond: Tensor,
+    mask: Tensor | None = None,
+    reuse: str = "block",
+) -> None:
+    """Refuse what no engine can run; the arguments are those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
-    Args:
-        network: the denoiser.
-        sampler: the sampler.
+    Raises:
+        MaskError: a ValueError, if the mask is no prune mask for the query.
+        ValueError: naming what was expected and what came.
     """
-
-    name = "reference"
-    detail = "eager and differentiable"
-
-    def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
-        self._network, self._schedule = network, sampler
-
-    def denoise(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
-    ) -> Tensor:
-        """See :meth:`Engine.denoise`; gradients flow."""
-        return denoise(self._network, self._schedule, noise, cond, mask, reuse=reuse)
-
-    @torch.no_grad()
-    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
-        """See :meth:`Engine.block_seconds`."""
-        network, like = self._network, self._network.pos_emb
-        x = network.embed(like.new_zeros(1, network.horizon, network.input_dim))
-        memory = network.memory(0, like.new_zeros(1, network.n_obs_steps, network.cond_dim))
-
-        def walk(kind: int) -> None:
-            for block in range(kind, network.num_blocks, len(BLOCK_TYPES)):
-                network.block(block, x, memory)
-
-        return time_blocks(walk, network.n_layer, repeats, like.device)
+    num_steps, batch = sampler.num_inference_steps, len(cond)
+    for name, tensor, expected in (
+        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
+        ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),
+    ):
+        if tuple(tensor.shape) != expected:
+            raise ValueError(f"{name}: expected shape {list(expected)}, got {list(tensor.shape)}")
+    if mask is not None:
+        validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
+    check_reuse(reuse)

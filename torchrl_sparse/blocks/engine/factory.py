@@ -1,35 +1,60 @@
-"""Choosing and making engines."""
+"""The table of engines, and how a policy holds the one that it runs in."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-from torchrl_sparse.blocks.engine.base import Engine, ReferenceEngine
+from torchrl_sparse.blocks.engine.base import Engine
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
+from torchrl_sparse.blocks.engine.reference import ReferenceEngine
 from torchrl_sparse.blocks.engine.torch.engine import TorchEngine
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+__all__ = ["ENGINES", "EngineEntry", "EngineName", "EngineSlot", "check_engine", "make_engine"]
 
-__all__ = ["EngineName", "EngineSlot", "check_engine", "make_engine"]
+EngineName = str  # a name in ENGINES, or "auto"
+Applies = Callable[[TransformerForDiffusion], tuple[bool, str]]
 
-EngineName = Literal["auto", "reference", "torch", "native"]
+
+def _always(network: TransformerForDiffusion) -> tuple[bool, str]:
+    return True, ""
+
+
+class EngineEntry(NamedTuple):
+    """An engine in :data:`ENGINES`.
+
+    Attributes:
+        make: makes it for a network and a sampler; raises ValueError where it does not apply.
+        applies: says whether it can run a network on this machine, and if not, why.
+    """
+
+    make: Callable[[TransformerForDiffusion, Sampler], Engine]
+    applies: Applies = _always
+
+
+# By name. "auto" takes the first that applies. An engine of your own: `ENGINES["mine"] = EngineEntry(MyEngine)`.
+ENGINES: dict[str, EngineEntry] = {
+    "native": EngineEntry(NativeEngine, native_supports),
+    "torch": EngineEntry(TorchEngine),
+    "reference": EngineEntry(ReferenceEngine),
+}
 
 
 def check_engine(name: str) -> None:
-    """Raise ValueError unless ``name`` is an :data:`EngineName`."""
-    if name not in get_args(EngineName):
-        raise ValueError(f"engine: expected one of {list(get_args(EngineName))}, got {name!r}")
+    """Raise ValueError unless ``name`` is in :data:`ENGINES`, or ``"auto"``."""
+    if name not in ("auto", *ENGINES):
+        raise ValueError(f"engine: expected one of {['auto', *ENGINES]}, got {name!r}")
 
 
 def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
-    """The engine ``name`` for ``network`` and ``sampler``.
+    """Make the engine ``name`` for ``network`` and ``sampler``.
 
-    ``"auto"`` takes the fastest that applies: native on a CPU where it was built, else torch.
+    ``"auto"`` takes the first of :data:`ENGINES` that applies: native on a CPU where it was built, else torch.
 
     Raises:
-        ValueError: on an unknown name, or if ``"native"`` cannot run the network here; the message says why.
+        ValueError: on an unknown name, or if the engine cannot run the network here; the message says why.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -41,11 +66,12 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sam
         'torch'
     """
     check_engine(name)
-    if name == "reference":
-        return ReferenceEngine(network, sampler)
-    if name == "native" or (name == "auto" and native_supports(network)[0]):
-        return NativeEngine(network, sampler)
-    return TorchEngine(network, sampler)
+    if name == "auto":
+        name = next(name for name, entry in ENGINES.items() if entry.applies(network)[0])
+    applies, reason = ENGINES[name].applies(network)
+    if not applies:
+        raise ValueError(f"{name} engine: {reason}")
+    return ENGINES[name].make(network, sampler)
 
 
 class EngineSlot:
@@ -54,7 +80,7 @@ class EngineSlot:
     Copies and pickles carry the choice, not the engine.
 
     Args:
-        name: what to make, see :func:`make_engine`.
+        name: of the engine to make, see :func:`make_engine`.
 
     Raises:
         ValueError: on an unknown name.
@@ -66,7 +92,7 @@ class EngineSlot:
         self._made: tuple[Any, Engine | None] = (None, None)
 
     def get(self, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
-        """The engine for ``network`` and ``sampler``.
+        """Return the engine for ``network`` and ``sampler``.
 
         Raises:
             ValueError: if the chosen engine cannot run the network.
@@ -79,12 +105,20 @@ class EngineSlot:
             self._made = wanted, engine
         return engine
 
+    def refresh(self) -> None:
+        """Make the engine anew in the next query, from the weights that the network has then."""
+        self._made = (None, None)
+
     def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
-        """Which engine runs and on what; if ``"auto"`` had to do without the native one, why."""
+        """Say which engine runs and on what; if ``"auto"`` had to pass over others, why."""
         engine = self.get(network, sampler)
         text = f"{engine.name}: {engine.detail}"
-        if self.name == "auto" and engine.name != "native":
-            text += f" (not native: {native_supports(network)[1]})"
+        if self.name != "auto":
+            return text
+        for name, entry in ENGINES.items():
+            if name == engine.name:
+                break
+            text += f" (not {name}: {entry.applies(network)[1]})"
         return text
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,76 +1,75 @@
-"""Exact algebra that takes work out of the denoising loop.
+"""Exact algebra that takes work out of the denoising loop: once for every engine, in float64.
 
-Cross-attention reads only 1 + To memory tokens, so its big matrices can be multiplied into those tokens
-before the loop. With ``q = W_q x + b_q``, ``k_s = W_k m_s + b_k`` and ``v_s = W_v m_s + b_v``, head h scores
-token s with::
+Each engine lays out, scales and rounds what is returned here as its own loop wants it.
 
-    q_h · k_hs / sqrt(d_h) = x · (W_qh' k_hs) / sqrt(d_h) + b_qh · k_hs / sqrt(d_h) = x · key_hs + bias_hs
+Whatever reads the residual stream begins with a layer norm of gain g and shift s. Both go into the projection that
+follows, ``W (g * n + s) + b = (W g) n + (W s + b)``, which then reads what is normalised but neither scaled nor
+shifted; 1 / sqrt(head size) goes into the queries.
 
-and the block adds ``b_o + sum_hs p_hs W_oh v_hs = b_o + sum_hs p_hs value_hs``: what is left inside the loop
-are two products with n_head * (1 + To) vectors, instead of two with d x d matrices. The time token of a
-denoising step depends on nothing else (without condition layers the condition encoder works token by token),
-so it is encoded and folded once per network.
+Cross-attention reads only 1 + To memory tokens, so its big matrices can be multiplied into those tokens before the
+loop. With ``q = W_q n + b_q``, ``k_s = W_k m_s + b_k`` and ``v_s = W_v m_s + b_v``, head h scores token s with::
 
-Whatever reads the residual stream begins with a layer norm, ``g (x - mean) / sqrt(var + eps) + s``. Gain and
-shift go into the weights that follow. As nothing ever sees the mean of the stream, what is added to it is
-centred beforehand, in the weights that make it; all that is left of a norm is a division by a length,
-``x / sqrt(|x|^2 + d eps)``, and a factor sqrt(d) that goes into the weights as well.
+    q_h · k_hs = n · (W_qh' k_hs) + b_qh · k_hs = n · key_hs + bias_hs
+
+and the block adds ``b_o + sum_hs p_hs W_oh v_hs = b_o + sum_hs p_hs value_hs``: what is left inside the loop are two
+products with n_head * (1 + To) vectors, instead of two with d x d matrices. The time token of a denoising step depends
+on nothing else (without condition layers the condition encoder works token by token), so it is encoded and folded once
+per network.
 """
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = [
+    "Affine",
     "ConditionEncoder",
-    "CrossAttentionFold",
-    "FoldRoom",
+    "FoldedLayer",
     "FoldedMemory",
-    "after_length",
     "after_norm",
-    "centred",
+    "fold_layers",
+    "fold_observation_stem",
+    "fold_tokens",
 ]
 
 
-def after_norm(norm: nn.LayerNorm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """f64 weight [out, d] and bias [out] of the layer behind ``norm``, to be used on what is normalised but not
-    yet scaled and shifted."""
-    weight, gain, shift = (part.detach().double() for part in (weight, norm.weight, norm.bias))
-    return weight * gain, bias.detach().double() + weight @ shift
+class Affine(NamedTuple):
+    """A linear layer, f64: ``weight`` [*out, *in] and ``bias`` [*out]."""
+
+    weight: Tensor
+    bias: Tensor
 
 
-def after_length(norm: nn.LayerNorm, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """The same, in the type of ``weight``, to be used on ``x / sqrt(|x|^2 + d eps)`` of a centred x.
+class FoldedLayer(NamedTuple):
+    """A decoder layer; ``qkv``, ``up`` and ``query`` read what is normalised but neither scaled nor shifted.
 
-    >>> norm, x = nn.LayerNorm(4), torch.tensor([1.0, -3.0, 0.0, 2.0])
-    >>> weight, bias = after_length(norm, torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.ones(1))
-    >>> torch.allclose(weight @ (x / (x @ x + 4 * norm.eps).sqrt()) + bias, norm(x) @ torch.arange(1.0, 5) + 1)
-    True
+    Attributes:
+        qkv: of self-attention, weight [3, n_head, head size, d].
+        out: of self-attention, weight [d, n_head, head size].
+        up, down: of the feed-forward network.
+        query: of cross-attention, weight [n_head, head size, d].
+        key_value: of cross-attention, from memory tokens, weight [2, n_head, head size, d].
+        cross_out: of cross-attention, weight [d, n_head, head size].
     """
-    folded, shifted = after_norm(norm, weight, bias)
-    return (folded * weight.shape[-1] ** 0.5).to(weight), shifted.to(weight)
+
+    qkv: Affine
+    out: Affine
+    up: Affine
+    down: Affine
+    query: Affine
+    key_value: Affine
+    cross_out: Affine
 
 
-def centred(tensor: Tensor) -> Tensor:
-    """``tensor`` [..., d] without its mean over d.
-
-    >>> centred(torch.tensor([1.0, 2.0, 6.0]))
-    tensor([-2., -1.,  3.])
-    """
-    exact = tensor.detach().double()
-    return (exact - exact.mean(dim=-1, keepdim=True)).to(tensor)
-
-
-@dataclass(frozen=True)
-class FoldedMemory:
-    """What N memory tokens mean to the cross-attention of all L layers.
+class FoldedMemory(NamedTuple):
+    """N memory tokens as the cross-attention of all L layers reads them.
 
     Attributes:
         vectors: [L, 2, N, n_head, d]; entry 0 of axis 1 holds the keys, entry 1 the values.
@@ -81,78 +80,68 @@ class FoldedMemory:
     bias: Tensor
 
 
-class FoldRoom:
-    """The memory that folding N tokens takes, and its result; made by :meth:`CrossAttentionFold.room`.
+def after_norm(norm: nn.LayerNorm, layer: Affine) -> Affine:
+    """Fold gain and shift of ``norm`` into the ``layer`` behind it, weight [out, d].
 
-    Args:
-        num_tokens: N.
-        sizes: layers L, heads, head size, width d.
-        like: gives type and device.
-
-    Attributes:
-        folded: of the tokens that were folded last.
+    >>> norm, x = nn.LayerNorm(2), torch.tensor([3.0, 1.0], dtype=torch.float64)
+    >>> _ = norm.weight.data.fill_(2.0), norm.bias.data.fill_(1.0)
+    >>> after_norm(norm, Affine(torch.eye(2), torch.zeros(2)))
+    Affine(weight=tensor([[2., 0.],
+            [0., 2.]], dtype=torch.float64), bias=tensor([1., 1.], dtype=torch.float64))
     """
-
-    def __init__(self, num_tokens: int, sizes: tuple[int, int, int, int], like: Tensor) -> None:
-        layers, heads, size, width = sizes
-        self.projected = like.new_empty(num_tokens, layers * 2 * heads * size)
-        self.projected_by_token = (num_tokens, layers, 2, heads, size)
-        self.split = like.new_empty(2, layers, heads, num_tokens, size)
-        self.key, self.value = self.split.flatten(1, 2).unbind(0)
-        vectors = like.new_empty(2, layers, heads, num_tokens, width)
-        self.key_vectors, self.value_vectors = vectors.flatten(1, 2).unbind(0)
-        bias = like.new_empty(layers, heads, num_tokens)
-        self.bias = bias.view(layers * heads, num_tokens, 1)
-        self.folded = FoldedMemory(vectors.permute(1, 0, 3, 2, 4), bias.transpose(1, 2))
+    weight, bias = (part.detach().double() for part in layer)
+    gain, shift = norm.weight.detach().double(), norm.bias.detach().double()
+    return Affine(weight * gain, bias + weight @ shift)
 
 
-class CrossAttentionFold:
-    """Folds memory tokens into keys and values of width d; a snapshot of the network's weights.
+def fold_layers(network: TransformerForDiffusion) -> list[FoldedLayer]:
+    """Fold norms and scales of every decoder layer into its projections."""
+    return [_fold_layer(layer, network.n_head) for layer in network.decoder.layers]
 
-    The keys are for activations divided by their length, the values are centred.
 
-    Args:
-        network: the denoiser.
+def _fold_layer(layer: nn.TransformerDecoderLayer, heads: int) -> FoldedLayer:
+    attention, cross, width = layer.self_attn, layer.multihead_attn, layer.self_attn.embed_dim
+    scale = (width // heads) ** -0.5
+    qkv = _split(after_norm(layer.norm1, _in_proj(attention)), (3, heads, -1))
+    for part in qkv:
+        part[0] *= scale
+    cross_in = _in_proj(cross)
+    query = after_norm(layer.norm2, Affine(*(part[:width] for part in cross_in)))
+    return FoldedLayer(
+        qkv=qkv,
+        out=_by_head(attention.out_proj, heads),
+        up=after_norm(layer.norm3, _exact(layer.linear1)),
+        down=_exact(layer.linear2),
+        query=Affine(*(part * scale for part in _split(query, (heads, -1)))),
+        key_value=_split(Affine(*(part[width:] for part in cross_in)), (2, heads, -1)),
+        cross_out=_by_head(cross.out_proj, heads),
+    )
 
-    Examples:
-        >>> network = TransformerForDiffusion(
-        ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=3, n_head=2, n_emb=16
-        ... )
-        >>> fold = CrossAttentionFold(network)
-        >>> fold(torch.zeros(6, 16), fold.room(6)).vectors.shape
-        torch.Size([3, 2, 6, 2, 16])
+
+def fold_tokens(layers: Sequence[FoldedLayer], tokens: Tensor) -> FoldedMemory:
+    """Fold encoded memory ``tokens``, f64 [N, d], into the cross-attention of all layers."""
+    folded = [_fold_into(layer, tokens) for layer in layers]
+    return FoldedMemory(*map(torch.stack, zip(*folded, strict=True)))
+
+
+def _fold_into(layer: FoldedLayer, tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """Return keys and values [2, N, n_head, d], and score biases [N, n_head]."""
+    heads = layer.query.bias.shape
+    weight, bias = (part.flatten(1, 2) for part in layer.key_value)
+    key, value = (torch.einsum("nod,kd->nko", weight, tokens) + bias[:, None]).unflatten(2, heads)
+    keys = torch.einsum("khc,hcd->khd", key, layer.query.weight)
+    values = torch.einsum("khc,dhc->khd", value, layer.cross_out.weight)
+    return torch.stack([keys, values]), torch.einsum("khc,hc->kh", key, layer.query.bias)
+
+
+def fold_observation_stem(network: TransformerForDiffusion) -> Affine:
+    """Merge the embedding of observations and the first layer of their encoder: bias [To, 4d], as tokens have positions.
+
+    Only for a condition encoder that works token by token.
     """
-
-    def __init__(self, network: TransformerForDiffusion) -> None:
-        heads, width = network.n_head, network.n_emb
-        layers, size = network.decoder.layers, width // heads
-        attention = [layer.multihead_attn for layer in layers]
-        weight = torch.stack([a.in_proj_weight for a in attention]).detach()
-        bias = torch.stack([a.in_proj_bias for a in attention]).detach()
-        output = torch.stack([a.out_proj.weight.T for a in attention])
-        # Scores are scaled by 1 / sqrt(d_h); scaling the query side scales keys and biases alike.
-        queries = [
-            after_length(layer.norm2, weight[i, :width] * size**-0.5, bias[i, :width] * size**-0.5)
-            for i, layer in enumerate(layers)
-        ]
-        self._sizes = (len(layers), heads, size, width)
-        self._query = torch.stack([query for query, _ in queries]).view(-1, size, width)
-        self._query_bias = torch.stack([shift for _, shift in queries]).view(-1, size, 1)
-        self._project = make_linear(weight[:, width:].flatten(0, 1), bias[:, width:].flatten())
-        self._output = centred(output).view(-1, size, width)
-
-    def room(self, num_tokens: int) -> FoldRoom:
-        """Memory to fold ``num_tokens`` tokens in."""
-        return FoldRoom(num_tokens, self._sizes, self._query)
-
-    def __call__(self, tokens: Tensor, room: FoldRoom) -> FoldedMemory:
-        """Fold encoded memory ``tokens`` [N, d]; the result is that of ``room``, until it is used again."""
-        projected = self._project(tokens, room.projected).view(room.projected_by_token)
-        room.split.copy_(projected.permute(2, 1, 3, 0, 4))
-        torch.bmm(room.key, self._query, out=room.key_vectors)
-        torch.bmm(room.value, self._output, out=room.value_vectors)
-        torch.bmm(room.key, self._query_bias, out=room.bias)
-        return room.folded
+    embed, up = network.cond_obs_emb, _exact(network.encoder[0])
+    bias = (embed.bias.detach().double() + network.cond_pos_emb.detach()[0, 1:]) @ up.weight.T + up.bias
+    return Affine(up.weight @ embed.weight.detach().double(), bias)
 
 
 class ConditionEncoder:
@@ -161,30 +150,33 @@ class ConditionEncoder:
     Args:
         network: the denoiser.
         timesteps: i64 [K], the diffusion timestep of each denoising step.
+        dtype: to compute in; the network's own by default.
 
     Attributes:
         separable: the encoder works token by token, so that time and observations may be encoded apart.
     """
 
-    def __init__(self, network: TransformerForDiffusion, timesteps: Tensor) -> None:
+    def __init__(
+        self, network: TransformerForDiffusion, timesteps: Tensor, dtype: torch.dtype | None = None
+    ) -> None:
         self.separable = network.n_cond_layers == 0
-        self._encoder: nn.Module = copy.deepcopy(network.encoder).eval()
-        self._embed: nn.Module = copy.deepcopy(network.cond_obs_emb)
-        self._position = network.cond_pos_emb.detach().clone()
+        self._encoder: nn.Module = copy.deepcopy(network.encoder).eval().to(dtype=dtype)
+        self._embed: nn.Module = copy.deepcopy(network.cond_obs_emb).to(dtype=dtype)
+        self._position = network.cond_pos_emb.detach().clone().to(dtype=dtype)
         position = self._position[0, :1]
         time = network.time_emb(timesteps.to(position.device)).to(position.dtype)
         self._time = time + position
 
     def time_tokens(self) -> Tensor:
-        """The encoded time tokens [K, d] of a separable encoder."""
+        """Encode the time tokens [K, d]; for a separable encoder."""
         return self._encoder(self._time)
 
     def observation_tokens(self, cond: Tensor) -> Tensor:
-        """The encoded observation tokens [B, To, d] of a separable encoder; ``cond`` is [B, To, cond_dim]."""
+        """Encode the observation tokens [B, To, d] of ``cond`` [B, To, cond_dim]; for a separable encoder."""
         return self._encoder(self._observations(cond))
 
     def memory(self, cond: Tensor) -> Tensor:
-        """All tokens [K, B, 1 + To, d], of any encoder: one batch of K * B."""
+        """Encode all tokens [K, B, 1 + To, d] with any encoder, as one batch of K * B."""
         steps, batch = len(self._time), len(cond)
         time = self._time[:, None, None].expand(-1, batch, -1, -1)
         tokens = torch.cat([time, self._observations(cond).expand(steps, -1, -1, -1)], dim=2)
@@ -192,3 +184,22 @@ class ConditionEncoder:
 
     def _observations(self, cond: Tensor) -> Tensor:
         return self._embed(cond) + self._position[:, 1:]
+
+
+def _exact(layer: nn.Linear) -> Affine:
+    return Affine(layer.weight.detach().double(), layer.bias.detach().double())
+
+
+def _in_proj(attention: nn.MultiheadAttention) -> Affine:
+    return Affine(attention.in_proj_weight.detach().double(), attention.in_proj_bias.detach().double())
+
+
+def _split(layer: Affine, sizes: tuple[int, ...]) -> Affine:
+    """Split the outputs of ``layer`` into ``sizes``."""
+    return Affine(*(part.unflatten(0, sizes) for part in layer))
+
+
+def _by_head(layer: nn.Linear, heads: int) -> Affine:
+    """Split the inputs of ``layer`` by head."""
+    weight, bias = _exact(layer)
+    return Affine(weight.unflatten(1, (heads, -1)), bias)

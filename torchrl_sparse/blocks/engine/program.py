@@ -1,5 +1,6 @@
-"""From a prune mask to a program: what the PyTorch engine executes for one query, known before its loop starts. The native
-engine does the same operations, but finds them in the mask as it goes.
+"""From a prune mask to a program: the operations that the PyTorch engine executes for one query, known before its loop.
+
+The native engine does the same operations, but finds them in the mask as it goes.
 
 A denoising step of a program is a short list of operations on the residual stream ``x``. Pruned blocks come in
 runs, and a run adds a sum of vectors that are already there, so it is one operation however long it is:
@@ -30,7 +31,7 @@ COMPUTE, REUSE, COLLAPSE = 0, 1, 2
 
 @dataclass(frozen=True)
 class Program:
-    """What one row of a batch executes.
+    """The operations that one row of a batch executes.
 
     Attributes:
         ops: i32 [n, 3], (operation, first, last) in order of execution.
@@ -46,12 +47,12 @@ class Program:
         return len(self.starts) - 1
 
     def step(self, k: int) -> list[tuple[int, int, int]]:
-        """Operations of denoising step ``k``, (operation, first, last) each."""
+        """Return the operations of denoising step ``k``, (operation, first, last) each."""
         return [tuple(op) for op in self.ops[self.starts[k] : self.starts[k + 1]].tolist()]
 
 
 def build_program(mask: Tensor | np.ndarray) -> Program:
-    """The program of one mask.
+    """Build the program of one mask.
 
     The work is array arithmetic over the computed blocks, so that a new mask costs little next to its query.
 
@@ -98,7 +99,7 @@ def build_program(mask: Tensor | np.ndarray) -> Program:
 
 
 def slot_counts(first: int, last: int, num_slots: int) -> tuple[int, ...]:
-    """How many of the columns ``first .. last-1`` read each of ``num_slots`` buffers (column modulo number).
+    """Count how many of the columns ``first .. last-1`` read each of ``num_slots`` buffers (column modulo number).
 
     >>> slot_counts(1, 6, num_slots=3)
     (1, 2, 2)

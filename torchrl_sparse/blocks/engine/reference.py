@@ -6,18 +6,18 @@ Every other engine is tested against :func:`denoise`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import Reuse, check_reuse, num_buffers, validate_mask
+from torchrl_sparse.blocks.engine.base import check_query
+from torchrl_sparse.blocks.engine.timing import time_blocks
+from torchrl_sparse.blocks.engine.weights import refuse_meta
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-
-__all__ = ["ComputedRows", "FeatureRecorder", "check_query", "denoise"]
+__all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
 
 
 class FeatureRecorder:
@@ -42,7 +42,7 @@ class FeatureRecorder:
         self._outputs.setdefault(block, []).append(output.detach())
 
     def features(self) -> Tensor:
-        """Everything recorded, [3L, K, B, H, d]."""
+        """Return everything recorded, [3L, K, B, H, d]."""
         return torch.stack([torch.stack(outputs) for _, outputs in sorted(self._outputs.items())])
 
 
@@ -115,7 +115,7 @@ def denoise(
 def _block_output(
     network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor | None
 ) -> Tensor:
-    """What ``block`` adds: computed for ``rows`` (True: all, False: none), ``latest`` for the others."""
+    """Return what ``block`` adds: computed for ``rows`` (True: all, False: none), ``latest`` for the others."""
     if rows is True:
         return network.block(block, x, memory)
     if rows is False:
@@ -137,7 +137,7 @@ class ComputedRows:
         self._any = None if mask is None else self._computed.any(dim=0).tolist()
 
     def at(self, step: int, block: int) -> Tensor | bool:
-        """True if every row computes, False if none does, else the i64 indices of those that do."""
+        """Return True if every row computes, False if none does, else the i64 indices of those that do."""
         if self._computed is None or self._all[step][block]:
             return True
         if not self._any[step][block]:
@@ -145,26 +145,47 @@ class ComputedRows:
         return self._computed[:, step, block].nonzero().flatten().to(self._device)
 
 
-def check_query(
-    network: TransformerForDiffusion,
-    sampler: Sampler,
-    noise: Tensor,
-    cond: Tensor,
-    mask: Tensor | None = None,
-    reuse: str = "block",
-) -> None:
-    """Refuse what no engine can run; the arguments are those of :func:`denoise`.
+class ReferenceEngine:
+    """The definition: eager and differentiable; reads the network's weights anew in every query.
+
+    Args:
+        network: the denoiser.
+        sampler: the sampler.
 
     Raises:
-        ValueError: naming what was expected and what came.
+        ValueError: if the network has weights without values, on the meta device.
     """
-    num_steps, batch = sampler.num_inference_steps, len(cond)
-    for name, tensor, expected in (
-        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
-        ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),
-    ):
-        if tuple(tensor.shape) != expected:
-            raise ValueError(f"{name}: expected shape {list(expected)}, got {list(tensor.shape)}")
-    if mask is not None:
-        validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
-    check_reuse(reuse)
+
+    name = "reference"
+    detail = "eager and differentiable"
+
+    def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
+        refuse_meta(network)
+        self._network, self._sampler = network, sampler
+
+    def denoise(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+    ) -> Tensor:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.denoise`; gradients flow."""
+        refuse_meta(self._network)
+        return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse)
+
+    def refresh(self) -> None:
+        """Do nothing: no weights are kept between queries."""
+
+    @torch.no_grad()
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
+        network, like = self._network, self._network.pos_emb
+        x = network.embed(like.new_zeros(1, network.horizon, network.input_dim))
+        memory = network.memory(0, like.new_zeros(1, network.n_obs_steps, network.cond_dim))
+
+        def walk(kind: int) -> None:
+            for block in range(kind, network.num_blocks, len(BLOCK_TYPES)):
+                network.block(block, x, memory)
+
+        return time_blocks(walk, network.n_layer, repeats, like.device)
+
+    def block_macs(self) -> tuple[int, int, int]:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`; the published count."""
+        return block_macs(NetworkSizes.of(self._network))

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.native.library import native_available
-from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativeGates
+from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner, PrunerWeights
 from torchrl_sparse.networks.diffusion.transformer import SinusoidalPosEmb
 
 __all__ = ["PrunerNetwork"]
@@ -99,7 +99,7 @@ class PrunerNetwork(nn.Module):
 
         In evaluation mode and without gradients, compiled code computes it for float32 on the CPU.
         """
-        if (native := self._native_gates(cond)) is not None:
+        if (native := self._compiled(cond)) is not None:
             return native.logits(self._features(cond, rate))
         _, middle, _, last = self.mlp
         hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
@@ -108,19 +108,28 @@ class PrunerNetwork(nn.Module):
 
     def prune_masks(self, cond: Tensor) -> Tensor:
         """bool [B, K, 3L]: where pruning is preferred, which it never is in the first step; without a rate as input."""
-        if (native := self._native_gates(cond)) is not None:
+        if (native := self._compiled(cond)) is not None:
             return native.masks(cond.flatten(1))
         masks = self.prune_logits(cond) > 0
         masks[:, 0] = False
         return masks
 
-    def _native_gates(self, cond: Tensor) -> NativeGates | None:
+    def _compiled(self, cond: Tensor) -> NativePruner | None:
         """The compiled MLP, or None where PyTorch has to compute."""
         if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):
             return None
         if self._native is None and self._can_be_native():
-            self._native = NativeGates(self)
+            self._native = NativePruner(self.mlp_weights())
         return self._native
+
+    def mlp_weights(self) -> PrunerWeights:
+        """Return the weights of all that depends on the observation, for compiled code."""
+        _, middle, _, last = self.mlp
+        obs, fuse, middle, last = (
+            (layer.weight, layer.bias) for layer in (self.obs, self.fuse_obs, middle, last)
+        )
+        cells = self.cells().view(len(self.timesteps), self.num_blocks, -1)
+        return PrunerWeights(obs, fuse, cells, middle, last)
 
     def _can_be_native(self) -> bool:
         small = self.fuse_obs.out_features <= MAX_HIDDEN
@@ -139,14 +148,16 @@ class PrunerNetwork(nn.Module):
         if self.training or torch.is_grad_enabled():
             return self._encode()
         if self._cells is None:
-            self._cells = self._encode()
+            # Outside of autocast, which would round what is kept for calls without it.
+            with torch.autocast(self.obs.weight.device.type, enabled=False):
+                self._cells = self._encode()
         return self._cells
 
     # What is kept follows from the weights: training changes them, as do files and devices, and a copy makes its own.
 
     def _forget(self) -> None:
         self._cells: Tensor | None = None
-        self._native: NativeGates | None = None
+        self._native: NativePruner | None = None
 
     def train(self, mode: bool = True) -> PrunerNetwork:
         self._forget()

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchrl_sparse.blocks.engine.reference import ComputedRows, check_query
+from torchrl_sparse.blocks.engine.base import check_query
+from torchrl_sparse.blocks.engine.reference import ComputedRows
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 
 if TYPE_CHECKING:

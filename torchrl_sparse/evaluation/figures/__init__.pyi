@@ -1,6 +1,7 @@
+from .html_report import write_report as write_report
+from .pareto import plot_pareto as plot_pareto
 from .plots import (
     plot_error_surge as plot_error_surge,
-    plot_pareto as plot_pareto,
     plot_schedule as plot_schedule,
     plot_similarity as plot_similarity,
 )

@@ -4,44 +4,24 @@ Figures are made without pyplot, so that neither a display nor a global state is
 imported only when one is drawn.
 """
 
-import itertools
+from __future__ import annotations
+
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_sparse.blocks.mask import BLOCK_TYPES
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
-from torchrl_sparse.evaluation.figures.labels import place_labels
-from torchrl_sparse.evaluation.results.schema import REFERENCE, validate_results
+from torchrl_sparse.evaluation.figures.colors import REUSED_COLOR, TYPE_COLORS, method_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["block_labels", "plot_error_surge", "plot_pareto", "plot_schedule", "plot_similarity"]
-
-BLOCK_TYPES = ("SA", "CA", "FFN")
-TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
-REUSED_COLOR = "#E9E9EC"
-_FRONT_COLOR = "#B5B5BA"
-# Okabe and Ito's colours, which stay apart for colour-blind readers. The methods of the standard benchmark
-# have the same one in every figure; others take what is left.
-_METHOD_COLORS = {
-    REFERENCE: "#333333",
-    "ddim10": "#E69F00",
-    "uniform": "#56B4E9",
-    "bac_unified": "#CC79A7",
-    "bac_blockwise": "#D55E00",
-    "bac": "#0072B2",
-}
-_OTHER_COLORS = (
-    *("#009E73", "#8C6BB1", "#A6761D", "#B2182B", "#4D4D4D", "#66A61E"),
-    *("#E7298A", "#1B7F79", "#BCBD22", "#3F2A8C", "#F46D43", "#74A9CF"),
-    *("#7A4B2A", "#9E9AC8", "#FB9A99", "#00441B"),
-)
-_MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
+__all__ = ["block_labels", "plot_error_surge", "plot_schedule", "plot_similarity", "type_legend"]
 
 
 def block_labels(num_blocks: int) -> list[str]:
@@ -51,64 +31,6 @@ def block_labels(num_blocks: int) -> list[str]:
     ['L0 SA', 'L0 CA', 'L0 FFN', 'L1 SA', 'L1 CA', 'L1 FFN']
     """
     return [f"L{index // 3} {BLOCK_TYPES[index % 3]}" for index in range(num_blocks)]
-
-
-def plot_pareto(results: Mapping[str, Any], path: str | os.PathLike) -> Path:
-    """Success, with its interval, against the median latency of a query (log axis); marker by verdict.
-
-    Args:
-        results: content of a ``results.json``.
-        path: of the PNG.
-
-    Raises:
-        ValueError: if ``results`` is not of the schema.
-    """
-    validate_results(results)
-    methods = results["methods"]
-    figure, axes = make_figure(9, 5)
-    latency = {name: 1e3 * method["latency_s"]["p50"] for name, method in methods.items()}
-    rate = {name: 100 * method["success"]["rate"] for name, method in methods.items()}
-    colors = method_colors(methods)
-    axes.set_xscale("log")
-    intervals = {name: [100 * limit for limit in m["success"]["ci95"]] for name, m in methods.items()}
-    for name, method in methods.items():
-        axes.vlines(latency[name], *intervals[name], color=colors[name], linewidth=2, alpha=0.55)
-        marker = "s" if name == REFERENCE else _MARKERS[method["paired_vs_dense"]["verdict"]]
-        axes.plot(latency[name], rate[name], marker, color=colors[name], markersize=9, zorder=3)
-    _draw_front(axes, latency, rate)
-    margin = 100 * methods[REFERENCE]["paired_vs_dense"]["margin"]
-    axes.axhline(
-        rate[REFERENCE] - margin,
-        color=_METHOD_COLORS[REFERENCE],
-        linewidth=1,
-        linestyle=(0, (4, 3)),
-        alpha=0.6,
-    )
-    low, high = min(latency.values()), max(latency.values())
-    axes.set_xlim(low / 1.5, high * 1.5)
-    bottom = min(low for low, _ in intervals.values())
-    axes.set_ylim(max(bottom - 4, -2), 103)
-    axes.set_yticks([tick for tick in axes.get_yticks() if max(bottom - 4, -2) <= tick <= 100])
-    axes.annotate(
-        f"dense − {margin:g} points",
-        (high * 1.48, rate[REFERENCE] - margin),
-        ha="right",
-        va="top",
-        fontsize=9,
-        color="#666666",
-        xytext=(0, -3),
-        textcoords="offset points",
-    )
-    _plain_log_axis(axes, low / 1.5, high * 1.5)
-    axes.set_xlabel("latency per query, median (ms, log scale)")
-    axes.set_ylabel("success (%), 95 % interval")
-    n, machine = methods[REFERENCE]["success"]["n"], results["machine"]
-    threads = f"{machine['threads']} thread{'' if machine['threads'] == 1 else 's'}"
-    axes.set_title(f"{results['task']}: {n} paired episodes; {machine['cpu']}, {threads}", loc="left")
-    _verdict_legend(figure, axes, methods)
-    points = {name: (latency[name], rate[name]) for name in methods}
-    place_labels(figure, axes, points, intervals, colors)
-    return save_figure(figure, path)
 
 
 def plot_schedule(
@@ -153,7 +75,7 @@ def plot_schedule(
     return save_figure(figure, path)
 
 
-def type_legend(figure: "Figure") -> None:
+def type_legend(figure: Figure) -> None:
     """What the colours of a mask mean, under the figure."""
     from matplotlib.patches import Patch
 
@@ -241,7 +163,7 @@ def plot_error_surge(
     return save_figure(figure, path)
 
 
-def _draw_updates(axes: "Axes", masks: Mapping[str, np.ndarray], colors: Mapping[str, str]) -> None:
+def _draw_updates(axes: Axes, masks: Mapping[str, np.ndarray], colors: Mapping[str, str]) -> None:
     """One row per schedule; a step is the darker, the more of its FFN blocks are computed there."""
     for row, (name, mask) in enumerate(masks.items()):
         share = (~mask[:, 2::3]).mean(axis=1)
@@ -254,53 +176,6 @@ def _draw_updates(axes: "Axes", masks: Mapping[str, np.ndarray], colors: Mapping
     axes.set_xlim(-0.5, len(next(iter(masks.values()))) - 0.5)
     axes.grid(False)
     axes.set_ylabel("FFN\nupdates", rotation=0, ha="right", va="center", labelpad=12)
-
-
-def _draw_front(axes: "Axes", latency: Mapping[str, float], rate: Mapping[str, float]) -> None:
-    """Join the methods that no other beats in both latency and success."""
-    front = []
-    for name in sorted(latency, key=lambda name: (latency[name], -rate[name])):
-        if not front or rate[name] > rate[front[-1]]:
-            front.append(name)
-    if len(front) > 1:
-        axes.step(
-            [latency[name] for name in front],
-            [rate[name] for name in front],
-            where="post",
-            color=_FRONT_COLOR,
-            linewidth=1.2,
-            zorder=1,
-            label="Pareto front",
-        )
-
-
-def _verdict_legend(figure: "Figure", axes: "Axes", methods: Mapping[str, Any]) -> None:
-    from matplotlib.lines import Line2D
-
-    present = {m["paired_vs_dense"]["verdict"] for name, m in methods.items() if name != REFERENCE}
-    handles = [
-        Line2D([], [], color="#777777", marker=marker, linestyle="", markersize=8, label=verdict)
-        for verdict, marker in _MARKERS.items()
-        if verdict in present
-    ]
-    handles += axes.get_legend_handles_labels()[0]
-    figure.legend(handles=handles, ncols=len(handles), loc="outside lower center", frameon=False)
-
-
-def _plain_log_axis(axes: "Axes", low: float, high: float) -> None:
-    """Ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, in plain numbers."""
-    for multiples in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
-        ticks = [m * 10.0**e for e in range(-6, 7) for m in multiples if low <= m * 10.0**e <= high]
-        if len(ticks) >= 3:
-            break
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.minorticks_off()
-
-
-def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """name -> colour, the same one in every figure for the methods of the standard benchmark."""
-    others = itertools.cycle(_OTHER_COLORS)
-    return {name: _METHOD_COLORS.get(name) or next(others) for name in methods}
 
 
 def _check_mask(mask: Any, name: str) -> np.ndarray:

@@ -1,5 +1,6 @@
 from .measure import (
     Latency as Latency,
+    Machine as Machine,
     describe_machine as describe_machine,
     measure_latency as measure_latency,
     summarize_latency as summarize_latency,

@@ -21,7 +21,7 @@ import torch
 
 from torchrl_sparse.runtime.threads import num_threads
 
-__all__ = ["Latency", "describe_machine", "measure_latency", "summarize_latency"]
+__all__ = ["Latency", "Machine", "describe_machine", "measure_latency", "summarize_latency"]
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,16 @@ class Latency:
     n: int
     samples: tuple[float, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """The ``latency_s`` object of ``results.json``."""
-        return {"p50": self.p50, "p95": self.p95, "n": self.n}
+
+@dataclass(frozen=True)
+class Machine:
+    """What latencies were measured on: processor, PyTorch's threads, device, PyTorch's version, date and time."""
+
+    cpu: str
+    threads: int
+    device: str
+    torch: str
+    date: str
 
 
 def summarize_latency(samples: Sequence[float]) -> Latency:
@@ -118,26 +125,26 @@ def measure_latency(
     return {name: summarize_latency(values) for name, values in samples.items()}
 
 
-def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> dict[str, Any]:
-    """The ``machine`` object of ``results.json``: what the latencies were measured on.
+def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> Machine:
+    """Describe what latencies are measured on.
 
     Args:
         device: where the policy runs.
         threads: the threads used; None takes PyTorch's present setting.
 
-    >>> sorted(describe_machine())
-    ['cpu', 'date', 'device', 'threads', 'torch']
+    >>> describe_machine(threads=2).threads
+    2
     """
     device = torch.device(device)
     name = f"{device.type} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
     cores = _usable_cores()
-    return {
-        "cpu": f"{_cpu_model()}, {cores} {'core' if cores == 1 else 'cores'} usable",
-        "threads": torch.get_num_threads() if threads is None else int(threads),
-        "device": name,
-        "torch": torch.__version__,
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
+    return Machine(
+        cpu=f"{_cpu_model()}, {cores} {'core' if cores == 1 else 'cores'} usable",
+        threads=torch.get_num_threads() if threads is None else int(threads),
+        device=name,
+        torch=torch.__version__,
+        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    )
 
 
 def _time_once(call: Callable[[], Any], device: torch.device) -> float:

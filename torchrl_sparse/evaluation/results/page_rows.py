@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from torchrl_sparse.envs.seeds import evaluation_seeds
-from torchrl_sparse.evaluation.results.engine_report import engine_rows, load_engine_results
+from torchrl_sparse.envs.seeds import EVALUATION_SEED
+from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
-from torchrl_sparse.evaluation.results.report import format_percent, load_results, pair_rows, results_rows
+from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
+from torchrl_sparse.evaluation.results.schema import Results, load_results
+from torchrl_sparse.evaluation.results.text import percent_text
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.storage.json import parse_json
@@ -66,50 +67,48 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
 
 def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
-    rows = results_rows(results)
-    more = [_more(results, row["method"]) for row in rows]
-    wide = [{"task": results["task"], **row, **extra} for row, extra in zip(rows, more, strict=True)]
-    return {"methods": Table(results["task"], tuple(rows[0]), wide)}
+    rows = [{**row, **_more(results, row["method"])} for row in results_rows(results)]
+    return {"methods": _table(results.task, rows, len(rows[0]) - len(_MORE))}
 
 
-def _more(results: Mapping[str, Any], name: str) -> Row:
-    method, executed = results["methods"][name], results["policy"]["n_action_steps"]
-    chunks = 1 / method["latency_s"]["p50"]
-    return {
-        "success, %": format_percent(**method["success"]),
-        "action chunks per second": f"{chunks:.1f}",
-        "actions per second": f"{executed * chunks:.0f}",
-    }
+_MORE = "success, %", "action chunks per second", "actions per second"
+
+
+def _more(results: Results, name: str) -> Row:
+    method = results.methods[name]
+    chunks = 1 / method.latency_s.p50
+    texts = percent_text(method.success), f"{chunks:.1f}", f"{results.policy.n_action_steps * chunks:.0f}"
+    return dict(zip(_MORE, texts, strict=True))
 
 
 def _realtime(path: Path) -> dict[str, Table]:
     results = load_realtime(path)
-    rows = realtime_rows(results)
-    return {"methods": Table(results["task"], tuple(rows[0]), [{"task": results["task"], **r} for r in rows])}
+    return {"methods": _table(results.task, realtime_rows(results))}
 
 
 def _engine(path: Path) -> dict[str, Table]:
-    tables = {}
-    for name, shape in load_engine_results(path)["shapes"].items():
-        rows = engine_rows(shape)
-        tables[name] = Table(name, tuple(rows[0])[:-2], rows)
-    return tables
+    shapes = load_engine_results(path).shapes
+    return {name: _table(name, engine_rows(shape), len(COLUMNS)) for name, shape in shapes.items()}
 
 
 def _vla(path: Path) -> dict[str, Table]:
     results = load_vla_results(path)
-    tables = {"methods": vla_method_rows(results), "parts": vla_part_rows(results)}
-    return {name: Table(results["shape"]["name"], tuple(rows[0]), rows) for name, rows in tables.items()}
+    rows = {"methods": vla_method_rows(results), "parts": vla_part_rows(results)}
+    return {name: _table(results.shape.name, of_one) for name, of_one in rows.items()}
 
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
-    dense = next(iter(results["methods"].values()))
-    seeds = evaluation_seeds(results["seed"], dense["success"]["n"])
+    first = EVALUATION_SEED + results.seed
+    seeds = range(first, first + results.dense.success.n)
     names = {name for pair in pairs for name in pair}
     episodes = {name: list(_episodes(path.parent / "episodes" / f"{name}.jsonl", seeds)) for name in names}
-    rows = pair_rows(episodes, pairs, dense["paired_vs_dense"]["margin"])
-    return Table(results["task"], tuple(rows[0]), [{"task": results["task"], **row} for row in rows])
+    return _table(results.task, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
+
+
+def _table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
+    """Make a table that shows its first columns, all unless it is said how many."""
+    return Table(task, tuple(rows[0])[:shown], rows)
 
 
 def _episodes(path: Path, seeds: range) -> Iterator[EpisodeResult]:

@@ -1,206 +1,236 @@
 """``results.json``: the only source of every table and figure.
 
-Schema version 1 (all numbers finite; no other keys)::
-
-    {"schema": 1, "task": str, "seed": int,
-     "machine": {"cpu": str, "threads": int, "device": str, "torch": str, "date": str},
-     "policy": {"params": int, "num_inference_steps": int, "horizon": int, "n_obs_steps": int,
-                "n_action_steps": int},
-     "methods": {NAME: {
-        "success": {"k": int, "n": int, "rate": float, "ci95": [lo, hi]},
-        "paired_vs_dense": {"diff": float, "ci95": [lo, hi], "margin": float, "verdict": str},
-        "prune_rate": float,
-        "flops": {"per_query": float, "ratio_to_dense": float},
-        "latency_s": {"p50": float, "p95": float, "n": int},
-        "speedup_vs_dense": float,
-        "action_error_vs_dense": {"mean": float, "max": float},
-        "episode_length": float,
-        "planning_s": {"p50": float, "p95": float, "n": int},
-        "tokens": {"kept_mean": float, "kept_fine": float | null, "kept_coarse": float | null}}}}
-
-``success.ci95`` is Wilson's interval; ``paired_vs_dense`` compares success on the same seeds, with Tango's
-interval and a verdict ``"non-inferior"``, ``"inferior"`` or ``"undecided"`` against ``margin``;
-``prune_rate`` is the pruned share of the blocks, or of the visual tokens; ``flops`` are 2 * MAC of one
-query, denoiser only, or of a whole vision-language-action model; ``latency_s`` is
-in seconds per query and ``speedup_vs_dense`` the ratio of the medians; ``action_error_vs_dense`` is the
-absolute difference of an action entry, on the same observations and the same noise; ``episode_length`` is a
-mean in environment steps. ``planning_s``, the part of a query in which the planner decides, is there where it looks at the
-observation; ``tokens`` is there for policies with visual tokens alone: how many are in a decoder layer, mean over
-layers and queries, and over the queries in fine and in coarse mode, null without any.
-
-``methods`` always holds ``"dense"``. Its own ``paired_vs_dense`` is ``diff 0, ci95 [0, 0], "non-
-inferior"``: a policy equals itself by definition, nothing is estimated.
+The dataclasses are the schema, version 1; `load_results` and `save_results` refuse everything else. Seconds are those of a
+query; FLOPs are 2 * MAC of a query, of the denoiser alone or of a whole vision-language-action model.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
+from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Verdict, wilson_interval
+from torchrl_sparse.storage.json import read_json, write_json
 
-__all__ = ["MACHINE", "OUTCOME", "REFERENCE", "SCHEMA", "check_types", "outcome_entry", "validate_results"]
+__all__ = [
+    "DENSE",
+    "SCHEMA",
+    "ActionError",
+    "Difference",
+    "Flops",
+    "Interval",
+    "MethodEntry",
+    "Percentiles",
+    "PolicyShape",
+    "Results",
+    "Success",
+    "TokensKept",
+    "load_results",
+    "save_results",
+]
 
 SCHEMA = 1
-REFERENCE = "dense"
+DENSE = "dense"
+"""The method that all others are compared with."""
 
-MACHINE = {"cpu": str, "threads": int, "device": str, "torch": str, "date": str}
-OUTCOME = {
-    "success": {"k": int, "n": int, "rate": float, "ci95": "interval"},
-    "paired_vs_dense": {"diff": float, "ci95": "interval", "margin": float, "verdict": str},
-}
-_METHOD = {
-    **OUTCOME,
-    "prune_rate": float,
-    "flops": {"per_query": float, "ratio_to_dense": float},
-    "latency_s": {"p50": float, "p95": float, "n": int},
-    "speedup_vs_dense": float,
-    "action_error_vs_dense": {"mean": float, "max": float},
-    "episode_length": float,
-}
-# Of some methods only.
-_PARTS = {
-    "planning_s": {"p50": float, "p95": float, "n": int},
-    "tokens": {"kept_mean": float, "kept_fine": "number or null", "kept_coarse": "number or null"},
-}
-_RESULTS = {
-    "schema": int,
-    "task": str,
-    "seed": int,
-    "machine": MACHINE,
-    "policy": {
-        "params": int,
-        "num_inference_steps": int,
-        "horizon": int,
-        "n_obs_steps": int,
-        "n_action_steps": int,
-    },
-    "methods": dict,
-}
+Interval = tuple[float, float]
 
 
-def outcome_entry(outcomes: Sequence[bool], paired: PairedDifference) -> dict[str, Any]:
-    """What `OUTCOME` describes: success of the episodes, and their difference to dense.
+@dataclass(frozen=True)
+class PolicyShape:
+    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed."""
 
-    >>> from torchrl_sparse.evaluation.statistics.intervals import paired_difference
-    >>> outcome_entry([True, False], paired_difference([True, False], [True, True], 0.05))["success"]["rate"]
+    params: int
+    num_inference_steps: int
+    horizon: int
+    n_obs_steps: int
+    n_action_steps: int
+
+
+@dataclass(frozen=True)
+class Success:
+    """Episodes solved, with Wilson's 95 % interval of the rate.
+
+    >>> Success.of([True, False]).rate
     0.5
     """
-    k, n = sum(outcomes), len(outcomes)
-    return {
-        "success": {"k": k, "n": n, "rate": k / n, "ci95": list(wilson_interval(k, n))},
-        "paired_vs_dense": {
-            "diff": paired.diff,
-            "ci95": list(paired.ci),
-            "margin": paired.margin,
-            "verdict": paired.verdict,
-        },
-    }
+
+    k: int
+    n: int
+    rate: float
+    ci95: Interval
+
+    def __post_init__(self) -> None:
+        _require(self.n >= 1, "n", "at least 1", self.n)
+        _require(0 <= self.k <= self.n, "k", f"0 to {self.n}", self.k)
+        rate = self.k / self.n
+        _require(math.isclose(self.rate, rate, abs_tol=1e-9), "rate", f"k / n = {rate}", self.rate)
+        _check_interval(self.ci95)
+        _require(self.ci95[0] >= 0 and self.ci95[1] <= 1, "ci95", "limits in [0, 1]", self.ci95)
+
+    @classmethod
+    def of(cls, outcomes: Sequence[bool]) -> Success:
+        """Count the successes of episodes."""
+        k, n = sum(outcomes), len(outcomes)
+        return cls(k, n, k / n, wilson_interval(k, n))
 
 
-def validate_results(results: Any) -> None:
-    """Check that ``results`` is of schema version 1 and agrees with itself.
+@dataclass(frozen=True)
+class Difference:
+    """Success minus dense success on the same seeds, with Tango's 95 % interval and the verdict against a margin.
+
+    The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
+    """
+
+    diff: float
+    ci95: Interval
+    margin: float
+    verdict: Verdict
+
+    def __post_init__(self) -> None:
+        _require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
+        _check_interval(self.ci95)
+        _require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
+
+    @classmethod
+    def of(cls, paired: PairedDifference) -> Difference:
+        """Keep what a file holds of a comparison."""
+        return cls(paired.diff, paired.ci, paired.margin, paired.verdict)
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Median and 95th percentile of ``n`` timed calls, seconds."""
+
+    p50: float
+    p95: float
+    n: int
+
+    def __post_init__(self) -> None:
+        _require(0 < self.p50 <= self.p95, "p50", "0 < p50 <= p95", (self.p50, self.p95))
+        _require(self.n >= 1, "n", "at least 1", self.n)
+
+    @classmethod
+    def of(cls, latency: Latency) -> Percentiles:
+        """Keep what a file holds of a measurement."""
+        return cls(latency.p50, latency.p95, latency.n)
+
+
+@dataclass(frozen=True)
+class Flops:
+    """FLOPs of a query, and over those of a dense one."""
+
+    per_query: float
+    ratio_to_dense: float
+
+    def __post_init__(self) -> None:
+        _require(self.per_query >= 0, "per_query", "at least 0", self.per_query)
+        _require(self.ratio_to_dense >= 0, "ratio_to_dense", "at least 0", self.ratio_to_dense)
+
+
+@dataclass(frozen=True)
+class ActionError:
+    """Absolute difference of an action entry to the dense policy's, on the same observations and the same noise."""
+
+    mean: float
+    max: float
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "max"):
+            value = getattr(self, name)
+            _require(0 <= value < math.inf, name, "a finite number >= 0", value)
+
+
+@dataclass(frozen=True)
+class TokensKept:
+    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, in fine and in coarse mode."""
+
+    kept_mean: float
+    kept_fine: float | None
+    kept_coarse: float | None
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """Everything about one method.
+
+    Attributes:
+        success: of its episodes.
+        paired_vs_dense: their difference to the dense policy's.
+        prune_rate: pruned share of the blocks, or of the visual tokens.
+        flops: of a query.
+        latency_s: of a query, measured interleaved with the other methods.
+        speedup_vs_dense: ratio of the medians.
+        action_error_vs_dense: of its actions.
+        episode_length: mean, environment steps.
+        planning_s: part of a query in which the planner decides; where it looks at the observation.
+        tokens: that it keeps; of policies with visual tokens.
+    """
+
+    success: Success
+    paired_vs_dense: Difference
+    prune_rate: float
+    flops: Flops
+    latency_s: Percentiles
+    speedup_vs_dense: float
+    action_error_vs_dense: ActionError
+    episode_length: float
+    planning_s: Percentiles | None = None
+    tokens: TokensKept | None = None
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.prune_rate <= 1, "prune_rate", "0 to 1", self.prune_rate)
+
+
+@dataclass(frozen=True)
+class Results:
+    """The content of a ``results.json``: where it was measured, on what, and all methods, the dense policy among them."""
+
+    schema: Literal[1]
+    task: str
+    seed: int
+    machine: Machine
+    policy: PolicyShape
+    methods: dict[str, MethodEntry]
+
+    def __post_init__(self) -> None:
+        _require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
+        n = self.dense.success.n
+        for name, method in self.methods.items():
+            got = method.success.n
+            _require(got == n, f"methods.{name}.success.n", f"{n}, as every method", got)
+
+    @property
+    def dense(self) -> MethodEntry:
+        """The dense policy's entry."""
+        return self.methods[DENSE]
+
+
+def load_results(path: str | os.PathLike) -> Results:
+    """Read a ``results.json``.
 
     Raises:
-        ValueError: naming the path inside ``results``, what was expected there and what came.
-
-    >>> validate_results({"schema": 2})
-    Traceback (most recent call last):
-    ...
-    ValueError: schema: expected 1, got 2
+        FileNotFoundError: if there is none.
+        ValueError: naming file and key, if it is not of this schema or does not agree with itself.
     """
-    if isinstance(results, Mapping) and results.get("schema", SCHEMA) != SCHEMA:
-        raise _fault("schema", SCHEMA, results["schema"])
-    check_types(results, _RESULTS, "")
-    if REFERENCE not in results["methods"]:
-        raise _fault("methods", f"the key {REFERENCE!r}", sorted(results["methods"]))
-    n = None
-    for name, method in results["methods"].items():
-        path = f"methods.{name}"
-        there = {key: spec for key, spec in _PARTS.items() if isinstance(method, Mapping) and key in method}
-        check_types(method, _METHOD | there, path)
-        _check_method_values(method, path)
-        n = method["success"]["n"] if n is None else n
-        _require(
-            method["success"]["n"] == n, f"{path}.success.n", f"{n}, as every method", method["success"]["n"]
-        )
+    return read_json(path, Results)
 
 
-def _check_method_values(method: Mapping[str, Any], path: str) -> None:
-    success, paired, latency = method["success"], method["paired_vs_dense"], method["latency_s"]
-    k, n, rate = success["k"], success["n"], success["rate"]
-    _require(n >= 1, f"{path}.success.n", "at least 1", n)
-    _require(0 <= k <= n, f"{path}.success.k", f"0 to {n}", k)
-    _require(math.isclose(rate, k / n, abs_tol=1e-9), f"{path}.success.rate", f"k / n = {k / n}", rate)
-    _require(
-        all(0 <= limit <= 1 for limit in success["ci95"]),
-        f"{path}.success.ci95",
-        "within [0, 1]",
-        success["ci95"],
-    )
-    _require(-1 <= paired["diff"] <= 1, f"{path}.paired_vs_dense.diff", "-1 to 1", paired["diff"])
-    _require(0 < paired["margin"] < 1, f"{path}.paired_vs_dense.margin", "between 0 and 1", paired["margin"])
-    verdicts = get_args(Verdict)
-    _require(
-        paired["verdict"] in verdicts,
-        f"{path}.paired_vs_dense.verdict",
-        f"one of {verdicts}",
-        paired["verdict"],
-    )
-    _require(0 <= method["prune_rate"] <= 1, f"{path}.prune_rate", "0 to 1", method["prune_rate"])
-    _check_latency(latency, f"{path}.latency_s")
-    if "planning_s" in method:
-        _check_latency(method["planning_s"], f"{path}.planning_s")
-    for key in ("flops", "action_error_vs_dense"):
-        _require(min(method[key].values()) >= 0, f"{path}.{key}", "values >= 0", method[key])
+def save_results(results: Results, path: str | os.PathLike) -> Path:
+    """Write a ``results.json`` in one piece or not at all; return the path."""
+    return write_json(path, results)
 
 
-def _check_latency(latency: Mapping[str, Any], path: str) -> None:
-    _require(0 < latency["p50"] <= latency["p95"], path, "0 < p50 <= p95", latency)
-    _require(latency["n"] >= 1, f"{path}.n", "at least 1", latency["n"])
+def _check_interval(interval: Interval) -> None:
+    low, high = interval
+    _require(low <= high, "ci95", "low <= high", list(interval))
 
 
-def check_types(value: Any, spec: Any, path: str) -> None:
-    """Check a value against a nested specification: a type, ``"interval"``, ``"number or null"``, or a mapping of the only keys
-    to theirs.
-
-    Raises:
-        ValueError: naming the path, which is ``path`` and the keys below it.
-
-    >>> check_types({"k": 1.5}, {"k": int}, "success")
-    Traceback (most recent call last):
-    ...
-    ValueError: success.k: expected an integer, got 1.5
-    """
-    if isinstance(spec, Mapping):
-        _require(isinstance(value, Mapping), path or "results", "an object", value)
-        for key in spec:
-            _require(key in value, f"{path}.{key}".lstrip("."), "this key", "nothing")
-        unknown = sorted(str(key) for key in value if key not in spec)
-        _require(not unknown, path or "results", f"only the keys {sorted(spec)}", f"also {unknown}")
-        for key, inner in spec.items():
-            check_types(value[key], inner, f"{path}.{key}".lstrip("."))
-    elif spec == "interval":
-        pair = isinstance(value, Sequence) and len(value) == 2 and all(_is_number(limit) for limit in value)
-        _require(pair and value[0] <= value[1], path, "[low, high] with low <= high", value)
-    elif spec == "number or null":
-        _require(value is None or _is_number(value), path, "a finite number or null", value)
-    elif spec is float:
-        _require(_is_number(value), path, "a finite number", value)
-    elif spec is int:
-        _require(isinstance(value, int) and not isinstance(value, bool), path, "an integer", value)
-    else:
-        names = {str: "a string", dict: "an object", list: "an array", bool: "true or false"}
-        _require(isinstance(value, spec), path, names[spec], value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _require(condition: bool, path: str, expected: Any, got: Any) -> None:
+def _require(condition: bool, key: str, expected: str, got: Any) -> None:
     if not condition:
-        raise _fault(path, expected, got)
-
-
-def _fault(path: str, expected: Any, got: Any) -> ValueError:
-    return ValueError(f"{path}: expected {expected}, got {got!r}")
+        raise ValueError(f"{key}: expected {expected}, got {got!r}")

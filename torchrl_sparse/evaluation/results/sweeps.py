@@ -2,36 +2,56 @@
 
 from __future__ import annotations
 
-import json
+import csv
+import fcntl
 import os
 import secrets
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from torchrl_sparse.evaluation.results.report import load_results
-from torchrl_sparse.evaluation.results.schema import REFERENCE, validate_results
+from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json, to_plain, write_json
 
-__all__ = ["LocalSweep", "Trial", "merge_trials", "read_sweep", "trial_command"]
+__all__ = [
+    "LocalSweep",
+    "Trial",
+    "lock_folder",
+    "merge_trials",
+    "read_sweep",
+    "run_trial",
+    "trial_command",
+    "write_trials",
+]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial: the id of its wandb run, which is the name of its folder too, its parameters, and whether it is through."""
+    """One trial: the id of its wandb run, which also names its folder, its parameters, and whether it is through."""
 
     id: str
-    parameters: Mapping[str, Any]
+    parameters: dict[str, Any]
     finished: bool = False
 
     @property
     def label(self) -> str:
         """Its parameters in words."""
         return " ".join(f"{name}={value}" for name, value in self.parameters.items())
+
+
+@dataclass(frozen=True)
+class SavedSweep:
+    """The content of a ``sweep.json``: the sweep, and its trials in the order in which they were chosen."""
+
+    config: dict[str, Any]
+    trials: tuple[Trial, ...]
 
 
 def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
@@ -67,23 +87,23 @@ class LocalSweep:
         if count is None and config["method"] != "grid":
             raise ValueError(f"count: expected a number of trials for method {config['method']!r}, got None")
         if self._file.exists():
-            found = json.loads(self._file.read_text(encoding="utf-8"))
-            if found["config"] != json.loads(json.dumps(self.config)):
+            found = read_json(self._file, SavedSweep)
+            if found.config != to_plain(self.config):
                 raise ValueError(
                     f"{self._file}: holds another sweep than the one asked for; choose another out"
                 )
-            self.trials = [Trial(**trial) for trial in found["trials"]]
+            self.trials = list(found.trials)
 
     @property
     def _file(self) -> Path:
         return self.out / "sweep.json"
 
     def results_file(self, trial: Trial) -> Path:
-        """Where a trial's results are once it is finished."""
+        """Return the path at which a trial's results are once it is finished."""
         return self.out / trial.id / "results.json"
 
     def next_trial(self) -> Trial | None:
-        """The trial to run now: one that was killed, or a new one that the engine chooses; None at the end."""
+        """Return the trial to run now: one that was killed, or a new one that the engine chooses; None at the end."""
         for trial in self.trials:
             if not trial.finished:
                 return trial
@@ -108,16 +128,12 @@ class LocalSweep:
         self.trials[self.trials.index(trial)] = replace(trial, finished=True)
         self._save()
 
-    def results(self) -> list[tuple[Trial, dict[str, Any]]]:
-        """The finished trials and what they found, in the order in which they were chosen."""
+    def results(self) -> list[tuple[Trial, Results]]:
+        """Return the finished trials and what they found, in the order in which they were chosen."""
         return [(trial, load_results(self.results_file(trial))) for trial in self.trials if trial.finished]
 
     def _save(self) -> None:
-        text = json.dumps(
-            {"config": self.config, "trials": [asdict(trial) for trial in self.trials]}, indent=1
-        )
-        with atomic_path(self._file) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(self._file, SavedSweep(self.config, tuple(self.trials)))
 
     def _as_run(self, trial: Trial) -> Any:
         engine, metrics = _engine(), trial_metrics(load_results(self.results_file(trial)))
@@ -131,7 +147,7 @@ class LocalSweep:
 
 
 def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
-    """The command line of a trial, as wandb's agent would run it."""
+    """Return the command line of a trial, as wandb's agent would run it."""
     from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
     arguments = create_sweep_command_args({"args": {k: {"value": v} for k, v in trial.parameters.items()}})
@@ -143,8 +159,59 @@ def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
     ]
 
 
-def merge_trials(trials: Sequence[tuple[Trial, Mapping[str, Any]]]) -> dict[str, Any]:
-    """One ``results.json`` of a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
+@contextmanager
+def lock_folder(out: Path) -> Iterator[int]:
+    """Wait until nothing else works in the folder, and keep others out.
+
+    Yields:
+        The lock's file descriptor; a trial inherits it, since it outlives a sweep that is killed.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with open(out / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"waiting for a trial that still runs in {out}", flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield file.fileno()
+
+
+def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
+    """Run a trial to its end, as one offline run of wandb.
+
+    Raises:
+        RuntimeError: if its command fails.
+        FileNotFoundError: if it left no results.
+    """
+    environment = os.environ | {
+        "WANDB_MODE": "offline",
+        "WANDB_RUN_ID": trial.id,
+        "WANDB_RUN_GROUP": sweep.out.name,
+    }
+    command = trial_command(sweep.config, trial)
+    code = subprocess.run(command, env=environment, pass_fds=[lock]).returncode
+    if code:
+        raise RuntimeError(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
+    sweep.finish(trial)
+
+
+def write_trials(trials: Sequence[tuple[Trial, Results]], path: str | os.PathLike) -> None:
+    """Write one line of CSV per trial: its parameters, the numbers of what it tested, and the id of its run."""
+    rows = [{**trial.parameters, **_tested(results), "run": trial.id} for trial, results in trials]
+    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _tested(results: Results) -> dict[str, float]:
+    prefix = "tested/"
+    metrics = trial_metrics(results).items()
+    return {name.removeprefix(prefix): value for name, value in metrics if name.startswith(prefix)}
+
+
+def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
+    """Merge a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
 
     Latencies come from the trials' own processes, each with its own dense for ``speedup_vs_dense``; the dense entry
     is the first trial's.
@@ -156,15 +223,13 @@ def merge_trials(trials: Sequence[tuple[Trial, Mapping[str, Any]]]) -> dict[str,
         raise ValueError("trials: expected at least one finished, got none")
     first = trials[0][1]
     names = [tested_method(results) for _, results in trials]
-    if len({REFERENCE, *names}) <= len(names):
+    if len({DENSE, *names}) <= len(names):
         names = [trial.label for trial, _ in trials]
     tested = {
-        name: results["methods"][tested_method(results)]
+        name: results.methods[tested_method(results)]
         for name, (_, results) in zip(names, trials, strict=True)
     }
-    merged = {**first, "methods": {REFERENCE: first["methods"][REFERENCE], **tested}}
-    validate_results(merged)
-    return merged
+    return replace(first, methods={DENSE: first.dense, **tested})
 
 
 def _engine() -> Any:

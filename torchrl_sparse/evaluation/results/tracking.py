@@ -1,4 +1,4 @@
-"""What a benchmark tells Weights & Biases: numbers under fixed names, and its tables, pictures and videos as media."""
+"""Benchmarks in Weights & Biases: numbers under fixed names; tables, pictures and videos as media."""
 
 from __future__ import annotations
 
@@ -7,45 +7,42 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sparse.evaluation.results.report import results_rows
+from torchrl_sparse.evaluation.results.schema import MethodEntry, Results
 
 __all__ = ["log_benchmark", "tested_method", "trial_metrics"]
 
 
-def tested_method(results: Mapping[str, Any]) -> str:
-    """The method that a sweep's trial is about: the last one."""
-    return list(results["methods"])[-1]
+def tested_method(results: Results) -> str:
+    """Return the name of the method that a sweep's trial is about: the last one."""
+    return list(results.methods)[-1]
 
 
-def trial_metrics(results: Mapping[str, Any]) -> dict[str, float]:
-    """``"<method>/<number>"`` for every method, and ``"tested/<number>"`` for the last one, whatever its name.
-
-    Args:
-        results: content of a ``results.json``.
-    """
-    named = {**results["methods"], "tested": results["methods"][tested_method(results)]}
+def trial_metrics(results: Results) -> dict[str, float]:
+    """Return ``"<method>/<number>"`` for every method, and ``"tested/<number>"`` for the last one, whatever its name."""
+    named = {**results.methods, "tested": results.methods[tested_method(results)]}
     return {
         f"{name}/{key}": value for name, method in named.items() for key, value in _numbers(method).items()
     }
 
 
-def _numbers(method: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(method: MethodEntry) -> dict[str, float]:
     return {
-        "success": method["success"]["rate"],
-        "diff_to_dense": method["paired_vs_dense"]["diff"],
-        "prune_rate": method["prune_rate"],
-        "flops_ratio": method["flops"]["ratio_to_dense"],
-        "latency_p50_s": method["latency_s"]["p50"],
-        "speedup": method["speedup_vs_dense"],
-        "action_error": method["action_error_vs_dense"]["mean"],
-        "episode_length": method["episode_length"],
+        "success": method.success.rate,
+        "diff_to_dense": method.paired_vs_dense.diff,
+        "prune_rate": method.prune_rate,
+        "flops_ratio": method.flops.ratio_to_dense,
+        "latency_p50_s": method.latency_s.p50,
+        "speedup": method.speedup_vs_dense,
+        "action_error": method.action_error_vs_dense.mean,
+        "episode_length": method.episode_length,
     }
 
 
-def log_benchmark(results: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
+def log_benchmark(results: Results, folder: Path, config: Mapping[str, Any]) -> None:
     """Log a finished benchmark as one run. Where to is wandb's to know: an agent, or ``WANDB_MODE=offline`` to keep it here.
 
     Args:
-        results: content of its ``results.json``.
+        results: of the benchmark.
         folder: where its pictures and videos are.
         config: its settings.
     """

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
-
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["action_error", "block_errors", "relative_error"]
 

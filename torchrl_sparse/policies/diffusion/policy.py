@@ -1,7 +1,7 @@
 """A diffusion policy as a TensorDict pipeline: encode the observations, plan what to skip, denoise a chunk of actions.
 
-The planner only writes ``("diffusion", "prune_mask")``; the denoiser only reads it. The dense policy is the same pipeline with
-the `Dense` planner, so that every method is compared on one code path.
+The planner only writes ``("diffusion", "prune_mask")`` and ``("diffusion", "reuse")``; the denoiser only reads them. The
+dense policy is the same pipeline with the `Dense` planner, so that every method is compared on one code path.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
-from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.mask import Reuse, query_flops
+from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
@@ -124,8 +124,7 @@ class DiffusionPolicy(TensorDictSequential):
         """Change planner and sampler together, or, if the planner cannot serve that sampler, neither."""
         plan = Dense() if plan is None else plan
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
-        denoiser = self.module["denoise"]
-        denoiser.sampler, denoiser.reuse = sampler, plan.reuse
+        self.module["denoise"].sampler = sampler
         self.module["plan"] = plan
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
@@ -170,7 +169,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved: schedules and pruners are made for one policy."""
+        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
         digest = hashlib.sha256()
         for part in (self.network, self.vision):
             if part is not None:
@@ -200,7 +199,17 @@ class DiffusionPolicy(TensorDictSequential):
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
         slot = self.module["denoise"].engine
-        return engine_block_costs(slot.get(self.network, self.sampler), self.network)
+        return engine_block_costs(slot.get(self.network, self.sampler))
+
+    def refresh(self) -> None:
+        """Read all weights anew in the next query.
+
+        Needed after writes through ``parameter.data`` alone, unless they change whole parameters. Engines see optimiser
+        steps, ``load_state_dict``, moves, and parameters or modules that were exchanged.
+        """
+        self.module["denoise"].engine.refresh()
+        # A learned planner forgets what it keeps whenever its mode is set.
+        self.plan.train(self.plan.training)
 
     # -- running it ----------------------------------------------------------------------------------------------------
 
@@ -217,7 +226,10 @@ class DiffusionPolicy(TensorDictSequential):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
-        tensordict = super().forward(tensordict)
+        try:
+            tensordict = super().forward(tensordict)
+        except MaskError as error:
+            raise ValueError(f"{type(self.plan).__name__}: {error}") from error
         seconds = synchronised_clock(device) - start
         return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
 
@@ -262,41 +274,3 @@ class DiffusionPolicy(TensorDictSequential):
         )
         policy.source = stored.source
         return policy
-
-
-class ActionDenoiser(TensorDictModuleBase):
-    """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost."""
-
-    in_keys = [keys.COND, keys.SEED, keys.PRUNE_MASK]
-    out_keys = [keys.CHUNK, keys.FLOPS]
-
-    def __init__(
-        self,
-        network: TransformerForDiffusion,
-        normalizer: Normalizer,
-        sampler: Sampler,
-        engine: EngineName,
-    ):
-        super().__init__()
-        self.network = network
-        self.normalizer = normalizer
-        self.sampler = sampler
-        self.reuse = "block"
-        self.engine = EngineSlot(engine)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        batch = tensordict.batch_size
-        cond = tensordict.get(keys.COND).flatten(0, -3) if batch else tensordict.get(keys.COND)[None]
-        mask = tensordict.get(keys.PRUNE_MASK).reshape(cond.shape[0], -1, self.network.num_blocks)
-        shape = (self.network.horizon, self.network.input_dim)
-        noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
-        actions = self.run(noise, cond, mask, self.reuse)
-        chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
-        tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
-        return tensordict.set(keys.FLOPS, query_flops(self.network, mask).reshape(*batch, 1))
-
-    def run(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
-        """Normalised actions [B, H, A], all that the network denoises."""
-        if self.network.training or cond.requires_grad:
-            return denoise(self.network, self.sampler, noise, cond, mask, reuse=reuse)
-        return self.engine.get(self.network, self.sampler).denoise(noise, cond, mask, reuse)

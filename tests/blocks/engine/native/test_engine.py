@@ -1,16 +1,13 @@
 """The native engine against the reference, in double precision: same noise, same mask, same actions."""
 
-import ctypes
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
 from torchrl_sparse.blocks.engine import denoise
-from torchrl_sparse.blocks.engine.native import engine as native, library
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
-from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, native_available
-from torchrl_sparse.blocks.engine.native.packing import pack_panels
+from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -181,45 +178,6 @@ def test_inputs_need_not_be_contiguous_and_are_left_alone():
     assert all(torch.equal(*pair) for pair in zip((noise, cond, mask), copies, strict=True))
 
 
-def an_element(parameter):
-    parameter.view(-1)[-1] += 0.5
-
-
-def in_place_of_data(parameter):
-    parameter.data.mul_(1.5)
-
-
-def exchange(parameter):
-    parameter.data = parameter.data * 1.5
-
-
-@pytest.mark.parametrize("change", [an_element, in_place_of_data, exchange])
-def test_a_change_of_any_parameter_is_noticed(change):
-    network, sampler = make_network("one of each"), Sampler("ddim", 3)
-    noise, cond, _ = make_query(network, sampler)
-    engine = NativeEngine(network, sampler)
-    for name, parameter in network.named_parameters():
-        change(parameter)
-        expected = NativeEngine(network, sampler).denoise(noise, cond)
-        assert torch.equal(engine.denoise(noise, cond), expected), name
-    assert (expected - exact(network, sampler, noise, cond)).abs().max() < 1e-5
-
-
-def test_weights_that_were_moved_to_another_device_are_not_read():
-    engine = NativeEngine(make_network("one of each"), Sampler("ddim", 3))
-    with pytest.raises(ValueError, match="it runs on the CPU, the network was moved to meta"):
-        engine._watch.locate([torch.empty(3), torch.empty(3, device="meta")])
-
-
-def test_weights_that_stay_are_not_packed_again(monkeypatch):
-    network, sampler = make_network("one of each"), Sampler("ddim", 3)
-    noise, cond, _ = make_query(network, sampler)
-    network.head.bias[0] = float("nan")  # equal to nothing, not even to itself
-    engine = NativeEngine(network, sampler)
-    monkeypatch.setattr(native, "PackedNetwork", None)
-    assert engine.denoise(noise, cond).isnan().any()
-
-
 def test_memory_of_a_query_in_inference_mode_serves_everything_after_it():
     network, sampler = make_network("one of each"), Sampler("ddim", 3)
     noise, cond, _ = make_query(network, sampler)
@@ -278,50 +236,3 @@ def test_weights_outside_the_range_of_half_precision_are_refused():
     network.decoder.layers[0].linear1.weight[0, 0] = 1e6
     with pytest.raises(ValueError, match=r"range of torch\.float16"):
         NativeEngine(network, Sampler("ddim", 5), weights="float16")
-
-
-def test_panels_hold_the_matrix():
-    weight = torch.randn(40, 300)
-    parts = [part.view(2, -1, 32) for part in pack_panels(weight).split([2 * 256 * 32, 2 * 44 * 32])]
-    panels = torch.cat(parts, dim=1)
-    assert torch.equal(panels.transpose(1, 2).reshape(64, 300)[:40], weight)
-    assert not panels[1, :, 8:].any()
-
-
-def test_panels_of_bfloat16_hold_pairs_of_inputs():
-    weight = torch.randn(32, 7).bfloat16()
-    pairs = (
-        pack_panels(weight.float(), torch.bfloat16)
-        .view(4, 32)
-        .contiguous()
-        .view(torch.bfloat16)
-        .view(4, 32, 2)
-    )
-    assert torch.equal(pairs.transpose(1, 2).reshape(8, 32)[:7], weight.T)
-    assert not pairs[3, :, 1].any()
-
-
-def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monkeypatch):
-    assert "was not built" in library._load(tmp_path)
-    suffix = library.importlib.machinery.EXTENSION_SUFFIXES[0]
-    (tmp_path / f"_native{suffix}").write_bytes(b"no library")
-    assert "cannot be loaded" in library._load(tmp_path)
-
-    monkeypatch.setattr(library, "_load", lambda _: "it was not built")
-    library.library.cache_clear()
-    try:
-        with pytest.warns(UserWarning, match="without its native engine: it was not built"):
-            assert native_available() == (False, "it was not built")
-        assert native_supports(make_network()) == (False, "it was not built")
-    finally:
-        library.library.cache_clear()
-
-
-def test_the_library_depends_on_nothing_but_the_c_runtime():
-    """No PyTorch, no Python: any version of them can load it."""
-    found = library.library()
-    assert isinstance(found, ctypes.CDLL)
-    with open(found._name, "rb") as file:
-        content = file.read()
-    assert not any(name in content for name in (b"libtorch", b"libc10", b"libpython"))
-    assert set(SETS) <= set(INSTRUCTION_SETS)

@@ -8,7 +8,7 @@ import torch
 
 from torchrl_sparse.blocks.engine.native import library
 from torchrl_sparse.blocks.engine.native.library import native_available
-from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativeGates
+from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 
 AVAILABLE, REASON = native_available()
@@ -57,11 +57,12 @@ def test_the_logits_are_those_of_the_network(instruction_set, sizes):
     network = make_network(**sizes)
     cond = observations(cond_shape=network.cond_shape)
     expected = exact(network, cond)
-    gates = NativeGates(network, instruction_set)
-    assert_close(gates.logits(cond.flatten(1)), expected)
-    positive = gates.logits(cond.flatten(1)) > 0
+    with torch.no_grad():
+        compiled = NativePruner(network.mlp_weights(), instruction_set)
+    assert_close(compiled.logits(cond.flatten(1)), expected)
+    positive = compiled.logits(cond.flatten(1)) > 0
     positive[:, 0] = False
-    assert torch.equal(gates.masks(cond.flatten(1)), positive)
+    assert torch.equal(compiled.masks(cond.flatten(1)), positive)
 
 
 @pytest.mark.parametrize("rows", [1, 16])

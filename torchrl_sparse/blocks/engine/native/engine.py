@@ -8,16 +8,16 @@ the PyTorch engine's, its program is the mask.
 from __future__ import annotations
 
 import ctypes
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from ctypes import byref, c_float, c_void_p
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from torchrl_sparse.blocks.engine.base import check_query
+from torchrl_sparse.blocks.engine.costs import folded_block_macs
 from torchrl_sparse.blocks.engine.native.library import (
     INSTRUCTION_SETS,
     instruction_level,
@@ -25,13 +25,11 @@ from torchrl_sparse.blocks.engine.native.library import (
     native_available,
 )
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork
-from torchrl_sparse.blocks.engine.reference import check_query
+from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import WeightWatch
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
-
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["NativeEngine", "native_supports"]
 
@@ -40,7 +38,7 @@ _MAX_OBS_STEPS = 63
 
 
 def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
-    """Whether the native engine can run ``network`` on this machine, and if not, why.
+    """Return whether the native engine can run ``network`` on this machine, and if not, why.
 
     It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0,
     as all published models have), a noise vector as large as an action, and at most 63 observation steps.
@@ -146,7 +144,7 @@ class NativeEngine:
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
     ) -> Tensor:
-        """Normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
+        """Return normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
         Raises:
             ValueError: also if the inputs are no float32 tensors on the CPU, or if the network is in training mode.
@@ -168,24 +166,23 @@ class NativeEngine:
         _run_in_threads(work, min(self.threads or torch.get_num_threads(), len(cond)))
         return actions
 
-    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
-        """Seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``.
+    def refresh(self) -> None:
+        """Pack the weights anew in the next query."""
+        self._watch.refresh()
 
-        The best of ``repeats`` walks over all layers, so that weights come from where they do in a query.
-        """
+    def block_seconds(self, repeats: int = 20) -> dict[str, float]:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
         packed = self._current()
         scratch = self._new_scratch(packed).zero_()
-        return {
-            name: self._time_block(packed, kind, repeats, scratch) for kind, name in enumerate(BLOCK_TYPES)
-        }
 
-    def _time_block(self, packed: PackedNetwork, kind: int, repeats: int, scratch: Tensor) -> float:
-        best = float("inf")
-        for _ in range(repeats):
-            start = time.perf_counter()
+        def walk(kind: int) -> None:
             library().sparse_blocks(self._level, byref(packed.model), kind, scratch.data_ptr())
-            best = min(best, time.perf_counter() - start)
-        return best / self.network.n_layer
+
+        return time_blocks(walk, self.network.n_layer, repeats, scratch.device)
+
+    def block_macs(self) -> tuple[int, int, int]:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
+        return folded_block_macs(self.network)
 
     def _run(self, packed, slots: int, row: int, mask, noise, cond, actions, scratch) -> None:
         mask, noise, cond, actions = (
@@ -198,7 +195,7 @@ class NativeEngine:
 
     @contextmanager
     def _scratch(self, packed: PackedNetwork) -> Iterator[Tensor]:
-        """Memory for one call at a time, from a stock that grows to as many as there are calls at a time."""
+        """Lend memory for one call at a time, from a stock that grows to as many as there are calls at a time."""
         try:
             scratch = self._stock.pop()
         except IndexError:
@@ -207,11 +204,11 @@ class NativeEngine:
         self._stock.append(scratch)
 
     def _new_scratch(self, packed: PackedNetwork) -> Tensor:
-        """On a cache line, as all of PyTorch's memory; with a slot for each block, which is enough for every reuse rule."""
+        """Allocate on a cache line, as PyTorch always does, with a slot for each block: enough for every reuse rule."""
         return torch.empty(library().sparse_scratch(byref(packed.model), self.network.num_blocks))
 
     def _current(self) -> PackedNetwork:
-        """The packed weights, packed anew if the network has changed."""
+        """Return the packed weights, packed anew if the network has changed."""
         version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
         if known != version:

@@ -16,7 +16,7 @@ from pathlib import Path
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
 
 INSTRUCTION_SETS = ("portable", "avx2", "avx512", "avx512_bf16")
-# Of each function what it returns and takes; c_void_p is any address, of a structure of packing.py or of numbers.
+# Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
@@ -29,7 +29,7 @@ _SIGNATURES = {
 
 @lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | str:
-    """The compiled library, or why there is none; then it also warns, once in a process."""
+    """Return the compiled library, or why there is none; then it also warns, once in a process."""
     found = _load(Path(__file__).parent)
     if isinstance(found, str):
         warnings.warn(f"torchrl_sparse runs without its native engine: {found}", stacklevel=2)
@@ -55,7 +55,7 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def native_available() -> tuple[bool, str]:
-    """Whether the library was built, and the instruction sets that it can use here or what is missing.
+    """Return whether the library was built, and the instruction sets that it can use here or what is missing.
 
     Examples:
         >>> available, reason = native_available()
@@ -69,7 +69,7 @@ def native_available() -> tuple[bool, str]:
 
 
 def instruction_level(instruction_set: str | None = None) -> int:
-    """The number by which the library knows an instruction set; of the widest that this CPU has by default.
+    """Return the number by which the library knows an instruction set; by default the widest that this CPU has.
 
     Raises:
         ValueError: if this CPU does not have it.

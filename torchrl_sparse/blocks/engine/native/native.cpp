@@ -1,7 +1,8 @@
 // The denoising loop of one query of a Diffusion Policy transformer, for one CPU thread: plain C++17, no dependency.
 //
-// Python (native.py) folds and packs the weights once, and calls `sparse_denoise` through ctypes once for every action chunk.
-// What is computed here, and why it is exact, is in packing.py; this file is about doing it at the speed of the machine.
+// Python (engine.py) folds and packs the weights once, and calls `sparse_denoise` through ctypes once for every action chunk.
+// What is computed here, and why it is exact, is in folding.py and packing.py; this file is about doing it at the speed of
+// the machine.
 //
 // * With 5 to 16 rows of activations, a matrix product is limited by the multiply-adds only if each weight is loaded once.
 //   Weights are therefore packed in panels of 32 columns, which a tile of all rows x 32 columns reads front to back while
@@ -51,8 +52,8 @@ struct Model {
     const float* valid;         // [padded width]: 1 for each column, 0 for the padding
 };
 
-// The MLP of a pruner, see native_gates.py. A cell is a block of a denoising step.
-struct Gates {
+// The MLP of a pruner, see pruner.py. A cell is a block of a denoising step.
+struct Pruner {
     Matrix obs, middle;  // observation -> what it adds to every cell; cell -> its second hidden layer
     const float* cells;  // [count][padded width]: what a cell is without an observation
     const float* last;   // [padded width]
@@ -182,10 +183,10 @@ void sparse_gather(int32_t n, const float* const* places, float* values) {
 }
 
 // observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.
-void sparse_prune(int32_t level, const Gates* gates, int32_t n, const float* observations, float* logits, uint8_t* masks) {
+void sparse_prune(int32_t level, const Pruner* pruner, int32_t n, const float* observations, float* logits, uint8_t* masks) {
     for (ptrdiff_t i = 0; i < n; i++)
-        LEVELS[level].prune(*gates, observations + i * gates->obs.rows, logits ? logits + i * gates->count : nullptr,
-                            masks ? masks + i * gates->count : nullptr);
+        LEVELS[level].prune(*pruner, observations + i * pruner->obs.rows, logits ? logits + i * pruner->count : nullptr,
+                            masks ? masks + i * pruner->count : nullptr);
 }
 }
 
@@ -592,28 +593,28 @@ void run_blocks(const Model& m, int kind, float* scratch) {
 }
 
 // One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
-void prune(const Gates& g, const float* observation, float* logits, uint8_t* mask) {
+void prune(const Pruner& p, const float* observation, float* logits, uint8_t* mask) {
     // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
     constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
     constexpr int ld = stride(MAX_HIDDEN);
     alignas(64) float added[ld], x[GROUP * ld], y[GROUP * ld];
-    const int width = g.middle.columns;
-    multiply<float>(observation, 0, 1, g.obs, added, 0);
-    for (int first = 0; first < g.count; first += GROUP) {
-        const int n = g.count - first < GROUP ? g.count - first : GROUP;
+    const int width = p.middle.columns;
+    multiply<float>(observation, 0, 1, p.obs, added, 0);
+    for (int first = 0; first < p.count; first += GROUP) {
+        const int n = p.count - first < GROUP ? p.count - first : GROUP;
         for (int c = 0; c < n; c++)
             for (int j = 0; j < width; j += VECTOR) {
-                const float* const cell = g.cells + (size_t)(first + c) * width + j;
+                const float* const cell = p.cells + (size_t)(first + c) * width + j;
                 __builtin_prefetch(cell + 2 * GROUP * width);  // a policy's weights have driven the cells out of the cache
                 store(x + c * ld + j, relu(load(cell) + load(added + j)));
             }
-        multiply<float>(x, ld, n, g.middle, y, ld);
+        multiply<float>(x, ld, n, p.middle, y, ld);
         for (int c = 0; c < n; c++) {
             V total{};
-            for (int j = 0; j < width; j += VECTOR) total += relu(load(y + c * ld + j)) * load(g.last + j);
-            const float logit = g.bias + sum(total);
+            for (int j = 0; j < width; j += VECTOR) total += relu(load(y + c * ld + j)) * load(p.last + j);
+            const float logit = p.bias + sum(total);
             if (logits) logits[first + c] = logit;
-            if (mask) mask[first + c] = logit > 0.f && first + c >= g.first;
+            if (mask) mask[first + c] = logit > 0.f && first + c >= p.first;
         }
     }
 }

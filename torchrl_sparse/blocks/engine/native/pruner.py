@@ -1,4 +1,5 @@
-"""A pruner's MLP in the compiled code of ``native.cpp``: a product with all cells of a mask, and nothing kept between.
+"""The MLP of a learned planner in the compiled code of ``native.cpp``: a product with all cells of a mask, and nothing
+kept between.
 
 PyTorch takes four passes over an activation of [K * 3L, hidden]; here a dozen cells at a time stay in the L1 cache.
 """
@@ -7,25 +8,22 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import byref, c_float, c_int32, c_void_p
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
 from torchrl_sparse.blocks.engine.native.library import instruction_level, library
-from torchrl_sparse.blocks.engine.native.packing import PANEL, Arena, Matrix
 
-if TYPE_CHECKING:
-    from torchrl_sparse.blocks.sag.network import PrunerNetwork
-
-__all__ = ["MAX_HIDDEN", "NativeGates"]
+__all__ = ["MAX_HIDDEN", "NativePruner", "PrunerWeights"]
 
 MAX_HIDDEN = 256  # of native.cpp, which keeps a dozen cells on the stack
 
 
-class _Gates(ctypes.Structure):
-    """``struct Gates`` of native.cpp."""
+class _Pruner(ctypes.Structure):
+    """``struct Pruner`` of native.cpp."""
 
     _fields_ = [
         *((name, Matrix) for name in ("obs", "middle")),
@@ -36,15 +34,34 @@ class _Gates(ctypes.Structure):
     ]
 
 
-class NativeGates:
-    """Computes :meth:`PrunerNetwork.prune_logits` with the weights that the network has now. Not differentiable.
+@dataclass(frozen=True)
+class PrunerWeights:
+    """An MLP over all blocks of all denoising steps, ``last(relu(middle(relu(fuse(obs(features)) + cells))))``.
+
+    Each layer is a pair of a weight [outputs, inputs] and a bias [outputs], f32 on the CPU.
+
+    Attributes:
+        obs, fuse: of the observation's F features, one after the other.
+        cells: [K, 3L, hidden], what a block of a step adds to the first hidden layer.
+        middle: of the second hidden layer.
+        last: of the two logits, keep and prune.
+    """
+
+    obs: tuple[Tensor, Tensor]
+    fuse: tuple[Tensor, Tensor]
+    cells: Tensor
+    middle: tuple[Tensor, Tensor]
+    last: tuple[Tensor, Tensor]
+
+
+class NativePruner:
+    """Computes by how much pruning is preferred to keeping, for every block. Not differentiable.
 
     The two linear layers before the sum over cells are one here, and of the last layer's two logits the difference. A
     row of a batch is computed exactly as it would be alone. Calls from several threads may overlap.
 
     Args:
-        network: with float32 weights on the CPU and at most `MAX_HIDDEN` hidden activations; the compiled library has
-            to be there.
+        weights: with at most `MAX_HIDDEN` hidden activations; they are copied. The compiled library has to be there.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
 
     Raises:
@@ -52,54 +69,52 @@ class NativeGates:
 
     Examples:
         >>> from torchrl_sparse.blocks.engine import native_available
-        >>> from torchrl_sparse.blocks.sag.network import PrunerNetwork
-        >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5)).eval()
+        >>> square, pair = (torch.eye(8), torch.zeros(8)), (torch.ones(2, 8), torch.zeros(2))
+        >>> weights = PrunerWeights(square, square, torch.zeros(4, 6, 8), square, pair)
         >>> if native_available()[0]:
-        ...     assert NativeGates(network).logits(torch.zeros(7, 10)).shape == (7, 4, 6)
+        ...     assert NativePruner(weights).logits(torch.zeros(7, 8)).shape == (7, 4, 6)
     """
 
-    def __init__(self, network: PrunerNetwork, instruction_set: str | None = None) -> None:
+    def __init__(self, weights: PrunerWeights, instruction_set: str | None = None) -> None:
         self._level = instruction_level(instruction_set)
         self._arena = Arena()
         with torch.no_grad():
-            self._gates = self._pack(network)
-        self._features = network.obs.in_features
-        self._shape = len(network.timesteps), network.num_blocks
+            self._pruner = self._pack(weights)
+        self._features = weights.obs[0].shape[1]
+        self._shape = weights.cells.shape[:2]
 
-    def _pack(self, network: PrunerNetwork) -> _Gates:
-        first, second = network.obs, network.fuse_obs
-        weight = second.weight.double() @ first.weight.double()
-        bias = second.weight.double() @ first.bias.double() + second.bias
-        _, middle, _, last = network.mlp
-        cells = network.cells()
-        return _Gates(
-            obs=self._arena.matrix(weight, bias),
-            middle=self._arena.matrix(middle.weight, middle.bias),
-            cells=self._padded(cells),
-            last=self._padded(last.weight[1] - last.weight[0]),
-            bias=(last.bias[1] - last.bias[0]).item(),
-            count=len(cells),
-            first=network.num_blocks,
+    def _pack(self, weights: PrunerWeights) -> _Pruner:
+        (obs, obs_bias), (fuse, fuse_bias), (last, last_bias) = weights.obs, weights.fuse, weights.last
+        obs = fuse.double() @ obs.double()
+        bias = fuse.double() @ obs_bias.double() + fuse_bias
+        return _Pruner(
+            obs=self._arena.matrix(obs, bias),
+            middle=self._arena.matrix(*weights.middle),
+            cells=self._padded(weights.cells),
+            last=self._padded(last[1] - last[0]),
+            bias=(last_bias[1] - last_bias[0]).item(),
+            count=weights.cells.shape[:2].numel(),
+            first=weights.cells.shape[1],
         )
 
     def _padded(self, tensor: Tensor) -> int:
         return self._arena.floats(functional.pad(tensor, (0, -tensor.shape[-1] % PANEL)))
 
     def logits(self, features: Tensor) -> Tensor:
-        """By how much pruning is preferred, f32 [B, K, 3L].
+        """Return by how much pruning is preferred, f32 [B, K, 3L].
 
         Args:
-            features: flat observations, and rates if the network reads them, f32 [B, F] on the CPU.
+            features: flat observations, and rates if they are an input, f32 [B, F] on the CPU.
 
         Raises:
-            ValueError: if they do not have the network's number of features.
+            ValueError: if there is another number of features than F.
         """
         logits = torch.empty(len(features), *self._shape)
         self._run(features, logits.data_ptr(), None)
         return logits
 
     def masks(self, features: Tensor) -> Tensor:
-        """Where pruning is preferred, bool [B, K, 3L], False in the first step; see :meth:`logits`."""
+        """Return where pruning is preferred, bool [B, K, 3L], False in the first step; see :meth:`logits`."""
         masks = torch.empty(len(features), *self._shape, dtype=torch.bool)
         self._run(features, None, masks.data_ptr())
         return masks
@@ -108,5 +123,5 @@ class NativeGates:
         if features.shape[1] != self._features:
             raise ValueError(f"features: expected [B, {self._features}], got {list(features.shape)}")
         features = features.contiguous()
-        gates = byref(self._gates)
-        library().sparse_prune(self._level, gates, len(features), features.data_ptr(), logits, masks)
+        pruner = byref(self._pruner)
+        library().sparse_prune(self._level, pruner, len(features), features.data_ptr(), logits, masks)

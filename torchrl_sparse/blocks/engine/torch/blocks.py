@@ -1,7 +1,7 @@
 """The three blocks as the PyTorch engine runs them: few large operations on prepared weights, no gradients.
 
 Tokens of a batch are rows, [B * H, d]. A block reads the centred residual stream ``x`` and returns what it adds to it
-(:mod:`torchrl_sparse.blocks.engine.folding` has the algebra). It works in the memory of a :class:`Workbench` and
+(:mod:`torchrl_sparse.blocks.engine.torch.norms` says why). It works in the memory of a :class:`BlockScratch` and
 allocates nothing, except that on a CPU each product with large f32 weights returns memory of its own
 (:mod:`torchrl_sparse.blocks.engine.torch.linear` says why).
 """
@@ -13,14 +13,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.folding import after_length, centred
+from torchrl_sparse.blocks.engine.folding import FoldedLayer
 from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Block", "CrossAttention", "FeedForward", "SelfAttention", "Workbench"]
+__all__ = ["Block", "BlockScratch", "CrossAttention", "FeedForward", "SelfAttention"]
 
 
-class Workbench:
+class BlockScratch:
     """Memory for the intermediate results of one block, shared by all of them.
 
     Args:
@@ -60,7 +60,7 @@ class Workbench:
         self.output = like.new_empty(rows, width)
 
     def normalise(self, x: Tensor) -> Tensor:
-        """What is left of a layer norm: ``x`` [N * H, d] through its length."""
+        """Divide ``x`` [N * H, d] by its length, which is what is left of a layer norm."""
         torch.linalg.vector_norm(x, 2, -1, True, out=self._length)
         self._length.hypot_(self._smallest)
         return torch.div(x, self._length, out=self._direction)
@@ -74,32 +74,29 @@ class SelfAttention:
 
     Args:
         network: the denoiser.
-        index: of the layer.
+        layer: one of its layers, without norms.
     """
 
-    def __init__(self, network: TransformerForDiffusion, index: int) -> None:
-        layer, horizon = network.decoder.layers[index], network.horizon
-        attention = layer.self_attn
-        weight, bias = after_length(layer.norm1, attention.in_proj_weight, attention.in_proj_bias)
-        scale = weight.new_ones(3, 1)
-        scale[0] = (network.n_emb // network.n_head) ** -0.5
-        scale = scale.expand(3, network.n_emb).flatten()
-        self._project = make_linear(weight * scale[:, None], bias * scale)
-        self._output = make_linear(centred(attention.out_proj.weight.T).T, centred(attention.out_proj.bias))
+    def __init__(self, network: TransformerForDiffusion, layer: FoldedLayer) -> None:
+        like, horizon = network.pos_emb.detach(), network.horizon
+        self._project = make_linear(
+            layer.qkv.weight.flatten(0, 2).to(like), layer.qkv.bias.flatten().to(like)
+        )
+        self._output = make_linear(layer.out.weight.flatten(1).to(like), layer.out.bias.to(like))
         hidden = (
             torch.full((horizon, horizon), -torch.inf).tril(-1) if network.causal_attn else torch.zeros(1)
         )
-        self._hidden = hidden.to(weight)  # [key, query]: a later key
+        self._hidden = hidden.to(like)  # [key, query]: a later key
 
-    def __call__(self, x: Tensor, out: Tensor, bench: Workbench) -> Tensor:
-        """What the block adds to ``x`` [N * H, d], perhaps in ``out``."""
-        qkv = self._project(bench.normalise(x), bench.qkv)
-        bench.heads.copy_(qkv.view(bench.qkv_by_token).permute(2, 0, 3, 1, 4))
-        torch.baddbmm(self._hidden, bench.key, bench.query, out=bench.scores)
-        torch.softmax(bench.scores, 1, out=bench.weights)
-        torch.bmm(bench.weights_by_query, bench.value, out=bench.mixed)
-        bench.joined_by_head.copy_(bench.mixed_by_token)
-        return self._output(bench.joined, out)
+    def __call__(self, x: Tensor, out: Tensor, scratch: BlockScratch) -> Tensor:
+        """Return what the block adds to ``x`` [N * H, d], perhaps in ``out``."""
+        qkv = self._project(scratch.normalise(x), scratch.qkv)
+        scratch.heads.copy_(qkv.view(scratch.qkv_by_token).permute(2, 0, 3, 1, 4))
+        torch.baddbmm(self._hidden, scratch.key, scratch.query, out=scratch.scores)
+        torch.softmax(scratch.scores, 1, out=scratch.weights)
+        torch.bmm(scratch.weights_by_query, scratch.value, out=scratch.mixed)
+        scratch.joined_by_head.copy_(scratch.mixed_by_token)
+        return self._output(scratch.joined, out)
 
 
 class CrossAttention:
@@ -107,29 +104,29 @@ class CrossAttention:
 
     Args:
         network: the denoiser.
-        index: of the layer.
+        layer: one of its layers, without norms.
     """
 
-    def __init__(self, network: TransformerForDiffusion, index: int) -> None:
-        self._bias = centred(network.decoder.layers[index].multihead_attn.out_proj.bias)
+    def __init__(self, network: TransformerForDiffusion, layer: FoldedLayer) -> None:
+        self._bias = layer.cross_out.bias.to(network.pos_emb)
 
     def __call__(
-        self, x: Tensor, out: Tensor, bench: Workbench, keys: Tensor, values: Tensor, bias: Tensor
+        self, x: Tensor, out: Tensor, scratch: BlockScratch, keys: Tensor, values: Tensor, bias: Tensor
     ) -> Tensor:
-        """What the block adds to ``x`` [N * H, d], in ``out``.
+        """Return what the block adds to ``x`` [N * H, d], in ``out``.
 
         Args:
             x: residual stream.
             out: [N * H, d].
-            bench: for N rows.
+            scratch: for N rows.
             keys: [N, (1 + To) * n_head, d].
             values: the same shape.
             bias: [N, H, (1 + To) * n_head], with -inf where a token is hidden.
         """
-        bench.normalise(x)
-        torch.baddbmm(bias, bench.direction_by_row, keys.mT, out=bench.cross_scores)
-        torch.softmax(bench.cross_scores_by_head, 2, out=bench.cross_weights_by_head)
-        torch.baddbmm(self._bias, bench.cross_weights, values, out=out.view(bench.direction_by_row.shape))
+        scratch.normalise(x)
+        torch.baddbmm(bias, scratch.direction_by_row, keys.mT, out=scratch.cross_scores)
+        torch.softmax(scratch.cross_scores_by_head, 2, out=scratch.cross_weights_by_head)
+        torch.baddbmm(self._bias, scratch.cross_weights, values, out=out.view(scratch.direction_by_row.shape))
         return out
 
 
@@ -138,16 +135,14 @@ class FeedForward:
 
     Args:
         network: the denoiser.
-        index: of the layer.
+        layer: one of its layers, without norms.
     """
 
-    def __init__(self, network: TransformerForDiffusion, index: int) -> None:
-        layer = network.decoder.layers[index]
-        self._inner = make_linear(
-            *after_length(layer.norm3, layer.linear1.weight, layer.linear1.bias), gelu=True
-        )
-        self._outer = make_linear(centred(layer.linear2.weight.T).T, centred(layer.linear2.bias))
+    def __init__(self, network: TransformerForDiffusion, layer: FoldedLayer) -> None:
+        like = network.pos_emb.detach()
+        self._inner = make_linear(layer.up.weight.to(like), layer.up.bias.to(like), gelu=True)
+        self._outer = make_linear(layer.down.weight.to(like), layer.down.bias.to(like))
 
-    def __call__(self, x: Tensor, out: Tensor, bench: Workbench) -> Tensor:
-        """What the block adds to ``x`` [N * H, d], perhaps in ``out``."""
-        return self._outer(self._inner(bench.normalise(x), bench.hidden), out)
+    def __call__(self, x: Tensor, out: Tensor, scratch: BlockScratch) -> Tensor:
+        """Return what the block adds to ``x`` [N * H, d], perhaps in ``out``."""
+        return self._outer(self._inner(scratch.normalise(x), scratch.hidden), out)

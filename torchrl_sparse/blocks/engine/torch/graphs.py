@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-__all__ = ["GraphCapture"]
+__all__ = ["GraphCapture", "padded_batch"]
 
 _WARM_UP = 3
 # A thread that begins to capture waits for the device, which would end the capture of another.
@@ -18,8 +18,9 @@ class GraphCapture:
     """Captures functions without arguments as CUDA graphs. Written for a GPU, never run on one.
 
     They may launch what they like but read and write only memory that outlives the graph, and may not wait for the device.
-    All graphs take their scratch memory from one pool: none leaves anything there for another, so they may be played in
-    any order, one at a time.
+    All graphs of one `GraphCapture` take their scratch memory from one pool: none leaves anything there for another, so
+    they may be played in any order, one at a time. Graphs that may be played at the same time, and those after a capture
+    that failed, need a `GraphCapture` of their own.
 
     Args:
         device: a CUDA device.
@@ -31,7 +32,7 @@ class GraphCapture:
         self._pool = torch.cuda.graph_pool_handle()
 
     def __call__(self, segment: Callable[[], object]) -> Callable[[], object]:
-        """``segment`` as a graph, to be called like it; the segment runs a few times."""
+        """Return ``segment`` as a graph, to be called like it; the segment runs a few times."""
         with _CAPTURES:
             present = torch.cuda.current_stream(self._device)
             self._stream.wait_stream(present)
@@ -44,3 +45,12 @@ class GraphCapture:
             with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 segment()
         return graph.replay
+
+
+def padded_batch(rows: int) -> int:
+    """Round a number of rows up to a power of two: the rows that are due vary, and each size is captured anew.
+
+    >>> [padded_batch(rows) for rows in (1, 2, 3, 5, 8, 9)]
+    [1, 2, 4, 8, 8, 16]
+    """
+    return 1 << (rows - 1).bit_length()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.program import COLLAPSE, COMPUTE
-from torchrl_sparse.blocks.engine.torch.blocks import Workbench
+from torchrl_sparse.blocks.engine.torch.blocks import BlockScratch
 from torchrl_sparse.blocks.engine.torch.memory import Memory
 from torchrl_sparse.blocks.engine.torch.program import Loop, Operation, build_loop
 from torchrl_sparse.blocks.engine.torch.tables import Tables
@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES
 
 __all__ = ["Segment", "Workspace"]
 
-_CA = BLOCK_TYPES.index("CA")
+_KINDS, _CA = len(BLOCK_TYPES), BLOCK_TYPES.index("CA")
 
 Segment = Callable[[], object]
 
@@ -49,7 +49,7 @@ class Workspace:
         network, new = tables.network, tables.stem_weight.new_zeros
         rows, width = batch * network.horizon, network.n_emb
         self._tables, self._batch = tables, batch
-        self._memory, self._bench = Memory(tables, batch), Workbench(network, batch)
+        self._memory, self._scratch = Memory(tables, batch), BlockScratch(network, batch)
         self._parts: dict[int, _Part] = {}
         self._sample, self._clean, self._eps = new(3, rows, network.input_dim).unbind(0)
         self._step_table = new(tables.num_steps, tables.coefficients.shape[1] + self._sample.numel())
@@ -63,8 +63,8 @@ class Workspace:
         self._keeps = slots > 0
         self._latest = new(slots, rows, width)
         blocks = range(network.num_blocks)
-        self._slots = [self._latest[b % slots] if slots else self._bench.output for b in blocks]
-        self._reads = [self._memory.by_layer[b // 3] if b % 3 == _CA else () for b in blocks]
+        self._slots = [self._latest[b % slots] if slots else self._scratch.output for b in blocks]
+        self._reads = [self._memory.by_layer[b // _KINDS] if b % _KINDS == _CA else () for b in blocks]
         self._ones = new(network.num_blocks) + 1
         self._runs: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
         self._set_segments(capture)
@@ -90,7 +90,7 @@ class Workspace:
             self._fold = capture(self._fold)
 
     def denoise(self, loop: Loop, noise: Tensor, cond: Tensor) -> Tensor:
-        """Actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
+        """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
         self._sample.copy_(noise[:, 0].flatten(0, 1))
         # What step k adds is the gaussian of the transition to step k + 1; the last step adds none.
         gaussians = noise[:, 1:].transpose(0, 1)
@@ -101,8 +101,8 @@ class Workspace:
         return self._sample.view(noise[:, 0].shape).clone()
 
     def walk(self, kind: int) -> None:
-        """To be timed: the blocks of type ``kind`` (0 SA, 1 CA, 2 FFN) of all layers."""
-        for segment in self._compute[kind :: len(BLOCK_TYPES)]:
+        """Run, to be timed, the blocks of type ``kind`` (an index of ``BLOCK_TYPES``) of all layers."""
+        for segment in self._compute[kind::_KINDS]:
             segment()
 
     def _run(self, loop: Loop) -> None:
@@ -142,21 +142,21 @@ class Workspace:
 
     def _compute_all(self, block: int) -> None:
         slot = self._slots[block]
-        added = self._tables.blocks[block](self._x, slot, self._bench, *self._reads[block])
+        added = self._tables.blocks[block](self._x, slot, self._scratch, *self._reads[block])
         self._x.add_(added)
         if self._keeps and added is not slot:
             slot.copy_(added)
 
     def _compute_chosen(self, block: int) -> None:
-        """For the rows that ``_chosen`` names."""
-        bench, slot = self._bench, self._slots[block]
-        added = self._tables.blocks[block](self._x, bench.output, bench, *self._reads[block])
+        """Compute ``block`` for the rows that ``_chosen`` names."""
+        scratch, slot = self._scratch, self._slots[block]
+        added = self._tables.blocks[block](self._x, scratch.output, scratch, *self._reads[block])
         latest = slot.view(self._batch, -1)
         torch.where(self._chosen, added.view(latest.shape), latest, out=latest)
         self._x.add_(slot)
 
     def _compute_gathered(self, block: int, rows: list[int]) -> None:
-        """For ``rows`` alone."""
+        """Compute ``block`` for ``rows`` alone."""
         part = self._parts.get(len(rows))
         if part is None:
             part = self._parts[len(rows)] = _Part(self._tables, self._memory, len(rows))
@@ -165,7 +165,9 @@ class Workspace:
         for source, target in zip(sources, part.inputs, strict=False):
             for row, place in zip(rows, target, strict=True):
                 place.copy_(source[row])
-        added = self._tables.blocks[block](part.x, part.bench.output, part.bench, *part.memory[: len(reads)])
+        added = self._tables.blocks[block](
+            part.x, part.scratch.output, part.scratch, *part.memory[: len(reads)]
+        )
         latest = slot.view(self._batch, -1)
         for row, values in zip(rows, added.view(len(rows), -1), strict=True):
             latest[row].copy_(values)
@@ -187,7 +189,9 @@ class Workspace:
         """Predict the noise and take the sampler's step (``StepCoefficients.update`` says what it computes)."""
         tables, sample, clean = self._tables, self._sample, self._clean
         noise_scale, signal_scale, clean_weight, sample_weight, eps_weight = self._coefficients
-        eps = torch.addmm(tables.head_bias, self._bench.normalise(self._x), tables.head_weight, out=self._eps)
+        eps = torch.addmm(
+            tables.head_bias, self._scratch.normalise(self._x), tables.head_weight, out=self._eps
+        )
         torch.addcmul(sample, eps, noise_scale, out=clean)
         clean.div_(signal_scale).clamp_(-tables.clip, tables.clip)
         torch.addcmul(self._gaussian, sample, sample_weight, out=sample)
@@ -201,7 +205,7 @@ class _Part:
 
     def __init__(self, tables: Tables, memory: Memory, size: int) -> None:
         network = tables.network
-        self.bench = Workbench(network, size)
+        self.scratch = BlockScratch(network, size)
         self.x = tables.stem_weight.new_empty(size * network.horizon, network.n_emb)
         self.memory = [source.new_empty(size, *source.shape[1:]) for source in memory.by_layer[0]]
         # By row: the residual stream, and what cross-attention reads.

@@ -1,4 +1,4 @@
-"""What cross-attention reads in the PyTorch engine: folded memory tokens, in the same place in every denoising step."""
+"""Folded memory tokens, which cross-attention reads in the same place in every denoising step."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ class Memory:
             tokens = batch * (1 + observations)
             self._tokens = new(tables.num_steps, tokens, width)
             self._present = new(tokens, width)
-            self._room = tables.fold.room(tokens)
+            self._scratch = tables.fold.scratch(tokens)
         else:
-            self._room = tables.fold.room(batch * observations)
+            self._scratch = tables.fold.scratch(batch * observations)
 
     def begin(self, cond: Tensor) -> None:
         """Take the observations [B, To, D] of a query."""
         encoder = self._tables.encoder
         if encoder.separable:
             tokens = encoder.observation_tokens(cond).flatten(0, 1)
-            self._put(slice(1, None), self._tables.fold(tokens, self._room))
+            self._put(slice(1, None), self._tables.fold(tokens, self._scratch))
         else:
             self._tokens.copy_(encoder.memory(cond).flatten(1, 2))
 
@@ -67,7 +67,7 @@ class Memory:
 
     def fold(self) -> None:
         """Fold the tokens of the step at hand, which :meth:`load` put in their place."""
-        self._put(slice(None), self._tables.fold(self._present, self._room))
+        self._put(slice(None), self._tables.fold(self._present, self._scratch))
 
     def _put(self, tokens: slice, folded: FoldedMemory) -> None:
         self._vectors[:, :, :, tokens] = folded.vectors.unflatten(2, (self._batch, -1))

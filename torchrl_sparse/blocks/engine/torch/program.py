@@ -17,7 +17,6 @@ __all__ = ["Loop", "Operation", "build_loop"]
 
 _CA = BLOCK_TYPES.index("CA")
 
-
 Operation = tuple[int, int, int, list[int] | Tensor | None]
 
 
@@ -39,7 +38,7 @@ class Loop:
 
 
 def build_loop(masks: np.ndarray, device: torch.device, gather: bool) -> Loop:
-    """The loop of the masks bool [B, K, 3L] of a batch, kept for the next batch with the same masks.
+    """Make the loop of the masks bool [B, K, 3L] of a batch, kept for the next batch with the same masks.
 
     Args:
         masks: True = pruned.
@@ -74,7 +73,7 @@ def _build_loop(shape: tuple[int, ...], data: bytes, device: torch.device, gathe
 
 
 def _partial_rows(masks: np.ndarray, pruned_by_all: np.ndarray, device: torch.device, gather: bool) -> dict:
-    """(step, block) -> rows, wherever some rows compute a block and others do not."""
+    """Map (step, block) to rows, wherever some rows compute a block and others do not."""
     cells = np.argwhere(masks.any(axis=0) & ~pruned_by_all)
     computed = ~masks[:, cells[:, 0], cells[:, 1]].T
     if gather:

@@ -1,4 +1,4 @@
-"""What the PyTorch engine knows before it sees an observation."""
+"""The tables of the PyTorch engine: all that follows from a network and a sampler alone."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.folding import (
+    Affine,
     ConditionEncoder,
-    CrossAttentionFold,
+    FoldedLayer,
     FoldedMemory,
-    after_length,
-    centred,
+    after_norm,
+    fold_layers,
+    fold_tokens,
 )
 from torchrl_sparse.blocks.engine.program import slot_counts
 from torchrl_sparse.blocks.engine.torch.blocks import CrossAttention, FeedForward, SelfAttention
+from torchrl_sparse.blocks.engine.torch.fold import TokenFold
 from torchrl_sparse.blocks.engine.torch.linear import transposed
+from torchrl_sparse.blocks.engine.torch.norms import after_length, centred, without_norms
 from torchrl_sparse.blocks.mask import num_buffers
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -44,19 +48,20 @@ class Tables:
     """
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
-        self.network = network
-        self.device = network.pos_emb.device
-        kinds = (SelfAttention, CrossAttention, FeedForward)
-        self.blocks = [kinds[b % 3](network, b // 3) for b in range(network.num_blocks)]
+        self.network, like = network, network.pos_emb.detach()
+        self.device = like.device
+        layers = [without_norms(layer) for layer in fold_layers(network)]
+        kinds = (SelfAttention, CrossAttention, FeedForward)  # in the order of BLOCK_TYPES
+        self.blocks = [kind(network, layer) for layer in layers for kind in kinds]
         self.stem_weight = centred(network.input_emb.weight.T).contiguous()
         self.stem_bias = centred(network.input_emb.bias + network.pos_emb[0])
-        head_weight, self.head_bias = after_length(network.ln_f, network.head.weight, network.head.bias)
-        self.head_weight = transposed(head_weight)
+        head = after_length(after_norm(network.ln_f, Affine(network.head.weight, network.head.bias)))
+        self.head_weight, self.head_bias = transposed(head.weight.to(like)), head.bias.to(like)
         self.memory_mask = None if network.memory_mask is None else network.memory_mask.clone()
-        self.fold = CrossAttentionFold(network)
+        self.fold = TokenFold(layers, like)
         self.encoder = ConditionEncoder(network, sampler.timesteps)
         self.num_steps = sampler.num_inference_steps
-        self.time = self._fold_time() if self.encoder.separable else None
+        self.time = self._fold_time(layers) if self.encoder.separable else None
         coefficients = sampler.coefficients
         self.clip, self.spread = coefficients.clip, coefficients.spread.to(self.stem_weight)
         columns = coefficients.table()[:, :-1].clone()
@@ -65,16 +70,16 @@ class Tables:
         self.weighs_eps = bool(coefficients.eps_weight.any())
         self.counts = {n: _count_table(network.num_blocks, n, self.stem_weight) for n in _SHARED_BUFFERS}
 
-    def _fold_time(self) -> list[FoldedMemory]:
-        """For each step, vectors [L, 2, 1, n_head, d] and bias [L, 1, 1, n_head]."""
-        folded = self.fold(self.encoder.time_tokens(), self.fold.room(self.num_steps))
-        vectors = folded.vectors.movedim(2, 0).contiguous().unsqueeze(3)
-        bias = folded.bias.movedim(1, 0).contiguous()[:, :, None, None]
+    def _fold_time(self, layers: list[FoldedLayer]) -> list[FoldedMemory]:
+        """Fold the time token of each step: vectors [L, 2, 1, n_head, d] and bias [L, 1, 1, n_head]."""
+        vectors, bias = fold_tokens(layers, self.encoder.time_tokens().double())
+        vectors = vectors.to(self.stem_weight).movedim(2, 0).contiguous().unsqueeze(3)
+        bias = bias.to(self.stem_weight).movedim(1, 0).contiguous()[:, :, None, None]
         return [FoldedMemory(*step) for step in zip(vectors, bias, strict=True)]
 
 
 def _count_table(num_blocks: int, num_slots: int, like: Tensor) -> list[list[Tensor]]:
-    """``table[first][last]``: how often the blocks ``first .. last-1`` read each shared buffer, [num_slots]."""
+    """Make ``table[first][last]``: how often the blocks ``first .. last-1`` read each shared buffer, [num_slots]."""
     edges = range(num_blocks + 1)
     counts = [[slot_counts(first, max(first, last), num_slots) for last in edges] for first in edges]
     return [list(row.unbind(0)) for row in torch.tensor(counts).to(like).unbind(0)]

@@ -1,0 +1,66 @@
+"""Planners' files say what they are: one function reads them all, those of other packages too."""
+
+import json
+
+import pytest
+import torch
+
+from torchrl_sparse import SAGPruner, StaticPlanner, load_planner
+from torchrl_sparse.blocks.planner import PlanSpec
+from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork
+from torchrl_sparse.blocks.saved import PLANNERS
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+
+
+class Until(StaticPlanner):
+    """Computes everything until a step and nothing afterwards, and is kept in a file."""
+
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def mask(self, spec):
+        late = torch.arange(spec.num_inference_steps) > self.step
+        return late[:, None].repeat(1, spec.num_blocks)
+
+    @classmethod
+    def from_pretrained(cls, path):
+        return cls(json.loads(path.read_text())["step"])
+
+
+def test_the_format_chooses_the_class(tmp_path):
+    mask = torch.tensor([[False] * 3, [True] * 3])
+    planner = SchedulePlanner(CacheSchedule.from_mask(mask, method="by hand", policy="8d1f"))
+    planner.save_pretrained(tmp_path / "schedule.json")
+    read = load_planner(tmp_path / "schedule.json")
+    assert isinstance(read, SchedulePlanner)
+    assert read.schedule == planner.schedule
+
+    pruner = SAGPruner(PrunerNetwork([1, 0], 3, (2, 5)), PrunerInfo("8d1f", "ddim", 0.7))
+    pruner.save_pretrained(tmp_path / "sag")
+    read = load_planner(tmp_path / "sag")
+    assert isinstance(read, SAGPruner)
+    assert read.fingerprint == pruner.fingerprint
+    assert read.made_for == PlanSpec(2, 1, "8d1f", "ddim")
+
+
+def test_a_class_of_another_package_takes_one_line(tmp_path, monkeypatch):
+    (tmp_path / "until.json").write_text('{"format": "elsewhere.until/1", "step": 2}')
+    with pytest.raises(ValueError, match=r"until.json: format: expected one of .*, got 'elsewhere.until/1'"):
+        load_planner(tmp_path / "until.json")
+    monkeypatch.setitem(PLANNERS, "elsewhere.until/1", Until)
+    planner = load_planner(tmp_path / "until.json")
+    planner.bind(PlanSpec(4, 1, "any"))
+    assert planner.masks(torch.zeros(1, 2, 5))[0, :, 0].tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"format": null}', '{"format": ["a"]}'])
+def test_a_file_without_a_format_is_named(tmp_path, content):
+    (tmp_path / "odd.json").write_text(content)
+    with pytest.raises(ValueError, match=r"odd.json: format: expected one of .*, got"):
+        load_planner(tmp_path / "odd.json")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere"):
+        load_planner(tmp_path / "nowhere")

@@ -1,0 +1,1 @@
+from tests.fixtures.diffusion import make_network  # noqa: F401

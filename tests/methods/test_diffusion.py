@@ -1,0 +1,153 @@
+"""Methods by name: what is made of each, how rates are written, and what one from another package takes."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.fixtures.diffusion import SIZES
+from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
+from torchrl_sparse.blocks.calibration import calibrate
+from torchrl_sparse.blocks.planner import Dense, StaticPlanner
+from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
+from torchrl_sparse.blocks.schedule import CacheSchedule
+from torchrl_sparse.blocks.uniform import Uniform
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.methods.diffusion import METHODS, Method, check_method, make_controller, make_method
+
+LAYERS = 2
+QUERY = TensorDict({"history": {"state": torch.zeros(1, 2, SIZES["cond_dim"])}}, [1])
+
+
+@pytest.fixture
+def policy(make_network):
+    normalizer = Normalizer(torch.ones(5), torch.zeros(5), torch.ones(10), torch.zeros(10))
+    return DiffusionPolicy(make_network(n_layer=LAYERS), normalizer, sampler=Sampler("ddpm", 20))
+
+
+@pytest.fixture
+def make(policy, tmp_path):
+    """Makes a method of `policy`, by default with planners in `tmp_path` and nothing to calibrate."""
+
+    def make(text, calibration=pytest.fail):
+        return make_method(text, policy, num_updates=5, planners=tmp_path, calibration=calibration)
+
+    return make
+
+
+@pytest.fixture
+def pruner(policy, tmp_path):
+    """A pruner for DDIM with four steps that takes a rate, saved as `sag`."""
+    torch.manual_seed(0)
+    network = PrunerNetwork([75, 50, 25, 0], 3 * LAYERS, (2, SIZES["cond_dim"]), rate_input=True)
+    pruner = SAGPruner(network, PrunerInfo(policy.fingerprint, "ddim", 0.5, (0.3, 0.7)))
+    pruner.save_pretrained(tmp_path / "sag")
+    return pruner
+
+
+class Odd(StaticPlanner):
+    """Skips every second step; a planner of another package."""
+
+    def mask(self, spec):
+        odd = torch.arange(spec.num_inference_steps) % 2 == 1
+        return odd[:, None].repeat(1, spec.num_blocks)
+
+
+def test_one_line_adds_a_method_from_outside(policy, make, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match=r"methods: expected dense, .*, got 'odd'"):
+        make("odd")
+    monkeypatch.setitem(METHODS, "odd", Method(lambda inputs: (Odd(), inputs.sampler)))
+    mask = make("odd")(QUERY.clone())[keys.PRUNE_MASK]
+    assert mask[0].any(dim=1).tolist() == 10 * [False, True]
+    with pytest.raises(ValueError, match=r"methods: expected dense, .*, odd, or a planner in .*, got 'even'"):
+        check_method("even", tmp_path)
+
+
+def test_a_method_may_bring_its_own_controller(monkeypatch):
+    controller = ActionAwareController(coarse=1, fine=2)
+    mine = Method(lambda inputs: (Odd(), inputs.sampler), controller=lambda rates: controller)
+    monkeypatch.setitem(METHODS, "odd", mine)
+    assert make_controller("odd") is controller
+
+
+def test_dense_shares_the_networks(policy, make):
+    dense = make("dense")
+    assert dense.network is policy.network
+    assert dense.sampler is policy.sampler
+    assert isinstance(dense.plan, Dense)
+
+
+@pytest.mark.parametrize(
+    ("name", "timesteps"),
+    [("ddim10", list(range(90, -1, -10))), ("ddim4", [75, 50, 25, 0]), ("ddim_87_20", [87, 20])],
+)
+def test_ddim_takes_its_timesteps_from_the_name(make, name, timesteps):
+    method = make(name)
+    assert method.sampler.kind == "ddim"
+    assert method.sampler.timesteps.tolist() == timesteps
+    assert isinstance(method.plan, Dense)
+
+
+@pytest.mark.parametrize(
+    "name", ["ddim0", "ddim_", "ddpm", "Dense", "bac@0.5-", "dense@1", "uniform@0.5@0.5", ""]
+)
+def test_other_names_are_refused(make, name):
+    with pytest.raises(ValueError, match="methods: expected"):
+        make(name)
+
+
+def test_uniform_computes_each_block_as_often_as_asked(make):
+    planner = make("uniform").plan
+    assert isinstance(planner, Uniform)
+    assert (~planner.mask(planner.spec)).sum(dim=0).tolist() == [5] * 3 * LAYERS
+
+
+def test_bac_is_read_where_it_fits_and_computed_where_not(policy, make, tmp_path):
+    noise, cond = policy.sample_noise(torch.tensor([1])), torch.zeros(1, 2, SIZES["cond_dim"])
+    computed = make("bac", lambda: calibrate(policy.network, policy.sampler, noise, cond)).plan.schedule
+    assert computed.settings["num_updates"] == 5
+    computed.save_pretrained(tmp_path / "bac.json")
+    assert make("bac").plan.schedule == computed  # without a calibration
+    asked = []
+    with pytest.raises(AttributeError):
+        make_method(
+            "bac", policy, num_updates=6, planners=tmp_path, calibration=lambda: asked.append("asked")
+        )
+    assert asked == ["asked"]
+
+
+def test_a_saved_planner_brings_its_sampler(policy, make, tmp_path):
+    mask = torch.tensor([[False], [True], [True]]).repeat(1, 3 * LAYERS)
+    schedule = CacheSchedule.from_mask(
+        mask, method="mine", policy=policy.fingerprint, sampler="ddim_90_50_10"
+    )
+    schedule.save_pretrained(tmp_path / "mine.json")
+    method = make("mine")
+    assert method.sampler.timesteps.tolist() == [90, 50, 10]
+    assert torch.equal(method(QUERY.clone())[keys.PRUNE_MASK][0], mask)
+
+
+@pytest.mark.usefixtures("pruner")
+def test_rates_are_written_behind_the_name(make):
+    assert make("sag").plan.rate == 0.5
+    assert make_controller("sag") is make_controller("sag@0.6") is None
+    assert make("sag@0.6").plan.rate == 0.6
+    coarse_then_fine = make("sag@0.7-0.4")
+    assert coarse_then_fine.plan.rate == 0.7
+    assert coarse_then_fine.num_inference_steps == 4
+    controller = make_controller("sag@0.7-0.4")
+    assert controller.budgets == (0.7, 0.4)
+    assert keys.PRUNE_RATE in controller.out_keys
+
+
+@pytest.mark.usefixtures("pruner")
+@pytest.mark.parametrize("text", ["sag@0.9", "sag@0.7-0.1", "sag@0.9-0.5"])
+def test_a_rate_out_of_range_is_refused_at_once(make, text):
+    with pytest.raises(ValueError, match=r"rate: expected prune rates in \[0.3, 0.7\]"):
+        make(text)
+
+
+def test_planners_without_a_rate_say_so(make):
+    with pytest.raises(
+        ValueError, match="methods: uniform: expected a planner that takes a prune rate, got Uniform"
+    ):
+        make("uniform@0.5")

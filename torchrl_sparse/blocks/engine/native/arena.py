@@ -1,0 +1,111 @@
+"""Matrices and constants in the memory layout of ``native.cpp``.
+
+A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into panels of 32 columns,
+[part][panel][row][32].
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+from ctypes import c_int32, c_void_p
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+__all__ = ["PANEL", "Arena", "Matrix", "pack_panels"]
+
+PANEL, PART = 32, 256
+_TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as native.cpp numbers them
+_CACHE_LINE = 64
+
+
+class Matrix(ctypes.Structure):
+    """``struct Matrix`` of native.cpp; :meth:`Arena.matrix` makes one."""
+
+    _fields_ = [
+        *((name, c_void_p) for name in ("weight", "bias")),
+        *((name, c_int32) for name in ("rows", "columns", "bias_stride", "type")),
+    ]
+
+
+def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Lay a matrix out in the order in which ``native.cpp`` reads it.
+
+    Args:
+        weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
+        dtype: torch.float32, torch.float16 or torch.bfloat16. Of bfloat16, each two rows become one of i32, the first
+            in the lower half: CPUs multiply them in pairs.
+
+    Returns:
+        flat, part after part of up to 256 rows, in each [ceil(columns / 32), rows of the part, 32]; zero where there
+        is no column.
+
+    Raises:
+        ValueError: if a weight is too large for ``dtype``.
+
+    Examples:
+        >>> pack_panels(torch.ones(40, 7)).view(2, 7, 32)[1, 0].sum()
+        tensor(8.)
+    """
+    rounded = weight.to(dtype)
+    if not rounded.isfinite().all():
+        raise ValueError(
+            f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
+        )
+    if dtype == torch.bfloat16:
+        rounded = functional.pad(rounded, (0, weight.shape[1] % 2)).contiguous().view(torch.int32)
+    columns, rows = rounded.shape
+    panels = functional.pad(rounded, (0, 0, 0, -columns % PANEL)).view(-1, PANEL, rows).transpose(1, 2)
+    return torch.cat([part.flatten() for part in panels.split(PART, dim=1)])
+
+
+class Arena:
+    """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
+
+    _BLOCK = 32 << 20
+
+    def __init__(self) -> None:
+        self._blocks: list[Tensor] = []
+        self._used = self._size = 0
+
+    def keep(self, tensor: Tensor) -> int:
+        """Copy ``tensor`` and return the address of the copy, on a cache line."""
+        tensor = tensor.contiguous().view(-1).view(torch.uint8)
+        if self._used + tensor.numel() > self._size:
+            self._size = max(self._BLOCK, tensor.numel())
+            self._used = 0
+            self._blocks.append(torch.frombuffer(_pages(self._size), dtype=torch.uint8))
+        place = self._blocks[-1][self._used : self._used + tensor.numel()].copy_(tensor)
+        self._used += -(-tensor.numel() // _CACHE_LINE) * _CACHE_LINE
+        return place.data_ptr()
+
+    def floats(self, tensor: Tensor) -> int:
+        """Copy ``tensor`` as f32 and return the address of the copy."""
+        return self.keep(tensor.float())
+
+    def matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype = torch.float32) -> Matrix:
+        """Pack a layer's ``weight`` [columns, rows] and ``bias`` [columns], or [n, columns] for n rows of a product."""
+        columns, rows = weight.shape
+        bias = functional.pad(bias, (0, -columns % PANEL))
+        return Matrix(
+            weight=self.keep(pack_panels(weight, dtype)),
+            bias=self.floats(bias),
+            rows=-(-rows // 2) if dtype == torch.bfloat16 else rows,
+            columns=bias.shape[-1],
+            bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
+            type=_TYPES.index(dtype),
+        )
+
+
+def _pages(size: int) -> mmap.mmap:
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return mmap.mmap(-1, size)
+    # Private, because memory that processes share, the default here, is not given large pages.
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    # A kernel without large pages refuses, and nothing is lost.
+    with contextlib.suppress(OSError):
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return memory

@@ -1,0 +1,46 @@
+"""Timing of single blocks, for planners that budget in time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import torch
+
+from torchrl_sparse.blocks.mask import BLOCK_TYPES
+
+__all__ = ["time_blocks"]
+
+
+def time_blocks(
+    walk: Callable[[int], None], num_layers: int, repeats: int, device: torch.device
+) -> dict[str, float]:
+    """Measure the seconds of a block of each type: the best of ``repeats``, which other work disturbs least.
+
+    Args:
+        walk: runs the blocks of one type (an index of ``BLOCK_TYPES``) of all layers, so that weights come from
+            where they come from in a query.
+        num_layers: layers L.
+        repeats: timed walks of each type, interleaved, after a few that are not timed.
+        device: synchronised around every walk if it is a GPU.
+    """
+    samples: list[list[float]] = [[] for _ in BLOCK_TYPES]
+    for turn in range(-3, repeats):
+        for kind in range(len(BLOCK_TYPES)):
+            seconds = _time_once(walk, kind, device) / num_layers
+            if turn >= 0:
+                samples[kind].append(seconds)
+    return {name: min(samples[kind]) for kind, name in enumerate(BLOCK_TYPES)}
+
+
+def _time_once(walk: Callable[[int], None], kind: int, device: torch.device) -> float:
+    _synchronize(device)
+    start = time.perf_counter()
+    walk(kind)
+    _synchronize(device)
+    return time.perf_counter() - start
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

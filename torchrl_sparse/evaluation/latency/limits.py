@@ -1,0 +1,60 @@
+"""What a machine can do at best: how fast it reads weights, and how fast it multiplies with them."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from torchrl_sparse.blocks.engine.program import build_program
+from torchrl_sparse.blocks.engine.torch.linear import make_linear
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+
+__all__ = ["block_weights", "measure_bandwidth", "measure_multiply_adds", "program_seconds"]
+
+
+def block_weights(network: TransformerForDiffusion) -> tuple[int, int, int]:
+    """Count the weights that one SA, CA and FFN block must read; folded cross-attention reads next to nothing."""
+    width = network.n_emb
+    return 4 * width * width, 0, 8 * width * width
+
+
+def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> float:
+    """Measure the bytes per second at which this thread reads as much as one denoising step's weights, again and again.
+
+    The best of ``repeats``.
+    """
+    size = network.n_layer * sum(block_weights(network))
+    array = torch.ones(size)
+    return 4 * size / min(_timed(array.sum, repeats))
+
+
+def measure_multiply_adds(size: int = 1536, repeats: int = 5) -> float:
+    """Measure the FLOPs (2 * MAC) per second of a large product of f32 matrices in PyTorch, the best of ``repeats``.
+
+    Of the two libraries that PyTorch may have for it the faster one counts: on AMD's CPUs MKL's vectors are half as wide as
+    oneDNN's.
+    """
+    matrix, out = torch.ones(size, size), torch.ones(size, size)
+    products = torch.mm, make_linear(matrix, torch.zeros(size))
+    best = min(min(_timed(lambda product=product: product(matrix, out), repeats)) for product in products)
+    return 2 * size**3 / best
+
+
+def program_seconds(case: EngineCase, repeats: int = 50) -> float:
+    """Measure the median seconds that the program of a new random mask takes to build."""
+    mask = case.queries["random91"].mask[0].numpy()
+    return statistics.median(_timed(lambda: build_program(mask), repeats))
+
+
+def _timed(call: Callable[[], Any], repeats: int) -> list[float]:
+    samples = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        samples.append(time.perf_counter() - start)
+    return samples

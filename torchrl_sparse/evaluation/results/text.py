@@ -1,0 +1,70 @@
+"""Numbers as the tables print them."""
+
+from __future__ import annotations
+
+from torchrl_sparse.evaluation.results.schema import Difference, Interval, Success
+
+__all__ = [
+    "count_text",
+    "difference_text",
+    "milliseconds_text",
+    "percent_text",
+    "points_text",
+    "threads_text",
+]
+
+
+def count_text(success: Success) -> str:
+    """Return solved episodes with the interval of their rate.
+
+    >>> count_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
+    '3/4 [30, 95] %'
+    """
+    return f"{success.k}/{success.n} {_percent_range(success.ci95)} %"
+
+
+def percent_text(success: Success) -> str:
+    """Return a success rate with its interval, in percent.
+
+    >>> percent_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
+    '75.0 [30, 95]'
+    """
+    return f"{100 * success.rate:.1f} {_percent_range(success.ci95)}"
+
+
+def difference_text(difference: Difference) -> str:
+    """Return a difference of success rates with its interval, in points."""
+    return points_text(difference.diff, difference.ci95)
+
+
+def points_text(diff: float, interval: Interval) -> str:
+    """Return a difference of rates with its interval, in points.
+
+    >>> points_text(-0.03, (-0.053, 0.014))
+    '-3.0 [-5.3, +1.4]'
+    """
+    low, high = (f"{100 * limit:+.1f}" for limit in interval)
+    return f"{100 * diff:+.1f} [{low}, {high}]"
+
+
+def milliseconds_text(seconds: float) -> str:
+    """Return a duration to three digits, in milliseconds.
+
+    >>> milliseconds_text(0.00838), milliseconds_text(1.2345)
+    ('8.38', '1234')
+    """
+    value = 1e3 * seconds
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def threads_text(threads: int) -> str:
+    """Return a number of threads in words.
+
+    >>> threads_text(1), threads_text(2)
+    ('1 thread', '2 threads')
+    """
+    return f"{threads} thread{'' if threads == 1 else 's'}"
+
+
+def _percent_range(interval: Interval) -> str:
+    return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
