@@ -32,4 +32,4 @@ sanitize: install
 		-o build/sanitize/native.so torchrl_sparse/blocks/engine/native/native.cpp
 	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
 		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
-		$(BIN)/python -m pytest tests/blocks/engine/test_native.py tests/blocks/engine/test_native_gates.py -k "not library"
+		$(BIN)/python -m pytest tests/blocks/engine/native -k "not library"

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
@@ -44,14 +45,14 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
-    TokenMethod,
     matching_share,
     method_identity,
     mid_episode_query,
     seen_images,
 )
 from torchrl_sparse.evaluation.statistics.fidelity import action_error
-from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.vla.token_budget import recorded_queries, replay
 
@@ -62,24 +63,26 @@ _ZOOM = 2
 @hydra.main(version_base=None, config_path=".", config_name="benchmark_vla")
 def main(config: DictConfig) -> None:
     out = Path(config.out)
-    methods = {text: TokenMethod.parse(text) for text in dict.fromkeys(["dense", *config.methods])}
-    check_references(methods)
+    methods = [*dict.fromkeys(["dense", *config.methods])]
+    check_matches(methods)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
     environment = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     seeds = range(EVALUATION_SEED + config.seed, EVALUATION_SEED + config.seed + config.episodes)
-    actor = methods["dense"].executor(dense, config.n_action_steps)
+    actor = executor("dense", dense, config)
     recorded = recorded_queries(dense, actor, environment, seeds[: config.probe_episodes])
     recorded = [*tqdm(recorded, total=len(seeds[: config.probe_episodes]), unit="episode", desc="recording")]
 
-    policies, episodes, options = {}, {}, OmegaConf.to_container(config.specprune)
+    policies, episodes = {}, {}
+    settings = {"specprune": OmegaConf.to_container(config.specprune)}
     with backend_runtime(config.backend, config.workers):  # one Ray for all methods
-        for text, method in sorted(methods.items(), key=lambda item: item[1].like is not None):
-            number = method.number
-            if method.like is not None:
-                kept = token_totals(episodes[method.like]).mean
-                number = matching_share(method.pruner, dense, recorded, kept)
-            policies[text] = with_pruner(dense, method.pruner(number, options))
-            identity = method_identity(text, number, dense, options)
+        written = {text: TokenMethodName.parse(text) for text in methods}
+        for text in sorted(methods, key=lambda text: written[text].like is not None):
+            make, number = partial(make_pruner, text, settings=settings), written[text].number
+            if (like := written[text].like) is not None:
+                kept = token_totals(episodes[like]).mean
+                number = matching_share(lambda share, make=make: make(number=share), dense, recorded, kept)
+            policies[text] = dense.with_pruner(make(number=number))
+            identity = method_identity(text, number, dense, settings)
             episodes[text] = evaluate(text, policies[text], environment, seeds, identity, config)
     policies = {text: policies[text] for text in methods}  # in the order asked for
 
@@ -114,14 +117,8 @@ def main(config: DictConfig) -> None:
     print(f"\n{config.episodes} paired episodes per method; files are in {out}")
 
 
-def check_references(methods: dict[str, TokenMethod]) -> None:
-    """Raises ValueError if a method matches one that is not asked for, or that matches another itself."""
-    plain = [text for text, method in methods.items() if method.like is None]
-    for text, method in methods.items():
-        if method.like is not None and method.like not in plain:
-            raise ValueError(
-                f"methods: {text}: expected one of {', '.join(plain)} after @, got {method.like!r}"
-            )
+def executor(text: str, policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
+    return ChunkExecutor(policy, config.n_action_steps, make_controller(text))
 
 
 def evaluate(
@@ -139,7 +136,7 @@ def evaluate(
         log = Path(config.dense_log)
     with tqdm(total=len(seeds), unit="episode", desc=f"{text:>14}") as bar:
         return rollout_episodes(
-            TokenMethod.parse(text).executor(policy, config.n_action_steps),
+            executor(text, policy, config),
             environment,
             seeds,
             num_envs=config.num_envs,
@@ -176,7 +173,7 @@ def describe(policy: VLAPolicy, config: DictConfig) -> PolicyShape:
 
 def film(name: str, policy: VLAPolicy, env: EnvBase, config: DictConfig) -> None:
     """One episode: a video of what both cameras see and the policy keeps, a strip of it, and the controller's timeline."""
-    actor = TokenMethod.parse(name).executor(policy, config.n_action_steps)
+    actor = executor(name, policy, config)
     try:
         steps = env.rollout(env.base_env.horizon, actor, auto_cast_to_device=True).cpu()
     finally:

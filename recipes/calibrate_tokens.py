@@ -1,10 +1,10 @@
-"""Picks SpecPrune's alpha for a task: the smallest within a tolerance of the dense policy, in action error or in success.
+"""Pick SpecPrune's alpha for a task: the smallest within a tolerance of the dense policy, in action error or in success.
 
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla tolerance=0.02
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla demos=data/lift_named_images.h5   # without rendering
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla measure=success tolerance=0.05
 
-Writes ``out``, which `TokenBudget.load` reads, and a figure beside it.
+Writes ``out``, which `TokenBudget.from_pretrained` reads, and a figure beside it.
 """
 
 from __future__ import annotations
@@ -27,27 +27,24 @@ from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.budget import BudgetPoint, TokenBudget, smallest_alpha
 from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.token_budget import (
-    MEASURES,
-    BudgetPoint,
-    TokenBudget,
     demonstrated_queries,
     measure_errors,
     measure_success,
     recorded_queries,
-    smallest_alpha,
 )
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 
 @hydra.main(version_base=None, config_path=".", config_name="calibrate_tokens")
 def main(config: DictConfig) -> None:
-    if config.measure not in MEASURES:
-        raise ValueError(f"measure: expected one of {', '.join(MEASURES)}, got {config.measure!r}")
+    measures = {"action_error": errors, "success": lost_episodes}
+    if config.measure not in measures:
+        raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
     policy = VLAPolicy.from_pretrained(config.policy).to(config.device)
-    measure = errors if config.measure == "action_error" else lost_episodes
-    points = tuple(measure(policy, config))
+    points = tuple(measures[config.measure](policy, config))
     for point in points:
         print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
     alpha = smallest_alpha(points, config.tolerance)
@@ -55,13 +52,13 @@ def main(config: DictConfig) -> None:
         config.preset, alpha, config.measure, config.tolerance, points, OmegaConf.to_container(config.options)
     )
     out = Path(config.out)
-    budget.save(out)
+    budget.save_pretrained(out)
     plot_token_budget(budget, out.with_suffix(".png"))
     print(f"{out}: alpha {alpha:g}, {config.measure} within {config.tolerance:g} of dense")
 
 
 def errors(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
-    """The action error of each alpha, on the same recorded queries."""
+    """Measure the action error of each alpha, on the same recorded queries."""
     if config.demos is not None:
         recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps)
     else:
@@ -75,7 +72,7 @@ def errors(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
 
 
 def lost_episodes(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
-    """How much lower the success rate of each alpha is than the dense policy's, on the same initial states."""
+    """Measure the success that each alpha loses to the dense policy, on the same initial states."""
     make_actor, make = partial(executor, config=config), environment(policy, config)
     with tqdm(total=(1 + len(config.alphas)) * config.episodes, unit="episode") as bar:
         return measure_success(policy, make_actor, make, seeds(config), pruners(config), bar.update)

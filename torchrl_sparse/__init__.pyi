@@ -53,6 +53,7 @@ from .tokens import (
     RandomPruner as RandomPruner,
     SparseVLMPruner as SparseVLMPruner,
     SpecPrune as SpecPrune,
+    TokenBudget as TokenBudget,
     TokenPruner as TokenPruner,
     VLACachePruner as VLACachePruner,
 )

@@ -68,17 +68,17 @@ def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
     [
         (lambda text: text[: len(text) // 2], "expected a complete JSON file"),
         (lambda text: "", "expected a complete JSON file"),
-        (lambda text: "[1, 2]", "expected a JSON object, got list"),
+        (lambda text: "[1, 2]", r"expected an object, got \[1, 2\]"),
         (lambda text: text.replace("schedule/1", "schedule/9"), "format: expected .*schedule/1.*schedule/9"),
-        (lambda text: "{}", "format: expected .*, got None"),
-        (lambda text: text.replace('"method": "bac",', ""), r"missing \['method'\]"),
+        (lambda text: "{}", "format: expected this key, got nothing"),
+        (lambda text: text.replace('"method": "bac",', ""), "method: expected this key, got nothing"),
         (
             lambda text: text.replace('"settings"', '"seting"'),
-            r"missing \['settings'\], unknown \['seting'\]",
+            "settings: expected this key, got nothing",
         ),
         (
             lambda text: text.replace('"policy": "8d1f"', '"policy": 7'),
-            "policy: expected a non-empty string, got 7",
+            "policy: expected a valid string, got 7",
         ),
         (lambda text: text.replace('_steps": 10', '_steps": 10.0'), "num_inference_steps: .*got 10.0"),
         (lambda text: text.replace('_layers": 2', '_layers": "2"'), "num_layers: .*got '2'"),
@@ -95,7 +95,7 @@ def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
         (lambda text: text.replace('.SA": [0, ', '.SA": [0, 10, ', 1), r"layers\.0\.SA: .*in 0\.\.9"),
         (
             lambda text: text.replace('.SA": [0, ', '.SA": [0, "1", ', 1),
-            r"layers\.0\.SA: expected .*whole numbers",
+            r"layers\.0\.SA\.1: expected a valid integer",
         ),
         (lambda text: re.sub(r'SA": \[.*\]', 'SA": null', text, count=1), r"layers\.0\.SA: .*got None"),
         (lambda text: re.sub(r'SA": \[.*\]', 'SA": []', text, count=1), r"layers\.0\.SA: .*got \[\]"),
@@ -105,7 +105,7 @@ def test_a_damaged_file_is_refused_naming_file_and_field(path, damage, message):
     before = path.read_text()
     path.write_text(damage(before))
     assert path.read_text() != before
-    with pytest.raises(ValueError, match=f"(?s)schedule {re.escape(str(path))}: .*{message}"):
+    with pytest.raises(ValueError, match=f"(?s){re.escape(str(path))}: .*{message}"):
         CacheSchedule.from_pretrained(path)
 
 

@@ -29,12 +29,13 @@ from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.rollouts.vla_methods import TokenMethod, matching_share
+from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.methods.diffusion import make_controller, make_method
+from torchrl_sparse.methods.vla import TokenMethodName, make_controller as make_token_controller, make_pruner
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.json import to_plain
-from torchrl_sparse.training.vla.token_budget import TokenBudget
+from torchrl_sparse.tokens.budget import TokenBudget
 
 __all__ = [
     "EpisodeResult",
@@ -123,12 +124,14 @@ def vla_actor(folder: Path, name: str, recorded: Sequence[TensorDictBase], kept:
     A method that matches another keeps ``kept`` tokens on the ``recorded`` queries. ``NAME.json`` is a calibrated budget.
     """
     if name.endswith(".json"):
-        return ChunkExecutor(with_pruner(_vla(folder), TokenBudget.load(folder / name).pruner()), 1)
-    method = TokenMethod.parse(name)
-    number = method.number
-    if method.like is not None:
-        number = matching_share(method.pruner, _vla(folder), [recorded], kept)
-    return method.executor(with_pruner(_vla(folder), method.pruner(number, {})), n_action_steps=1)
+        pruner = TokenBudget.from_pretrained(folder / name).pruner()
+        return ChunkExecutor(_vla(folder).with_pruner(pruner), 1)
+    number = None
+    if TokenMethodName.parse(name).like is not None:
+        number = matching_share(lambda share: make_pruner(name, number=share), _vla(folder), [recorded], kept)
+    return ChunkExecutor(
+        _vla(folder).with_pruner(make_pruner(name, number=number)), 1, make_token_controller(name)
+    )
 
 
 def vla_query(images: Tensor, state: Any, instruction: str, eef_vel: Any, seed: int, step: int) -> TensorDict:

@@ -45,7 +45,7 @@ _FFN = BLOCK_TYPES.index("FFN")
 
 
 def acs(similarity: Tensor, num_updates: int, objective: Objective = "anchor") -> tuple[int, ...]:
-    """The best ``num_updates`` denoising steps to compute one block at; step 0 is always one of them.
+    """Choose the best ``num_updates`` denoising steps to compute one block at; step 0 is always one of them.
 
     * ``"anchor"``: maximise ``Σ_m Σ_{t=c_m}^{c_{m+1}-1} S[c_m, t]``, the similarity of every step to the
       update that it reuses. Dynamic programme over the end of the m-th interval, ``D[m][i] = max_{j<i}
@@ -102,7 +102,7 @@ def _anchored(similarity: Tensor, num_updates: int) -> tuple[int, ...]:
 
 
 def upstream_blocks(errors: Tensor | Sequence[float], top_k: int) -> tuple[int, ...]:
-    """The set U of BUA: columns of the ``top_k`` highest error scores, ascending; of equals the shallower.
+    """Return the set U of BUA: columns of the ``top_k`` highest error scores, ascending; of equals the shallower.
 
     >>> upstream_blocks([0.1, 0.3, 0.2], top_k=2)
     (1, 2)
@@ -120,7 +120,7 @@ def bubbling_union(
     errors: Tensor | Sequence[float],
     top_k: int = 5,
 ) -> tuple[tuple[int, ...], ...]:
-    """BUA: let the blocks of highest error compute whenever a downstream FFN does.
+    """Let the blocks of highest error compute whenever a downstream FFN does (BUA).
 
     ``C(u) ← C(u) ∪ ⋃_{v∈D(u)} C(v)`` for every u in U, the ``top_k`` blocks of highest error (FFNs included);
     D(u) are the FFNs of u's own layer and deeper. Afterwards C(u) ⊇ C(v) for every v in D(u). The order does not
@@ -160,7 +160,7 @@ def bac_blockwise_schedule(
     objective: Objective = "anchor",
     force_last: bool = True,
 ) -> CacheSchedule:
-    """Ablation ``bac_blockwise`` (Table 2, "block-wise ACS"): ACS for every block, without BUA.
+    """Make the schedule of the ablation ``bac_blockwise`` (Table 2, "block-wise ACS"): ACS for every block, without BUA.
 
     Arguments: :func:`bac_schedule`.
     """
@@ -179,7 +179,7 @@ def bac_unified_schedule(
     objective: Objective = "anchor",
     force_last: bool = True,
 ) -> CacheSchedule:
-    """Ablation ``bac_unified`` (Table 2, "unified ACS"): all blocks share the ACS of their mean similarity.
+    """Make the schedule of the ablation ``bac_unified`` (Table 2, "unified ACS"): ACS of the mean similarity for all blocks.
 
     Arguments: :func:`bac_schedule`.
     """
@@ -198,7 +198,7 @@ def bac_schedule(
     force_last: bool = True,
     top_k: int = 5,
 ) -> CacheSchedule:
-    """The method itself, ``bac``: ACS for every block, then BUA.
+    """Make the schedule of the method itself, ``bac``: ACS for every block, then BUA.
 
     Args:
         calibration: of the policy, see :func:`calibrate`.

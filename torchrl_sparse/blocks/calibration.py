@@ -1,28 +1,25 @@
-"""Calibration: what dense queries reveal about each block, the input of the caching schedulers.
+"""Calibration: statistics of each block over dense queries, from which BAC decides.
 
-How alike a block's outputs are between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much they
+They tell how alike a block's outputs are between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much they
 vary in all. Few queries suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
-
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["Calibration", "block_error", "calibrate", "feature_similarity"]
 
 
 def feature_similarity(features: Tensor) -> Tensor:
-    """Cosine similarity of a block's outputs between denoising steps (Fig. 1), averaged over samples.
+    """Return the cosine similarity of a block's outputs between denoising steps (Fig. 1), averaged over samples.
 
     Args:
         features: outputs of one block [K, B, ...]; each sample is flattened to one vector.
@@ -38,7 +35,7 @@ def feature_similarity(features: Tensor) -> Tensor:
 
 
 def block_error(features: Tensor) -> Tensor:
-    """Error score of a block, ``l = 1/K² Σ_t Σ_u ‖X^t − X^u‖₁`` (BUA, phase 1), averaged over samples.
+    """Return the error score of a block, ``l = 1/K² Σ_t Σ_u ‖X^t − X^u‖₁`` (BUA, phase 1), averaged over samples.
 
     Args:
         features: outputs of one block [K, B, ...].
@@ -55,7 +52,7 @@ def block_error(features: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What BAC knows of a policy.
+    """Similarities and errors of a policy's blocks.
 
     Attributes:
         similarity: f64 [3L, K, K], see :func:`feature_similarity`.

@@ -1,4 +1,4 @@
-"""Learning-to-Cache (L2C, arXiv:2406.01733) for denoising transformers: a learned schedule that never looks.
+"""Learning-to-Cache (L2C, arXiv:2406.01733) for denoising transformers: a learned schedule, the same for every observation.
 
 One logit for each block of each denoising step, learned through the frozen policy, then cut at one half: the
 baseline that tells what a learned mask is worth without the observation. As released, L2C may cache only every
@@ -37,5 +37,5 @@ class StaticGates(nn.Module):
         self.logits = nn.Parameter(torch.zeros(num_steps, num_blocks))
 
     def prune_logits(self, cond: Tensor, rate: None = None) -> Tensor:
-        """f32 [B, K, 3L], the same for every observation of ``cond`` [B, To, D]."""
+        """Return f32 [B, K, 3L], the same for every observation of ``cond`` [B, To, D]."""
         return self.logits.expand(len(cond), -1, -1)

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from torchrl_sparse.blocks import schedule
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.blocks.sag import planner as sag
-from torchrl_sparse.storage.files import read_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = ["PLANNERS", "load_planner"]
 
@@ -40,8 +41,7 @@ def load_planner(path: str | os.PathLike) -> Planner:
     """
     path = Path(path)
     file = path / "config.json" if path.is_dir() else path
-    content = read_json(file)
-    found = content.get("format") if isinstance(content, dict) else None
+    found = read_json(file, dict[str, Any]).get("format")
     if not isinstance(found, str) or found not in PLANNERS:
         raise ValueError(f"{file}: format: expected one of {list(PLANNERS)}, got {found!r}")
     return PLANNERS[found].from_pretrained(path)

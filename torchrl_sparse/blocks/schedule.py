@@ -29,8 +29,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -46,21 +45,43 @@ from torchrl_sparse.blocks.mask import (
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
 from torchrl_sparse.networks.diffusion.sampler import split_sampler
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json
 
 __all__ = ["CacheSchedule", "SchedulePlanner"]
 
 FORMAT = "torchrl_sparse.schedule/1"
-_FIELDS = (
-    "format",
-    "method",
-    "policy",
-    "num_inference_steps",
-    "num_layers",
-    "sampler",
-    "reuse",
-    "settings",
-    "computed_steps",
-)
+
+
+@dataclass(frozen=True)
+class _ScheduleFile:
+    """The content of a schedule's file."""
+
+    format: Literal["torchrl_sparse.schedule/1"]
+    method: str
+    policy: str
+    sampler: str
+    num_inference_steps: int
+    num_layers: int
+    reuse: Reuse
+    settings: dict[str, Any]
+    computed_steps: dict[str, list[int]]
+
+    def schedule(self) -> CacheSchedule:
+        """Return the schedule; ValueError if its blocks are not those of the network."""
+        steps = self.computed_steps
+        names = [block_name(column) for column in range(len(steps))]
+        if missing := [name for name in names if name not in steps]:
+            raise ValueError(f"computed_steps: expected {', '.join(names)}; missing {missing}")
+        return CacheSchedule(
+            self.method,
+            self.policy,
+            self.num_inference_steps,
+            self.num_layers,
+            tuple(tuple(steps[name]) for name in names),
+            self.sampler,
+            self.reuse,
+            self.settings,
+        )
 
 
 @dataclass(frozen=True)
@@ -98,15 +119,11 @@ class CacheSchedule:
 
     def __post_init__(self) -> None:
         for name in ("method", "policy"):
-            value = getattr(self, name)
-            if not isinstance(value, str) or not value:
-                raise ValueError(f"{name}: expected a non-empty string, got {value!r}")
+            if not getattr(self, name):
+                raise ValueError(f"{name}: expected a non-empty string, got {getattr(self, name)!r}")
         for name in ("num_inference_steps", "num_layers"):
-            value = getattr(self, name)
-            if not _is_int(value) or value < 1:
-                raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
-        if not isinstance(self.settings, dict):
-            raise ValueError(f"settings: expected an object, got {type(self.settings).__name__}")
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)!r}")
         split_sampler(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
@@ -168,14 +185,11 @@ class CacheSchedule:
             FileNotFoundError: if there is no such file.
             ValueError: naming file and field, what was expected and what came, if it is no valid schedule.
         """
+        stored = read_json(path, _ScheduleFile)
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
-        except ValueError as error:  # no JSON or no text, as in a truncated file
-            raise ValueError(f"schedule {path}: expected a complete JSON file, got: {error}") from error
-        try:
-            return cls(**_checked_fields(data))
+            return stored.schedule()
         except ValueError as error:
-            raise ValueError(f"schedule {path}: {error}") from error
+            raise ValueError(f"{path}: {error}") from error
 
     def _to_json(self) -> str:
         """Return JSON with one line per block, which the standard library's indentation cannot do."""
@@ -229,39 +243,10 @@ class SchedulePlanner(StaticPlanner):
         return self.schedule.mask()
 
 
-def _checked_fields(data: Any) -> dict[str, Any]:
-    """Return the arguments of :class:`CacheSchedule` from decoded JSON; the values themselves are checked by the class."""
-    if not isinstance(data, dict):
-        raise ValueError(f"expected a JSON object, got {type(data).__name__}")
-    if data.get("format") != FORMAT:
-        raise ValueError(f"format: expected {FORMAT!r}, got {data.get('format')!r}")
-    _check_names("fields", data, _FIELDS)
-    num_layers, blocks = data["num_layers"], data["computed_steps"]
-    if not isinstance(blocks, dict):
-        raise ValueError(f"computed_steps: expected an object, got {type(blocks).__name__}")
-    names = [block_name(column) for column in range(len(blocks))]
-    if _is_int(num_layers) and len(BLOCK_TYPES) * num_layers == len(blocks):
-        _check_names("computed_steps", blocks, names)
-    fields = {name: data[name] for name in _FIELDS[1:-1]}
-    return fields | {"computed_steps": tuple(blocks.get(name) for name in names)}
-
-
-def _check_names(what: str, found: dict[str, Any], expected: Sequence[str]) -> None:
-    missing, unknown = sorted(set(expected) - set(found)), sorted(set(found) - set(expected))
-    if missing or unknown:
-        raise ValueError(f"{what}: expected {', '.join(expected)}; missing {missing}, unknown {unknown}")
-
-
-def _check_steps(name: str, steps: Any, num_steps: int) -> None:
-    valid = isinstance(steps, (list, tuple)) and all(
-        _is_int(step) and 0 <= step < num_steps for step in steps
-    )
-    if not valid or not steps or steps[0] != 0 or any(a >= b for a, b in pairwise(steps)):
+def _check_steps(name: str, steps: Sequence[int], num_steps: int) -> None:
+    within = all(0 <= step < num_steps for step in steps)
+    if not steps or steps[0] != 0 or not within or any(a >= b for a, b in pairwise(steps)):
         raise ValueError(
             f"computed_steps of {name}: expected increasing whole numbers in 0..{num_steps - 1} "
-            f"that start with 0, got {steps!r}"
+            f"that start with 0, got {list(steps)}"
         )
-
-
-def _is_int(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)

@@ -16,7 +16,7 @@ __all__ = ["Uniform", "uniform_mask"]
 
 
 def uniform_mask(num_steps: int, num_blocks: int, interval: int) -> Tensor:
-    """bool [num_steps, num_blocks], True = pruned; steps 0, interval, 2 · interval, … compute everything.
+    """Return bool [num_steps, num_blocks], True = pruned; steps 0, interval, 2 · interval, … compute everything.
 
     >>> uniform_mask(5, 1, interval=2).flatten().int().tolist()
     [0, 1, 0, 1, 0]
@@ -47,5 +47,5 @@ class Uniform(StaticPlanner):
         self.interval = interval
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """The uniform mask [K, 3L]."""
+        """Return the uniform mask [K, 3L]."""
         return uniform_mask(spec.num_inference_steps, spec.num_blocks, self.interval)

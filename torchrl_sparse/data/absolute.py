@@ -239,7 +239,7 @@ def _merge(
 
 
 def _fill(target: h5py.Group, demo: h5py.Group, part: h5py.File) -> None:
-    """What was made, and of the rest what does not depend on how the robot is controlled."""
+    """Merge what was converted with those recordings that do not depend on the controller."""
     copy_attributes(demo, target)
     part.copy("actions", target)
     part.copy("obs", target)

@@ -81,7 +81,7 @@ def _pool(backend: str, workers: int) -> Executor:
 
 
 def _death(backend: str, error: Exception) -> str:
-    """What died, in words; empty if it is the task that raised ``error``."""
+    """Name what died; empty if it is the task that raised ``error``."""
     if backend == "ray":
         return ray_death(error)
     return "a worker died" if isinstance(error, BrokenProcessPool) else ""

@@ -37,7 +37,7 @@ _OBSERVED = "obs/"
 
 @dataclass(frozen=True)
 class Collection:
-    """What to collect.
+    """Settings of a collection.
 
     Attributes:
         task: name or alias of a task that has an expert.
@@ -56,7 +56,7 @@ class Collection:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a collection went: episodes attempted, successes among them, episodes kept and their mean steps."""
+    """Tally of a collection: episodes attempted, successes among them, episodes kept and their mean steps."""
 
     attempts: int
     successes: int
@@ -200,7 +200,7 @@ def _worker_env(task: str) -> EnvBase:
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:
-    """How one demonstration started: ``env.reset(initial_state=...)`` begins there again.
+    """Read the start of one demonstration: ``env.reset(initial_state=...)`` begins there again.
 
     Its seed is -1 where the file names none, as those of people do not.
 

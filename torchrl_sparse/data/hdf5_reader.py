@@ -113,7 +113,7 @@ def _dataset_names(demo: h5py.Group) -> list[str]:
 
 
 def _first_loss(path: Path) -> str:
-    """Where a truncated file breaks off, in words."""
+    """Describe where a truncated file breaks off."""
     try:
         with open(path, "rb") as raw, h5py.File(_Endless(raw), "r") as file:
             for name in demo_names(path, file):

@@ -1,4 +1,4 @@
-"""What each demonstration of a file was asked to do: ``lang`` of its json attribute ``ep_meta``, as in RoboCasa's files."""
+"""The instruction of each demonstration of a file: ``lang`` of its json attribute ``ep_meta``, as in RoboCasa's files."""
 
 from __future__ import annotations
 

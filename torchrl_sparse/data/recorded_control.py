@@ -1,4 +1,4 @@
-"""What a demonstration file says about the controller that its actions were meant for."""
+"""The controller that a demonstration file's actions were meant for."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class RecordedControl:
     keeps_orientation: bool
 
     def are_deltas(self, actions: np.ndarray) -> bool:
-        """Whether actions [T, 7 * arms] are normalised deltas rather than absolute poses.
+        """Tell whether actions [T, 7 * arms] are normalised deltas rather than absolute poses.
 
         Diffusion Policy's published ``*_abs.hdf5`` files hold poses and still describe a delta controller. The rotation
         vector of a gripper that points down is about pi long, which no normalised delta is.

@@ -55,7 +55,7 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
 
 
 def _look(env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int) -> dict[str, np.ndarray]:
-    """What there is to see in each state, by the names of observations."""
+    """Render each state, by the names of observations."""
     seen = []
     for state in states:
         env.sim_env.sim.set_state_from_flattened(state)

@@ -1,4 +1,4 @@
-"""What the block-pushing task consists of, as bodies in pybullet, and where a published episode puts them."""
+"""The scene of block pushing as bodies in pybullet, and the published starts of episodes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Start:
 
 
 def published_start(seed: int) -> Start:
-    """Where the published episode of a seed puts blocks and targets, by the same stream of random numbers.
+    """Return the published start of a seed's episode, from the same stream of random numbers.
 
     >>> start = published_start(100000)
     >>> (np.abs(np.diff(start.blocks[:, 0])) > 0.1).item(), start.targets[:, 1].round(2).tolist()

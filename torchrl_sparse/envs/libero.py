@@ -8,6 +8,8 @@ An optional extra, as it brings 350 MB of scenes::
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -62,18 +64,16 @@ def make_libero_env(
     """
     if suite not in SUITES:
         raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
-    _register_missing_mount()
+    options = {
+        "camera_height": image_size,
+        "camera_width": image_size,
+        "wrist_camera": "robot0_eye_in_hand",
+        "max_episode_steps": SUITES[suite] if max_episode_steps is None else max_episode_steps,
+        "init_state_mode": init_state_mode,
+    }
     try:
-        env = LiberoEnv(
-            suite,
-            task_id,
-            camera_height=image_size,
-            camera_width=image_size,
-            wrist_camera="robot0_eye_in_hand",
-            max_episode_steps=SUITES[suite] if max_episode_steps is None else max_episode_steps,
-            init_state_mode=init_state_mode,
-            **kwargs,
-        )
+        with _base_of_floor_robots():
+            env = _MountedLibero(suite, task_id, **options, **kwargs)
     except ImportError as error:
         raise ImportError(
             f"LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]': {error}"
@@ -82,6 +82,29 @@ def make_libero_env(
     return TransformedEnv(
         env, Compose(InitTracker(), pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState())
     )
+
+
+class _MountedLibero(LiberoEnv):
+    """`LiberoEnv` in robosuite 1.5, which does not know the base of the robots in LIBERO's floor scenes: None.
+
+    Robots are made anew at every reset. robosuite's table has the entry only meanwhile.
+    """
+
+    def _reset(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        with _base_of_floor_robots():
+            return super()._reset(*args, **kwargs)
+
+
+@contextmanager
+def _base_of_floor_robots() -> Iterator[None]:
+    import_robosuite()
+    from robosuite.models.bases import BASE_MAPPING, NullMount
+
+    BASE_MAPPING[None] = NullMount
+    try:
+        yield
+    finally:
+        del BASE_MAPPING[None]
 
 
 class RotationVectorState(Transform):
@@ -116,11 +139,3 @@ def rotation_vector(quaternion: Tensor) -> Tensor:
     sine = (1 - w.square()).sqrt()
     turn = quaternion[..., :3] * 2 * w.acos() / sine.clamp_min(torch.finfo(w.dtype).tiny)
     return torch.where(sine > 0, turn, 0.0)
-
-
-def _register_missing_mount() -> None:
-    """LIBERO's floor scenes ask for a robot without a base by a name that robosuite 1.5 does not know."""
-    import_robosuite()
-    from robosuite.models.bases import BASE_MAPPING, NullMount
-
-    BASE_MAPPING.setdefault(None, NullMount)

@@ -59,7 +59,7 @@ class LiftNamed(Lift):
 
     @property
     def instruction(self) -> str:
-        """What counts in this episode, one of the task's instructions; can be set at any moment."""
+        """The instruction that counts in this episode; can be set at any moment."""
         return self._instruction
 
     @instruction.setter

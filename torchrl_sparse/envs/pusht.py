@@ -117,7 +117,7 @@ def block_keypoints(position: Sequence[float], angle: float) -> np.ndarray:
 
 
 def published_start(seed: int) -> np.ndarray:
-    """Where the published episode of a seed starts, f64 [5]: agent x, y; block x, y, all pixels; block angle, rad.
+    """Return the published start of a seed's episode, f64 [5]: agent x, y; block x, y, all pixels; block angle, rad.
 
     >>> published_start(100000).round(1).tolist()
     [235.0, 124.0, 335.0, 128.0, -0.9]

@@ -121,7 +121,7 @@ class CameraRenderer:
 
 
 def _same_uploads(one: Any, other: Any) -> bool:
-    """Whether a GL context made for one model shows the other as well."""
+    """Tell whether a GL context made for one model shows the other as well."""
     names = [name for name in dir(one) if name.startswith(_UPLOADED)]
     if not all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names):
         return False

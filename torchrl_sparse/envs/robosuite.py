@@ -163,7 +163,7 @@ class RobosuiteEnv(SeededEnv):
 
     @property
     def instruction(self) -> str:
-        """What this episode asks for, in words."""
+        """The instruction of this episode."""
         if isinstance(self._instruction, str):
             return self._instruction
         return self.sim_env.instruction if self.task.has_choice else self.task.instructions[0]

@@ -1,4 +1,4 @@
-"""What the environments here have in common: episodes fixed by one integer, success, horizon, and checked actions."""
+"""Base of the environments: episodes fixed by one integer, success, horizon, and checked actions."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class SeededEnv(EnvBase):
 
     @abstractmethod
     def _is_solved(self) -> bool:
-        """Whether the task's predicate holds now."""
+        """Tell whether the task's predicate holds now."""
 
     def _parts_done(self) -> int:
         """Parts of the task done so far in this episode."""

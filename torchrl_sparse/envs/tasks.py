@@ -67,7 +67,7 @@ class Task(Protocol):
 
 
 class _Named:
-    """What both kinds of tasks do with the names of their parts."""
+    """Load the expert that a task names."""
 
     name: str
     expert: str | None

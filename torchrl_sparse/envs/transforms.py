@@ -1,4 +1,4 @@
-"""What stands between an environment and a policy: observation history, and velocity where no simulator gives it."""
+"""Transforms between an environment and a policy: observation history, and velocity where no simulator gives it."""
 
 from __future__ import annotations
 

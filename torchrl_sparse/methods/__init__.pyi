@@ -7,3 +7,9 @@ from .diffusion import (
     make_controller as make_controller,
     make_method as make_method,
 )
+from .vla import (
+    TOKEN_METHODS as TOKEN_METHODS,
+    TokenMethod as TokenMethod,
+    TokenMethodName as TokenMethodName,
+    make_pruner as make_pruner,
+)

@@ -120,12 +120,12 @@ def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _ddim(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """At diffusers' timesteps, as many as the name ends with."""
+    """Take diffusers' timesteps, as many as the name ends with."""
     return Dense(), Sampler("ddim", int(inputs.name.removeprefix("ddim")), inputs.sampler.num_train_timesteps)
 
 
 def _ddim_at_timesteps(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """At the timesteps of the name."""
+    """Take the timesteps of the name."""
     return Dense(), Sampler.from_name(inputs.name, num_train_timesteps=inputs.sampler.num_train_timesteps)
 
 
@@ -134,7 +134,7 @@ def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """The saved schedule if it has as many updates, else a new one."""
+    """Take the saved schedule if it has as many updates, else make one."""
     path = inputs.planners / f"{inputs.name}.json"
     schedule = CacheSchedule.from_pretrained(path) if path.exists() else None
     if schedule is None or schedule.settings.get("num_updates") != inputs.num_updates:
@@ -144,7 +144,7 @@ def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """A saved planner and the sampler that it was made for."""
+    """Load a planner; its sampler is the one that it was made for."""
     planner, sampler = load_planner(_saved_path(inputs.planners, inputs.name)), inputs.sampler
     if (spec := planner.made_for) is not None:
         sampler = Sampler.from_name(spec.sampler, spec.num_inference_steps, sampler.num_train_timesteps)

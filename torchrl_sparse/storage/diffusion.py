@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from torch import Tensor, nn
 
@@ -23,14 +23,24 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.storage.files import read_tensors, write_tensors
+from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_tensors, take
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
-_FIELDS = {"format", "network", "schedule"}
-_OPTIONAL_FIELDS = {"vision", "source"}
 T = TypeVar("T")
 _NETWORK, _NORMALIZER, _VISION = "network.", "normalizer.", "vision."
+
+
+@dataclass(frozen=True)
+class _Config:
+    """The content of ``config.json``."""
+
+    format: Literal["torchrl_sparse.diffusion_policy/1"]
+    network: dict[str, Any]
+    schedule: dict[str, Any]
+    vision: dict[str, Any] | None = None
+    source: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -56,32 +66,30 @@ class StoredPolicy:
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
-    """Writes both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
-    config = {"format": FORMAT, "network": policy.network.config, "schedule": policy.sampler.config}
+    """Write both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
+    vision = None if policy.vision is None else policy.vision.config
+    config = _Config(FORMAT, policy.network.config, policy.sampler.config, vision, policy.source or None)
     weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
     if policy.vision is not None:
-        config["vision"] = policy.vision.config
         weights |= {_VISION + name: value for name, value in policy.vision.state_dict().items()}
     tensors = {name: value.half() if half else value for name, value in weights.items()}
     tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
-    if policy.source:
-        config["source"] = policy.source
     write_tensors(path / "model.safetensors", tensors)
-    write_config(path / "config.json", config)
+    write_json(path / "config.json", config)
 
 
 def read_pretrained(path: Path) -> StoredPolicy:
-    """The policy in the folder ``path``, its network in evaluation mode.
+    """Read the policy in the folder ``path``, its network in evaluation mode.
 
     Raises:
         FileNotFoundError: if a file is not there.
         ValueError: naming the file, what was expected and what came.
     """
-    config = read_config(path / "config.json", FORMAT, _FIELDS, _OPTIONAL_FIELDS)
+    config = read_json(path / "config.json", _Config)
     tensors = read_tensors(path / "model.safetensors")
     network = _make(path, TransformerForDiffusion, config, "network")
     sampler = _make(path, Sampler, config, "schedule")
-    vision = _make(path, VisionEncoder, config, "vision") if "vision" in config else None
+    vision = None if config.vision is None else _make(path, VisionEncoder, config, "vision")
     state_dim = network.cond_dim - (0 if vision is None else vision.feature_dim)
     where = path / "model.safetensors"
     _load(where, _NETWORK, tensors, network)
@@ -96,19 +104,19 @@ def read_pretrained(path: Path) -> StoredPolicy:
     check_tensors(f"{where}: {_NORMALIZER}", normalizer_tensors, expected)
     if tensors:
         raise ValueError(f"{where}: expected tensors of the policy alone, got {sorted(tensors)}")
-    return StoredPolicy(network, Normalizer(**normalizer_tensors), sampler, vision, config.get("source", {}))
+    return StoredPolicy(network, Normalizer(**normalizer_tensors), sampler, vision, config.source or {})
 
 
 def _load(where: Path, prefix: str, tensors: dict[str, Tensor], module: nn.Module) -> None:
-    """Moves the tensors under ``prefix`` into ``module`` and puts it in evaluation mode."""
+    """Move the tensors under ``prefix`` into ``module`` and puts it in evaluation mode."""
     found = take(tensors, prefix)
     check_tensors(f"{where}: {prefix}", found, {k: tuple(v.shape) for k, v in module.state_dict().items()})
     module.load_state_dict({name: value.float() for name, value in found.items()})
     module.eval()
 
 
-def _make(path: Path, kind: type[T], config: dict[str, Any], field: str) -> T:
+def _make(path: Path, kind: type[T], config: _Config, field: str) -> T:
     try:
-        return kind(**config[field])
+        return kind(**getattr(config, field))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path / 'config.json'}: {field}: {error}") from error

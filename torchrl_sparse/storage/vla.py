@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -20,14 +21,22 @@ from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
-from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.storage.files import read_tensors, write_tensors
+from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
 
 __all__ = ["StoredVLA", "read_vla", "write_vla"]
 
-FORMAT = "torchrl_sparse.vla_policy/1"
-_FIELDS = {"format", "network", "tokenizer"}
 _NETWORK, _NORMALIZER = "network.", "normalizer."
+
+
+@dataclass(frozen=True)
+class _Config:
+    """Content of ``config.json``."""
+
+    format: Literal["torchrl_sparse.vla_policy/1"]
+    network: dict[str, Any]
+    tokenizer: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -50,8 +59,10 @@ def write_vla(path: Path, policy: StoredVLA) -> None:
     tensors = {_NETWORK + name: value.half() for name, value in policy.network.state_dict().items()}
     tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
     write_tensors(path / "model.safetensors", tensors)
-    network, tokenizer = policy.network.config.to_dict(), policy.tokenizer.to_config()
-    write_config(path / "config.json", {"format": FORMAT, "network": network, "tokenizer": tokenizer})
+    config = _Config(
+        "torchrl_sparse.vla_policy/1", policy.network.config.to_dict(), policy.tokenizer.to_config()
+    )
+    write_json(path / "config.json", config)
 
 
 def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
@@ -66,10 +77,10 @@ def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
         ValueError: naming the file, what was expected and what came.
     """
     where = path / "config.json"
-    fields = read_config(where, FORMAT, _FIELDS)
+    stored = read_json(where, _Config)
     try:
-        config = VLAConfig.from_dict(fields["network"])
-        tokenizer = tokenizer_from_config(fields["tokenizer"])
+        config = VLAConfig.from_dict(stored.network)
+        tokenizer = tokenizer_from_config(stored.tokenizer)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
     _check_architecture(where, expected, config)

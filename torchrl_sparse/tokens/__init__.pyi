@@ -1,4 +1,8 @@
 from .base import TokenPruner as TokenPruner
+from .budget import (
+    BudgetPoint as BudgetPoint,
+    TokenBudget as TokenBudget,
+)
 from .efficientvla import EfficientVLAPruner as EfficientVLAPruner
 from .fastv import FastVPruner as FastVPruner
 from .frame_difference import FrameDifferencePruner as FrameDifferencePruner

@@ -15,6 +15,5 @@ from .trainer import (
     Trainer as Trainer,
 )
 from .vla import (
-    TokenBudget as TokenBudget,
     VLATrainer as VLATrainer,
 )

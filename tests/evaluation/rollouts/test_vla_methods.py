@@ -18,7 +18,6 @@ from torchrl_sparse.control.queries import answer
 from torchrl_sparse.envs.rendering import GL_HINT
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
-    TokenMethod,
     matching_share,
     mid_episode_query,
     seen_images,
@@ -38,32 +37,6 @@ def episode(steps=5):
     for step in range(1, steps):
         queries.append(later(queries[-1], seed=step))
     return [td[0] for td in queries]
-
-
-def test_names_make_pruners():
-    assert TokenMethod.parse("dense").pruner() is None
-    assert TokenMethod.parse("specprune@0.4").pruner().options.alpha == 0.4
-    assert not TokenMethod.parse("specprune_static").pruner().options.dynamic
-    gentle = (
-        TokenMethod.parse("specprune_static@0.4").pruner(options={"keep_share": 0.9, "dynamic": True}).options
-    )
-    assert (gentle.keep_share, gentle.dynamic, gentle.alpha) == (0.9, False, 0.4)
-    assert TokenMethod.parse("random@0.25").pruner().share == 0.25
-    assert TokenMethod.parse("fastv@specprune").pruner(0.125).share == 0.125
-    gates = [
-        TokenMethod.parse(name).executor(make_policy(), 2).controller
-        for name in ("specprune", "specprune_static")
-    ]
-    assert gates[0] is not None
-    assert gates[1] is None
-
-
-@pytest.mark.parametrize(
-    "text", ["fastw", "dense@0.5", "fastv@", "fastv@-1", "sparsevlm@specprune", "specprune@fastv"]
-)
-def test_other_names_are_refused(text):
-    with pytest.raises(ValueError, match=f"methods: expected .*, got '{text}'"):
-        TokenMethod.parse(text)
 
 
 @pytest.mark.parametrize("make", [FastVPruner, RandomPruner])

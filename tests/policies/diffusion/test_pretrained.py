@@ -66,7 +66,7 @@ CONFIG_FAULTS = {
         lambda c: c.update(format="other/1"),
         "format: expected 'torchrl_sparse.diffusion_policy/1', got 'other/1'",
     ),
-    "field": (lambda c: c.pop("schedule"), "expected the fields"),
+    "field": (lambda c: c.pop("schedule"), "schedule: expected this key, got nothing"),
     "unknown argument": (lambda c: c["network"].update(n_experts=3), "n_experts"),
     "size": (lambda c: c["network"].update(n_emb=30), "n_emb must be a multiple of n_head"),
     "timesteps": (

@@ -1,4 +1,4 @@
-"""The trained policy in assets/vla does what it is told: in one and the same scene, the words decide which cube goes up."""
+"""The trained policy in assets/vla follows its instruction: in one and the same scene, the words decide which cube goes up."""
 
 from dataclasses import replace
 from pathlib import Path

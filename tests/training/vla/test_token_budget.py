@@ -1,6 +1,5 @@
-"""Picking SpecPrune's budget: replayed queries are those of a rollout, and the choice keeps what it promises."""
+"""Measuring SpecPrune's budget: replayed queries are those of a rollout, and errors those of the executed actions."""
 
-import json
 import os
 import subprocess
 import sys
@@ -21,26 +20,18 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.budget import TokenBudget
 from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.token_budget import (
-    BudgetPoint,
-    TokenBudget,
     demonstrated_queries,
     measure_errors,
     measure_success,
     recorded_queries,
     replay,
-    smallest_alpha,
 )
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 RECIPE = Path(__file__).parents[3] / "recipes" / "calibrate_tokens.py"
-POINTS = (
-    BudgetPoint(0.2, 40, 0.05),
-    BudgetPoint(0.5, 70, 0.01),
-    BudgetPoint(0.7, 90, 0.03),
-    BudgetPoint(1.0, 99, 0.0),
-)
 
 
 def episode(steps=4):
@@ -82,45 +73,6 @@ def test_errors_are_those_of_the_executed_actions_after_the_first_query():
     assert (tight.alpha, whole.alpha) == (0.2, 1.0)
     with pytest.raises(ValueError, match=r"expected one with at least two queries, got \[1, 1\]"):
         measure_errors(policy, [queries[:1]] * 2, [pruner(0.2)], n_action_steps=1)
-
-
-@pytest.mark.parametrize(("tolerance", "alpha"), [(0.0, 1.0), (0.02, 1.0), (0.03, 0.5), (0.05, 0.2)])
-def test_no_larger_alpha_may_lose_more_than_the_tolerance(tolerance, alpha):
-    """At 0.02, 0.5 would do, but 0.7 would not: that 0.5 does is luck."""
-    assert smallest_alpha(POINTS, tolerance) == alpha
-    assert smallest_alpha(POINTS[::-1], tolerance) == alpha
-
-
-def test_a_tolerance_that_none_keeps_is_refused():
-    with pytest.raises(ValueError, match=r"at most 0.02 at the largest alpha, got 0.2: 0.05, 0.7: 0.03"):
-        smallest_alpha([POINTS[0], POINTS[2]], 0.02)
-
-
-def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
-    budget = TokenBudget("release", 0.5, "action_error", 0.03, POINTS, {"keep_share": 0.95})
-    budget.save(tmp_path / "budget.json")
-    again = TokenBudget.load(tmp_path / "budget.json")
-    assert again == budget
-    assert again.pruner().options == SpecPrune("release", alpha=0.5, keep_share=0.95).options
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"preset": "mine"}, "preset: expected 'paper' or 'release', got 'mine'"),
-        ({"points": 3}, "expected a token budget with preset, alpha"),
-        ({"more": 1}, "more"),
-    ],
-)
-def test_wrong_files_are_named(tmp_path, change, message):
-    path = tmp_path / "budget.json"
-    TokenBudget("paper", 0.5, "action_error", 0.03, POINTS).save(path)
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(ValueError, match=message) as error:
-        TokenBudget.load(path)
-    assert str(path) in str(error.value)
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
-        TokenBudget.load(tmp_path / "none.json")
 
 
 def test_queries_of_demonstrations_begin_with_each_episode():
@@ -189,7 +141,7 @@ def test_the_recipe_calibrates_from_a_demonstration_file(tmp_path):
     command = [sys.executable, str(RECIPE), f"demos={demos}", *options]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr[-3000:]
-    budget = TokenBudget.load(tmp_path / "policy" / "specprune.json")
+    budget = TokenBudget.from_pretrained(tmp_path / "policy" / "specprune.json")
     assert budget.alpha == 0.1
     assert [point.alpha for point in budget.points] == [0.1, 0.3]
     assert budget.points[0].kept < budget.points[1].kept

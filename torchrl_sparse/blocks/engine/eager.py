@@ -7,14 +7,11 @@ it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["EagerBaseline", "published_forward"]
 
@@ -22,7 +19,7 @@ __all__ = ["EagerBaseline", "published_forward"]
 def published_forward(
     network: TransformerForDiffusion, sample: Tensor, timestep: Tensor, cond: Tensor
 ) -> Tensor:
-    """Predicted noise [B, H, A], through PyTorch's own decoder module."""
+    """Predict the noise [B, H, A] through PyTorch's own decoder module."""
     memory = network.memory(timestep, cond)
     x = network.decoder(
         tgt=network.embed(sample), memory=memory, tgt_mask=network.mask, memory_mask=network.memory_mask
@@ -70,7 +67,7 @@ class EagerBaseline:
         *,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Normalised actions [B, H, A].
+        """Return normalised actions [B, H, A].
 
         Args:
             sample: initial noise f32 [B, H, A].

@@ -22,7 +22,7 @@ __all__ = ["PrunerNetwork"]
 
 
 class PrunerNetwork(nn.Module):
-    """Logits of every block of every denoising step from an encoded observation.
+    """Predicts logits of every block of every denoising step from an encoded observation.
 
     In evaluation mode, what follows from the weights alone is kept until ``train()``, ``eval()``, ``load_state_dict()`` or a
     move: call ``eval()`` after writing to a weight by hand.
@@ -86,7 +86,7 @@ class PrunerNetwork(nn.Module):
         self._forget()
 
     def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Logits (keep, prune) f32 [B, K, 3L, 2].
+        """Return logits (keep, prune) f32 [B, K, 3L, 2].
 
         Args:
             cond: encoded observations f32 [B, To, D].
@@ -95,7 +95,7 @@ class PrunerNetwork(nn.Module):
         return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, 2)
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """f32 [B, K, 3L]: by how much pruning is preferred to keeping, at less cost than both logits.
+        """Return f32 [B, K, 3L], by how much pruning is preferred to keeping, at less cost than both logits.
 
         In evaluation mode and without gradients, compiled code computes it for float32 on the CPU.
         """
@@ -107,7 +107,7 @@ class PrunerNetwork(nn.Module):
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
 
     def prune_masks(self, cond: Tensor) -> Tensor:
-        """bool [B, K, 3L]: where pruning is preferred, which it never is in the first step; without a rate as input."""
+        """Return bool [B, K, 3L], where pruning is preferred, the first step left out; for networks without a rate as input."""
         if (native := self._compiled(cond)) is not None:
             return native.masks(cond.flatten(1))
         masks = self.prune_logits(cond) > 0
@@ -115,7 +115,7 @@ class PrunerNetwork(nn.Module):
         return masks
 
     def _compiled(self, cond: Tensor) -> NativePruner | None:
-        """The compiled MLP, or None where PyTorch has to compute."""
+        """Return the compiled MLP, or None where PyTorch has to compute."""
         if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):
             return None
         if self._native is None and self._can_be_native():
@@ -139,12 +139,12 @@ class PrunerNetwork(nn.Module):
         return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        """The first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
+        """Return the first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
         obs = self.fuse_obs(self.obs(self._features(cond, rate)))
         return (obs[:, None] + self.cells()).flatten(0, 1)
 
     def cells(self) -> Tensor:
-        """What the coordinates contribute to the first MLP layer, [K * 3L, hidden]; kept in evaluation mode."""
+        """Return the coordinates' part of the first MLP layer's sums, [K * 3L, hidden]; kept in evaluation mode."""
         if self.training or torch.is_grad_enabled():
             return self._encode()
         if self._cells is None:
@@ -188,7 +188,7 @@ class PrunerNetwork(nn.Module):
         return self.fuse_z(self.encoder(self.token(self.coordinates)[None])[0])
 
     def _coordinates(self, code: SinusoidalPosEmb) -> Tensor:
-        """[K * 3L, 2 * width]: step and block codes, concatenated as in the paper, not added."""
+        """Return [K * 3L, 2 * width], step and block codes, concatenated as in the paper, not added."""
         steps = code(torch.tensor(self.timesteps)).repeat_interleave(self.num_blocks, dim=0)
         return torch.cat([steps, code(torch.arange(self.num_blocks)).repeat(len(self.timesteps), 1)], dim=-1)
 

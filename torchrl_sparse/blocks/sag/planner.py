@@ -1,4 +1,4 @@
-"""Sparse ActionGen (SAG, arXiv:2601.12894): a pruner that looks at the observation, then decides what to skip.
+"""Sparse ActionGen (SAG, arXiv:2601.12894): a learned planner that decides from the observation.
 
 One small network reads the encoded observation and the coordinates of all K x 3L blocks, and predicts the whole
 mask of a query before its first denoising step (Section 3.2 of the paper)::
@@ -13,16 +13,16 @@ output of their type ("one-for-all"). The paper does not publish sizes; those he
 the dense FLOPs. :mod:`torchrl_sparse.training.pruner.trainer` trains it.
 
 Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
-query through ``("diffusion", "prune_rate")``, and keeps each of them exactly, because the logits are then compared
-with that one of them that leaves so many above it.
+query through ``("diffusion", "prune_rate")``. It keeps each of them exactly: it prunes as many blocks as the rate
+asks for, those of the highest logits.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -32,13 +32,13 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.keys import COND, PRUNE_RATE
-from torchrl_sparse.storage.files import read_config, read_tensors, write_config, write_tensors
+from torchrl_sparse.storage.files import read_tensors, write_tensors
+from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_finite, check_shapes
 
 __all__ = ["PrunerInfo", "SAGPruner", "check_rates", "rate_threshold"]
 
 FORMAT = "torchrl_sparse.sag/1"
-_FIELDS = {"format", "policy", "sampler", "rate", "rate_range", "reuse", "settings", "network"}
 
 
 def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
@@ -86,8 +86,16 @@ class PrunerInfo:
     def __post_init__(self) -> None:
         check_reuse(self.reuse)
         check_rates(self.rate, self.rate_range)
-        if self.rate_range is not None:  # JSON brings a list
+        if self.rate_range is not None:  # options bring a list
             object.__setattr__(self, "rate_range", tuple(self.rate_range))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Config(PrunerInfo):
+    """The content of ``config.json``."""
+
+    format: Literal["torchrl_sparse.sag/1"]
+    network: dict[str, Any]
 
 
 def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
@@ -197,9 +205,8 @@ class SAGPruner(Planner):
         """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""
         path = Path(path)
         write_tensors(path / "pruner.safetensors", self.network.state_dict())
-        write_config(
-            path / "config.json", {"format": FORMAT, **asdict(self.info), "network": self.network.config}
-        )
+        config = {"format": FORMAT, **asdict(self.info), "network": self.network.config}
+        write_json(path / "config.json", config)
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> SAGPruner:
@@ -210,13 +217,12 @@ class SAGPruner(Planner):
             ValueError: naming the file, what was expected in it and what came.
         """
         path = Path(path)
-        config = read_config(path / "config.json", FORMAT, _FIELDS)
-        del config["format"]
+        config = read_json(path / "config.json", _Config)
+        info = PrunerInfo(**{field.name: getattr(config, field.name) for field in fields(PrunerInfo)})
         try:
-            network = PrunerNetwork(**config.pop("network"))
-            info = PrunerInfo(**config)
+            network = PrunerNetwork(**config.network)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{path / 'config.json'}: {error}") from error
+            raise ValueError(f"{path / 'config.json'}: network: {error}") from error
         where, expected = path / "pruner.safetensors", network.state_dict()
         tensors = read_tensors(where)
         check_shapes(str(where), tensors, {name: tuple(value.shape) for name, value in expected.items()})

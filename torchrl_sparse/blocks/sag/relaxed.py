@@ -1,18 +1,17 @@
-"""Denoising under gates that gradients flow to: what trains the methods that learn where to prune.
+"""Denoising as a function that is differentiable in its gates, to train the methods that learn where to prune.
 
 Its values are those of :func:`torchrl_sparse.blocks.engine.reference.denoise` under the hard mask. Its
 gradients are those of the mixture of SAG (arXiv:2601.12894), with the gate ``M`` a real number::
 
     out_b = (1 - M) d_b + M tau      tau <- out_b      x <- x + out_b
 
-so that a gate is told how the final actions would change if its block were computed or reused, also through
-what later blocks then reuse.
+so that the gradient of a gate says how the final actions would change if its block were computed or reused, also
+through what later blocks then reuse. SAG and Learning-to-Cache are trained with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,16 +20,14 @@ from torch.utils.checkpoint import checkpoint
 from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.reference import ComputedRows
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
-
-if TYPE_CHECKING:
-    from torchrl_sparse.networks.diffusion.sampler import Sampler
-    from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
 
 
 def straight_through_gate(logits: Tensor) -> Tensor:
-    """Hard gates with the gradient of ``sigmoid(logits)`` (straight-through estimator, arXiv:1308.3432).
+    """Return hard gates with the gradient of ``sigmoid(logits)`` (straight-through estimator, arXiv:1308.3432).
 
     Args:
         logits: f32 [*B, K, 3L], positive where pruning is preferred.
@@ -48,7 +45,7 @@ def straight_through_gate(logits: Tensor) -> Tensor:
 
 
 def gumbel_gate(logits: Tensor, temperature: float) -> Tensor:
-    """Hard gates drawn with probability ``sigmoid(logits)``, straight-through Gumbel-softmax (arXiv:1611.01144).
+    """Draw hard gates with probability ``sigmoid(logits)``, straight-through Gumbel-softmax (arXiv:1611.01144).
 
     Args:
         logits: f32 [*B, K, 3L].
@@ -73,7 +70,7 @@ def denoise_relaxed(
     explore: float = 1.0,
     checkpointed: bool = False,
 ) -> Tensor:
-    """Normalised actions [B, H, A], differentiable with respect to the gates.
+    """Return normalised actions [B, H, A], differentiable with respect to the gates.
 
     Args:
         network, sampler, noise, cond, reuse: as in :func:`~torchrl_sparse.blocks.engine.reference.denoise`.
@@ -103,12 +100,12 @@ def step_errors(
     explore: float = 1.0,
     checkpointed: bool = False,
 ) -> Tensor:
-    """What each denoising step alone does wrong: the chain with its gradients cut between the steps.
+    """Return the error of each denoising step alone, with gradients cut between the steps.
 
-    Every step starts from the sample and the buffers that the pruned chain reached, detached, and its result
-    is compared with a dense step from the same sample, which costs one more forward pass. No gradient runs
-    through more than one step, but a gate no longer learns what its buffer is worth to later steps, nor how
-    much of an early error the rest of the chain repairs. The arguments are those of :func:`denoise_relaxed`.
+    Every step starts from the sample and the buffers that the pruned chain reached, detached, and its result is compared
+    with a dense step from the same sample, which costs one more forward pass. No gradient runs through more than one
+    step: that of a gate leaves out the use of its buffer to later steps, and that later steps repair part of an early
+    error. The arguments are those of :func:`denoise_relaxed`.
 
     Returns:
         f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
@@ -127,8 +124,8 @@ def step_errors(
 
 
 def _chain(
-    network,
-    sampler,
+    network: TransformerForDiffusion,
+    sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     gate: Tensor,
@@ -138,7 +135,7 @@ def _chain(
     checkpointed: bool,
     cut: bool = False,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """The samples before and after each denoising step."""
+    """Yield the samples before and after each denoising step."""
     pruned = gate.detach().bool()
     check_query(network, sampler, noise, cond, pruned, reuse)
     if not 0 < explore <= 1:
@@ -165,28 +162,28 @@ class _Step:
 
     def __init__(
         self,
-        network,
-        sampler,
+        network: TransformerForDiffusion,
+        sampler: Sampler,
         k: int,
         cond: Tensor,
         noise: Tensor | None,
         computed: ComputedRows,
         slots: int,
     ) -> None:
-        self._network, self._schedule, self._k = network, sampler, k
+        self._network, self._sampler, self._k = network, sampler, k
         self._cond, self._noise = cond, noise
         self._computed, self._slots = computed, slots
 
     def __call__(self, sample: Tensor, gate: Tensor, *buffers: Tensor) -> tuple[Tensor, ...]:
-        """The next sample and the buffers after the step; ``gate`` is [B, 3L]."""
+        """Return the next sample and the buffers after the step; ``gate`` is [B, 3L]."""
         network, latest = self._network, list(buffers) or [None] * self._slots
-        memory = network.memory(int(self._schedule.timesteps[self._k]), self._cond)
+        memory = network.memory(int(self._sampler.timesteps[self._k]), self._cond)
         x = network.embed(sample)
         for block in range(network.num_blocks):
             slot = block % self._slots
             latest[slot] = output = self._output(block, x, memory, gate[:, block, None, None], latest[slot])
             x = x + output
-        return self._schedule.step(network.head_out(x), self._k, sample, self._noise), *latest
+        return self._sampler.step(network.head_out(x), self._k, sample, self._noise), *latest
 
     def _output(self, block: int, x: Tensor, memory: Tensor, gate: Tensor, latest: Tensor | None) -> Tensor:
         rows = self._computed.at(self._k, block)

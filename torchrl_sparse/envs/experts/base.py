@@ -24,7 +24,7 @@ DOWNWARD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 @dataclass(frozen=True)
 class Hand:
-    """What an arm's hand does now.
+    """State of an arm's hand now.
 
     Attributes:
         position: f64 [3] of the grip site, m, world frame.
@@ -51,7 +51,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where a hand should be next.
+    """The next goal of a hand.
 
     Attributes:
         position: f64 [3] of the grip site, m.

@@ -103,7 +103,7 @@ def _go_round(heading: np.ndarray, offset: np.ndarray, goal: np.ndarray) -> np.n
 
 
 def _closest(start: np.ndarray, end: np.ndarray) -> float:
-    """How near the way from ``start`` to ``end`` comes to the origin."""
+    """Return the distance of the segment from ``start`` to ``end`` from the origin."""
     way = end - start
     along = np.clip(-(start @ way) / max(float(way @ way), 1e-12), 0.0, 1.0)
     return float(np.linalg.norm(start + along * way))

@@ -101,7 +101,7 @@ class Disturbance:
         return -1.0
 
     def _missing(self, clean: np.ndarray, present: np.ndarray) -> bool:
-        """Whether the fingers are being closed on nothing: once begun, it goes on for the steps drawn."""
+        """Tell whether the fingers are being closed on nothing: once begun, it goes on for the steps drawn."""
         near = clean[6] < 0 and np.linalg.norm(clean[:3] - present) < _MISS_NEAR
         return self._missed_steps < self._miss_steps and bool(self._missed_steps or near)
 

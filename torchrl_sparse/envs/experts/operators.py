@@ -1,4 +1,4 @@
-"""Who demonstrates: the skill of a scripted operator, and how one episode of it is drawn.
+"""Operators: the skill of a scripted demonstrator, and the style that is drawn for an episode.
 
 ``proficient`` is one consistent skilled operator, ``mixed`` six of three skills: scripted counterparts of the
 proficient-human and multi-human data of robomimic (arXiv:2108.03298). ``recovering`` is the first of them with mishaps in most
@@ -49,7 +49,7 @@ class Operator:
     miss: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> Style:
-        """How this operator acts in one episode."""
+        """Draw the style of one episode."""
         sides = rng.choice([-1.0, 1.0], size=2)
         return Style(
             reach=rng.uniform(*self.reach),

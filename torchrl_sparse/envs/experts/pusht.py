@@ -99,7 +99,7 @@ class PushTExpert:
         return best
 
     def _candidates(self, position: np.ndarray, angle: float):
-        """Where pushes may begin and their unit directions."""
+        """Return the points where pushes may begin, and their unit directions."""
         turn = _rotation(angle)
         for start, end in zip(_CORNERS, np.roll(_CORNERS, -1, axis=0), strict=True):
             edge = end - start

@@ -187,13 +187,13 @@ def around(hole: np.ndarray) -> bool:
 
 
 def over_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where the hole's centre should be next on its way to the hook's upturned end; see `along_hook`."""
+    """Return the next goal of the hole's centre on its way to the hook's upturned end; see `along_hook`."""
     misfit = max(0.0, float(np.hypot(hole[0], hole[1])) - 0.003)
     return np.array([0.0, 0.0, min(0.01 + 10.0 * misfit, 0.05)]), float(_PITCHES[0])
 
 
 def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where the hole's centre should be next on its way down the hook's end and inward along its arm.
+    """Return the next goal of the hole's centre on its way down the hook's end and inward along its arm.
 
     The hole is 19 mm wide and the hook 20 mm high, so the tool cannot be slid over it level: its axis turns from
     near the upturned end's direction to near the arm's.

@@ -59,7 +59,7 @@ _HOMES = np.array([[0.0, -0.35, 1.12], [0.0, 0.24, 1.15]])  # m, where a hand wa
 
 @dataclass(frozen=True)
 class Hammer:
-    """How the hammer lies.
+    """Pose of the lying hammer.
 
     Attributes:
         middle: f64 [3] m, of its handle.

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable
 
 from torchrl_sparse.methods.diffusion import METHODS
+from torchrl_sparse.methods.vla import TOKEN_METHODS
 
 __all__ = ["OTHER_COLORS", "REUSED_COLOR", "TYPE_COLORS", "method_colors"]
 
@@ -23,11 +24,21 @@ OTHER_COLORS = (
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """Give every method a colour: that of `METHODS`, the same one in every figure, or one that is left.
+    """Give every method a colour: that of its table, the same one in every figure, or one that is left.
 
-    >>> method_colors(["mine", "bac"])
-    {'mine': '#009E73', 'bac': '#0072B2'}
+    A method is looked up without what follows ``@``; of several that differ in that alone, the first has the table's colour.
+
+    >>> method_colors(["mine", "bac", "fastv@0.3", "fastv@0.5"])
+    {'mine': '#009E73', 'bac': '#0072B2', 'fastv@0.3': '#4D4D4D', 'fastv@0.5': '#8C6BB1'}
     """
-    others = itertools.cycle(OTHER_COLORS)
-    known = {name: method.color for name, method in METHODS.items()}
-    return {name: known.get(name) or next(others) for name in methods}
+    methods, known = (
+        list(methods),
+        {name: method.color for name, method in {**TOKEN_METHODS, **METHODS}.items()},
+    )
+    named: dict[str, str] = {}
+    for name in methods:
+        color = known.get(name.partition("@")[0])
+        if color is not None and color not in named.values():
+            named[name] = color
+    left = itertools.cycle(color for color in OTHER_COLORS if color not in named.values())
+    return {name: named.get(name) or next(left) for name in methods}

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
-from torchrl_sparse.training.vla.token_budget import TokenBudget
+from torchrl_sparse.tokens.budget import TokenBudget
 
 __all__ = ["draw_tokens", "plot_control", "plot_token_budget", "plot_token_strip", "plot_tokens_per_layer"]
 

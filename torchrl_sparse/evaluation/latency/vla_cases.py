@@ -23,7 +23,7 @@ from torchrl_sparse.networks.vla.hooks import LayerState
 from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
-from torchrl_sparse.policies.vla.policy import VLAPolicy, with_pruner
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 
@@ -81,10 +81,10 @@ class VLACase:
     def __init__(self, policy: VLAPolicy, pruners: dict[str, TokenPruner | None]):
         self.network = policy.network
         first, second = _queries(policy)
-        self._dense = with_pruner(policy, None), second
+        self._dense = policy.with_pruner(None), second
         self.policies, self.queries = {}, {}
         for name, pruner in pruners.items():
-            self.policies[name] = with_pruner(policy, pruner)
+            self.policies[name] = policy.with_pruner(pruner)
             answered = self.policies[name](first.clone(recurse=False))
             remembered = answered.select(*self.policies[name].in_keys, strict=False)
             self.queries[name] = remembered.update(second)
@@ -107,7 +107,7 @@ class VLACase:
         return {
             "vision towers": lambda: network.vision(images),
             "projector": lambda: network.projector(features),
-            "decoder layers": lambda: network.decoder(sequence, TokenPruner()),
+            "decoder layers": lambda: network.decoder(sequence),
             "action head": lambda: network.head(readout),
         }
 
@@ -189,7 +189,7 @@ class _Watch(TokenPruner):
 def _watched(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Watch:
     """What ``pruner`` did in a query of this model."""
     watch = _Watch(pruner)
-    with_pruner(policy, watch)(query.clone(recurse=False))
+    policy.with_pruner(watch)(query.clone(recurse=False))
     return watch
 
 

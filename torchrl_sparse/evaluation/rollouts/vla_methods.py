@@ -1,10 +1,8 @@
-"""The methods of a vision-language-action benchmark by name, and the queries on which they are compared."""
+"""The methods of a vision-language-action benchmark on the same queries: matched in tokens, asked in mid-episode."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -13,111 +11,30 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
-from torchrl_sparse.control.action_aware import ActionAwareController
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, settings_of
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.tokens import (
-    EfficientVLAPruner,
-    FastVPruner,
-    FrameDifferencePruner,
-    RandomPruner,
-    SparseVLMPruner,
-    SpecPrune,
-    VLACachePruner,
-)
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import replay
 
-__all__ = ["TokenMethod", "matching_share", "mid_episode_query", "seen_images"]
+__all__ = ["matching_share", "method_identity", "mid_episode_query", "seen_images"]
 
-DENSE = "dense"
-_SPECPRUNE = {
-    "specprune": {},
-    "specprune_uncontrolled": {},
-    "specprune_static": {"dynamic": False},
-}
-# Each takes one number first: the share of the visual tokens that it keeps or, the last two, of what its own rule drops.
-_BASELINES: Mapping[str, Callable[..., TokenPruner]] = {
-    "fastv": FastVPruner,
-    "random": RandomPruner,
-    "frame_difference": FrameDifferencePruner,
-    "efficientvla": EfficientVLAPruner,
-    "vla_cache": VLACachePruner,
-    "sparsevlm": SparseVLMPruner,
-}
-_MATCHED = ("fastv", "random", "frame_difference", "efficientvla")
 _HALVINGS = 10
 
 
-@dataclass(frozen=True)
-class TokenMethod:
-    """A method as it is written: ``NAME``, ``NAME@NUMBER``, or ``NAME@OTHER`` for as many tokens as another method kept.
+def method_identity(text: str, number: float | None, policy: VLAPolicy, settings: Settings) -> dict[str, Any]:
+    """Return what tells the episodes of one method from others', as JSON values for an `EpisodeLog`.
 
-    Attributes:
-        name: ``dense``; ``specprune``, with the controller; its ablations ``specprune_uncontrolled`` (static and dynamic
-            pruning) and ``specprune_static``; or a baseline: ``fastv``, ``random``, ``frame_difference``, ``efficientvla``,
-            ``vla_cache``, ``sparsevlm``.
-        number: SpecPrune's alpha, or the baseline's first argument; None for its default.
-        like: the method whose tokens are matched.
-
-    Examples:
-        >>> TokenMethod.parse("fastv@0.3")
-        TokenMethod(name='fastv', number=0.3, like=None)
-        >>> TokenMethod.parse("random@specprune").like
-        'specprune'
+    Args:
+        text: the method, see `torchrl_sparse.methods.vla`.
+        number: that its pruner was made with.
+        policy: whose weights answered.
+        settings: sections that its pruner was made with.
     """
-
-    name: str
-    number: float | None = None
-    like: str | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> TokenMethod:
-        """Raises ValueError unless ``text`` is written as above."""
-        name, at, rest = text.partition("@")
-        names = (DENSE, *_SPECPRUNE, *_BASELINES)
-        if name not in names or (at and name == DENSE):
-            raise ValueError(f"methods: expected one of {', '.join(names)}, or NAME@NUMBER, got {text!r}")
-        if not at:
-            return cls(name)
-        if re.fullmatch(r"\d*\.?\d+", rest):
-            return cls(name, number=float(rest))
-        if name in _MATCHED and rest.partition("@")[0] in names:
-            return cls(name, like=rest)
-        raise ValueError(
-            f"methods: expected {name}@NUMBER{f' or {name}@METHOD' if name in _MATCHED else ''}, got {text!r}"
-        )
-
-    def pruner(
-        self, number: float | None = None, options: Mapping[str, Any] | None = None
-    ) -> TokenPruner | None:
-        """What prunes.
-
-        Args:
-            number: takes the place of `number`, for methods that match another.
-            options: of SpecPrune, see `SpecPruneOptions`; other methods do not read them.
-        """
-        number = self.number if number is None else number
-        if self.name == DENSE:
-            return None
-        if self.name in _SPECPRUNE:
-            alpha = {} if number is None else {"alpha": number}
-            return SpecPrune(**{**(options or {}), **_SPECPRUNE[self.name], **alpha})
-        return _BASELINES[self.name](*([] if number is None else [number]))
-
-    def executor(self, policy: VLAPolicy, n_action_steps: int) -> ChunkExecutor:
-        """``policy`` under this method's controller, if it has one."""
-        controller = ActionAwareController() if self.name == "specprune" else None
-        return ChunkExecutor(policy, n_action_steps, controller)
-
-
-def method_identity(
-    text: str, number: float | None, policy: VLAPolicy, options: Mapping[str, Any]
-) -> dict[str, Any]:
-    """What makes the episodes of one method its own, as JSON values for an `EpisodeLog`."""
-    fixed = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
-    return fixed | ({"options": dict(options)} if TokenMethod.parse(text).name in _SPECPRUNE else {})
+    identity = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
+    if TOKEN_METHODS[TokenMethodName.parse(text).name].settings is not None:
+        identity["options"] = settings_of(text, settings)
+    return identity
 
 
 def matching_share(
@@ -126,7 +43,7 @@ def matching_share(
     episodes: Iterable[Sequence[TensorDictBase]],
     kept: float,
 ) -> float:
-    """The share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all queries.
+    """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all queries.
 
     Args:
         make: called with a share in (0, 1]; more of it keeps more.
@@ -154,7 +71,7 @@ def matching_share(
 
 @torch.no_grad()
 def mid_episode_query(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> TensorDictBase:
-    """The middle one of an episode's queries, [], with what the policy remembers of those before."""
+    """Return the middle one of an episode's queries, [], with what the policy remembers of those before."""
     last = len(queries) // 2
     answers = replay(policy, queries[: last + 1], policy.pruner)
     remembered = [key for key in policy.out_keys if key in policy.in_keys]
@@ -163,7 +80,7 @@ def mid_episode_query(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> T
 
 
 def seen_images(policy: VLAPolicy, step: TensorDictBase) -> Tensor:
-    """u8 [V, 3, h, w] of one step, cropped as the network sees them."""
+    """Return the images of one step, u8 [V, 3, h, w], cropped as for the network."""
     config = policy.network.config
     images = torch.stack([keys.read(step, camera) for camera in config.cameras])
     return center_crop(images, config.crop_area)

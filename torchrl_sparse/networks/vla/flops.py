@@ -1,7 +1,7 @@
 """Floating-point operations of a vision-language-action model: 2 * MAC of all matrix products, from its sizes.
 
 Counted are linear layers, patch embeddings and both products of attention (each of the S tokens with each, since nothing is
-causal); not counted are norms, activations, softmax, additions and embeddings looked up. The decoder has no vocabulary
+causal); not counted are norms, activations, softmax, additions and the lookup of embeddings. The decoder has no vocabulary
 projection, as its read-outs go to the action head. With S tokens a layer of width d and feed-forward width m is::
 
     2 * S * (4 * d**2 + 3 * d * m) + 4 * d * S**2

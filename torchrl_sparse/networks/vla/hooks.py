@@ -1,4 +1,4 @@
-"""What a vision-language-action model shows between its decoder's layers, and what it lets others decide there.
+"""The interface between a vision-language-action model's decoder and a method that reads or prunes its tokens.
 
 The decoder calls one `LayerHooks` object around every layer::
 
@@ -141,7 +141,7 @@ class LayerState:
 
 
 class LayerHooks:
-    """What the decoder calls around its layers; this one changes nothing, which is the dense model."""
+    """Base of the objects that the decoder calls around its layers; this one changes nothing, which is the dense model."""
 
     def layers_scored(self, num_layers: int) -> set[int]:
         """Return the decoder layers that compute ``state.scores``; each costs a softmax of the chosen rows over all tokens."""

@@ -1,4 +1,4 @@
-"""Converts a published checkpoint to the files that `DiffusionPolicy.from_pretrained` reads.
+"""Convert a published checkpoint to the files that `DiffusionPolicy.from_pretrained` reads.
 
     python -m torchrl_sparse.policies.diffusion.convert "epoch=0650-test_mean_score=1.000.ckpt" policies/lift
 
@@ -15,7 +15,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command and return its exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_sparse.policies.diffusion.convert",
         description="Converts a published Diffusion Policy checkpoint. Nothing in it is executed.",

@@ -1,4 +1,4 @@
-"""What a policy observes as the denoiser's condition: normalised states, with features of the cameras before them."""
+"""Observations as the denoiser's condition: normalised states, with features of the cameras before them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
 
 class ConditionEncoder(nn.Module):
-    """The condition f32 [*B, To, D] of what a TensorDict observes; D is the features' size and the state's together.
+    """Computes the condition f32 [*B, To, D] of observations; D is the features' size and the state's together.
 
     Args:
         normalizer: of states.
         vision: encoder of the cameras; None reads the state alone.
 
     Attributes:
-        in_keys: what it reads: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
+        in_keys: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
             u8 [*B, To, 3, h, w] of each camera.
     """
 
@@ -36,7 +36,7 @@ class ConditionEncoder(nn.Module):
             self.in_keys += [keys.history(name) for name in vision.cameras]
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
-        """Encodes one batch.
+        """Encode one batch.
 
         Raises:
             KeyError: if an observation is missing.

@@ -41,6 +41,9 @@ class DiffusionPolicy(TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
+    Weights may change at any time, by training, ``load_state_dict`` or a move: the next query sees it. Only after writing
+    to a part of a tensor through ``.data``, which PyTorch does not record, call `refresh`.
+
     Args:
         network: the denoiser.
         normalizer: of states and actions.
@@ -243,6 +246,8 @@ class DiffusionPolicy(TensorDictSequential):
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
         """Read what `save_pretrained` wrote, to run in ``engine``. Nothing in the files is executed.
+
+        Whoever then writes to weights through ``.data`` calls `refresh` afterwards.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.

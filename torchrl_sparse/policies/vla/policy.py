@@ -25,7 +25,7 @@ from torchrl_sparse.storage.published.openvla_oft import read_openvla_oft
 from torchrl_sparse.storage.vla import StoredVLA, read_vla, write_vla
 from torchrl_sparse.tokens.base import TokenPruner
 
-__all__ = ["VLAPolicy", "with_pruner"]
+__all__ = ["VLAPolicy"]
 
 
 class VLAPolicy(VLAWrapperBase):
@@ -42,7 +42,8 @@ class VLAPolicy(VLAWrapperBase):
         tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
 
     Attributes:
-        pruner: the `TokenPruner`. Assign another to change the method: ``vla.pruner = pruner``; None is dense.
+        pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense
+            policy.
 
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
@@ -93,6 +94,16 @@ class VLAPolicy(VLAWrapperBase):
     def pruner(self) -> TokenPruner | None:
         """The method that drops visual tokens; None is dense."""
         return self._pruner
+
+    def with_pruner(self, pruner: TokenPruner | None) -> VLAPolicy:
+        """Return a policy of the same network under another pruner.
+
+        Raises:
+            ValueError: if the pruner does not fit the network.
+        """
+        policy = VLAPolicy(self.network, self.normalizer, self.tokenizer)
+        policy.pruner = pruner
+        return policy
 
     def __setattr__(self, name: str, value: Any) -> None:
         # nn.Module registers any module that is assigned, so a property with a setter never sees a pruner that is one.
@@ -232,10 +243,3 @@ class VLAPolicy(VLAWrapperBase):
     @classmethod
     def _assemble(cls, stored: StoredVLA) -> VLAPolicy:
         return cls(stored.network, stored.normalizer, stored.tokenizer)
-
-
-def with_pruner(policy: VLAPolicy, pruner: TokenPruner | None) -> VLAPolicy:
-    """Return the same model under another method, None for dense; ``policy`` stays as it is."""
-    other = VLAPolicy(policy.network, policy.normalizer, policy.tokenizer)
-    other.pruner = pruner
-    return other

@@ -30,7 +30,7 @@ KNOWN_NAMES = {
     **dict.fromkeys(["typing.Any", *_TYPES]),
     **{f"dill.{module}._load_type": Name for module in ("_dill", "dill")},
 }
-"""What a pickled configuration mentions, for `read_pickle`."""
+"""Classes that a pickled configuration may name, for `read_pickle`."""
 
 _REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 _MAX_DEPTH = 32

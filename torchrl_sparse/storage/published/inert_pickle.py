@@ -26,14 +26,14 @@ class Name:
 
 @dataclass
 class Record:
-    """What a pickle says about an object of a class that is not made: the fields of its state."""
+    """Stands for an object whose class is never made: the fields of its state."""
 
     name: str
     state: dict = field(default_factory=dict)
 
 
 def _encode(text: str, encoding: str) -> bytes:
-    """How protocol 2 spells bytes."""
+    """Decode bytes as protocol 2 spells them."""
     if encoding != "latin1":
         raise ValueError(f"expected bytes spelled in latin1, got {encoding!r}")
     return text.encode("latin1")

@@ -23,7 +23,8 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
-from torchrl_sparse.storage.files import read_json, read_tensors
+from torchrl_sparse.storage.files import read_tensors
+from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
 from torchrl_sparse.storage.vla import StoredVLA
 
@@ -81,10 +82,9 @@ def read_openvla_oft(
 
 
 def _image_size(path: Path) -> int:
-    config = read_json(path)
-    if not isinstance(config, dict) or config.get("model_type") != "openvla":
-        found = config.get("model_type") if isinstance(config, dict) else type(config).__name__
-        raise ValueError(f"{path}: model_type: expected 'openvla', got {found!r}")
+    config = read_json(path, dict[str, Any])
+    if config.get("model_type") != "openvla":
+        raise ValueError(f"{path}: model_type: expected 'openvla', got {config.get('model_type')!r}")
     text = config.get("text_config", {})
     for name, value in _FIXED_TEXT.items():
         if text.get(name, value) != value:
@@ -97,7 +97,7 @@ def _image_size(path: Path) -> int:
 
 def _read_shards(path: Path) -> dict[str, Tensor]:
     index = path / "model.safetensors.index.json"
-    weight_map = read_json(index).get("weight_map") or {}
+    weight_map = read_json(index, dict[str, Any]).get("weight_map") or {}
     shards = sorted({*weight_map.values()})
     if not shards or any(Path(name).name != name for name in shards):
         raise ValueError(f"{index}: weight_map: expected file names in this folder, got {shards}")
@@ -125,7 +125,7 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
 
 
 def _statistics(path: Path, unnorm_key: str | None) -> dict[str, Any]:
-    every = read_json(path)
+    every = read_json(path, dict[str, dict[str, Any]])
     wanted = [unnorm_key, f"{unnorm_key}_no_noops"] if unnorm_key is not None else list(every)
     found = [name for name in wanted if name in every]
     if not found or (unnorm_key is None and len(found) > 1):

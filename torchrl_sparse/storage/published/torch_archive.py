@@ -98,7 +98,7 @@ class TorchArchive:
         self._zip.close()
 
     def contents(self, known: Mapping[str, Callable[..., Any] | None] = PLAIN) -> Any:
-        """What was saved, with a `StoredTensor` in the place of each tensor.
+        """Return the saved object with a `StoredTensor` in the place of each tensor.
 
         Args:
             known: names that the pickle may mention besides those of tensors, see `read_pickle`.

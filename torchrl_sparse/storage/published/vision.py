@@ -25,7 +25,7 @@ _RENAMED = ((r"^nets\.0\.nets\.", "trunk."), (r"^nets\.1\.nets\.", "keypoints.")
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """What a published image policy observes.
+    """Observations of a published image policy.
 
     Attributes:
         order: robomimic's name -> size in the condition, in the published order.
@@ -68,7 +68,7 @@ class ImageLayout:
         return cls(order, cameras, states, size[1:])
 
     def columns(self) -> list[int]:
-        """Where each number of the condition here, cameras first, lies in the published one."""
+        """Indices, in the published condition, of each number of the condition here, cameras first."""
         first, places = 0, {}
         for key, size in self.order.items():
             places[key] = range(first, first + size)

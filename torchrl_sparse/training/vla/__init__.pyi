@@ -1,2 +1,1 @@
-from .token_budget import TokenBudget as TokenBudget
 from .trainer import VLATrainer as VLATrainer

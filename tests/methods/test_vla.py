@@ -1,0 +1,78 @@
+"""The table of token methods: names that are written, pruners that are made, and a method registered from outside."""
+
+import pytest
+import torch
+
+from torchrl_sparse.methods.vla import TOKEN_METHODS, TokenMethod, check_matches, make_controller, make_pruner
+from torchrl_sparse.tokens.base import TokenPruner
+
+
+def test_names_make_pruners():
+    assert make_pruner("dense") is None
+    assert make_pruner("specprune@0.4").options.alpha == 0.4
+    assert not make_pruner("specprune_static").options.dynamic
+    gentle = {"specprune": {"keep_share": 0.9, "dynamic": True}}
+    options = make_pruner("specprune_static@0.4", settings=gentle).options
+    assert (options.keep_share, options.dynamic, options.alpha) == (0.9, False, 0.4)
+    assert make_pruner("random@0.25", settings=gentle).share == 0.25
+    assert make_pruner("vla_cache@0.5").static_share == 0.5
+    assert make_pruner("fastv@specprune", number=0.125).share == 0.125
+
+
+def test_specprune_alone_runs_with_a_controller():
+    assert [name for name in TOKEN_METHODS if make_controller(name) is not None] == ["specprune"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("fastw", "one of dense, specprune, .*"),
+        ("dense@0.5", "dense"),
+        ("fastv@", "fastv or fastv@NUMBER or fastv@METHOD"),
+        ("fastv@-1", "fastv or fastv@NUMBER or fastv@METHOD"),
+        ("sparsevlm@specprune", "sparsevlm or sparsevlm@NUMBER"),
+        ("specprune@fastv", "specprune or specprune@NUMBER"),
+    ],
+)
+def test_other_names_are_refused(text, expected):
+    with pytest.raises(ValueError, match=f"methods: expected {expected}, got '{text}'"):
+        make_pruner(text)
+
+
+def test_a_match_of_a_match_is_refused():
+    check_matches(["specprune@0.4", "fastv@specprune@0.4"])
+    with pytest.raises(ValueError, match=r"expected one of dense, specprune after @, got 'fastv@specprune'"):
+        check_matches(["dense", "specprune", "fastv@specprune", "random@fastv@specprune"])
+
+
+class KeepFirst(TokenPruner):
+    """Keeps the first visual tokens, after the first layer."""
+
+    def __init__(self, share=0.5):
+        self.share = share
+
+    def after_layer(self, index, state):
+        if index:
+            return None
+        keep = torch.arange(state.num_visual) < round(self.share * state.num_visual)
+        return state.keep_visual(keep.expand(len(state.hidden), -1))
+
+
+@torch.no_grad()
+def test_a_method_from_outside_is_one_line(monkeypatch):
+    """Its pruner drops what it says in a policy, at the number that is written and at one that matches another method."""
+    pytest.importorskip("transformers")
+    from tests.tokens.helpers import LAYERS, make_policy, query
+    from torchrl_sparse import keys
+    from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
+
+    monkeypatch.setitem(TOKEN_METHODS, "mine", TokenMethod(KeepFirst, "share", matches=True))
+    policy = make_policy(make_pruner("mine@0.25"))
+    depth = policy(query(1))[keys.TOKEN_DEPTH][0]
+    assert depth.tolist() == [LAYERS] * 8 + [1] * 24
+    check_matches(["specprune", "mine@specprune"])
+    dense, episodes = make_policy(), [[query(1)[0]]]
+    share = matching_share(lambda share: make_pruner("mine@specprune", number=share), dense, episodes, 12.0)
+    assert dense.with_pruner(make_pruner("mine", number=share))(query(1))[keys.KEPT] == pytest.approx(
+        12.0, abs=1
+    )

@@ -1,0 +1,173 @@
+"""The methods of a vision-language-action policy by name: pruner, controller, and colour in figures.
+
+A method is written ``NAME``, ``NAME@NUMBER`` or ``NAME@METHOD``. NAME is a key of :data:`TOKEN_METHODS`; NUMBER is the argument
+that the method is tuned by, such as SpecPrune's alpha or the share of tokens that stays; METHOD is another method, of which as
+many tokens are kept: ``fastv@specprune@0.4``.
+
+A method of one's own is one line, executed before its name is used::
+
+    TOKEN_METHODS["mine"] = TokenMethod(MyPruner, number="share")
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.tokens.base import TokenPruner
+from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
+from torchrl_sparse.tokens.fastv import FastVPruner
+from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
+from torchrl_sparse.tokens.random import RandomPruner
+from torchrl_sparse.tokens.sparsevlm import SparseVLMPruner
+from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.tokens.vla_cache import VLACachePruner
+
+__all__ = [
+    "TOKEN_METHODS",
+    "TokenMethod",
+    "TokenMethodName",
+    "check_matches",
+    "make_controller",
+    "make_pruner",
+]
+
+Settings = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class TokenMethod:
+    """One entry of the table: how a method is made, controlled and drawn.
+
+    Attributes:
+        make: called with keyword arguments; returns the pruner, or None for the dense policy.
+        number: the argument of ``make`` that NAME@NUMBER sets; None where there is none.
+        matches: whether NAME@METHOD may be written: its number is a share in (0, 1], of which more keeps more tokens.
+        settings: the section of a benchmark's settings whose entries are further arguments of ``make``; None for none.
+        controller: returns what a `ChunkExecutor` runs at every step beside the policy; None for nothing.
+        color: in figures, such as ``"#0072B2"``; None takes what is left.
+    """
+
+    make: Callable[..., TokenPruner | None]
+    number: str | None = None
+    matches: bool = False
+    settings: str | None = None
+    controller: Callable[[], TensorDictModuleBase] | None = None
+    color: str | None = None
+
+
+def _dense() -> None:
+    return None
+
+
+def _static_specprune(**options: Any) -> SpecPrune:
+    return SpecPrune(**{**options, "dynamic": False})
+
+
+TOKEN_METHODS: dict[str, TokenMethod] = {
+    "dense": TokenMethod(_dense, color="#333333"),
+    "specprune": TokenMethod(
+        SpecPrune, "alpha", settings="specprune", controller=ActionAwareController, color="#009E73"
+    ),
+    "specprune_uncontrolled": TokenMethod(SpecPrune, "alpha", settings="specprune", color="#8C6BB1"),
+    "specprune_static": TokenMethod(_static_specprune, "alpha", settings="specprune", color="#A6761D"),
+    "frame_difference": TokenMethod(FrameDifferencePruner, "share", matches=True, color="#B2182B"),
+    "fastv": TokenMethod(FastVPruner, "share", matches=True, color="#4D4D4D"),
+    "random": TokenMethod(RandomPruner, "share", matches=True, color="#66A61E"),
+    "efficientvla": TokenMethod(EfficientVLAPruner, "share", matches=True, color="#E7298A"),
+    "vla_cache": TokenMethod(VLACachePruner, "static_share", color="#1B7F79"),
+    "sparsevlm": TokenMethod(SparseVLMPruner, "scale", color="#BCBD22"),
+}
+"""Name -> method. ``specprune`` runs with the controller; ``specprune_uncontrolled`` (static and dynamic pruning) and
+``specprune_static`` are its ablations."""
+
+
+@dataclass(frozen=True)
+class TokenMethodName:
+    """A method as it is written: ``NAME``, ``NAME@NUMBER`` or ``NAME@METHOD``.
+
+    Attributes:
+        name: key of :data:`TOKEN_METHODS`.
+        number: see the module; None for the method's default.
+        like: the method whose tokens are matched, as it is written; None for none.
+    """
+
+    name: str
+    number: float | None = None
+    like: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> TokenMethodName:
+        """Raise ValueError unless ``text`` is written as above.
+
+        >>> TokenMethodName.parse("fastv@0.3")
+        TokenMethodName(name='fastv', number=0.3, like=None)
+        >>> TokenMethodName.parse("random@specprune@0.4").like
+        'specprune@0.4'
+        """
+        name, at, rest = text.partition("@")
+        method = TOKEN_METHODS.get(name)
+        if method is None:
+            raise ValueError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}")
+        if not at:
+            return cls(name)
+        if method.number is not None and re.fullmatch(r"\d*\.?\d+", rest):
+            return cls(name, number=float(rest))
+        if method.matches and rest.partition("@")[0] in TOKEN_METHODS:
+            return cls(name, like=rest)
+        forms = [name, *([f"{name}@NUMBER"] if method.number else []), *([f"{name}@METHOD"] * method.matches)]
+        raise ValueError(f"methods: expected {' or '.join(forms)}, got {text!r}")
+
+
+def check_matches(texts: Iterable[str]) -> None:
+    """Raise ValueError if a method matches one that is not among ``texts``, or that matches another itself.
+
+    >>> check_matches(["dense", "fastv@specprune"])
+    Traceback (most recent call last):
+    ...
+    ValueError: methods: fastv@specprune: expected one of dense after @, got 'specprune'
+    """
+    like = {text: TokenMethodName.parse(text).like for text in texts}
+    plain = [text for text, matched in like.items() if matched is None]
+    for text, matched in like.items():
+        if matched is not None and matched not in plain:
+            raise ValueError(f"methods: {text}: expected one of {', '.join(plain)} after @, got {matched!r}")
+
+
+def make_pruner(
+    text: str, *, number: float | None = None, settings: Settings | None = None
+) -> TokenPruner | None:
+    """Return the pruner of a method, None for the dense policy.
+
+    Args:
+        text: the method, as the module says.
+        number: takes the place of the one that is written, where another method is matched.
+        settings: sections of further arguments, see `TokenMethod`.
+
+    Examples:
+        >>> make_pruner("specprune@0.8", settings={"specprune": {"budget": 20.0}}).options.alpha
+        0.8
+    """
+    written = TokenMethodName.parse(text)
+    number = written.number if number is None else number
+    arguments = settings_of(text, settings)
+    if number is not None:
+        arguments[TOKEN_METHODS[written.name].number] = number
+    return TOKEN_METHODS[written.name].make(**arguments)
+
+
+def make_controller(text: str) -> TensorDictModuleBase | None:
+    """Return the controller of a method, None where it has none."""
+    make = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
+    return None if make is None else make()
+
+
+def settings_of(text: str, settings: Settings | None) -> dict[str, Any]:
+    """Return the section of ``settings`` that a method reads; empty where it reads none."""
+    section = TOKEN_METHODS[TokenMethodName.parse(text).name].settings
+    return dict((settings or {}).get(section, {}))
