@@ -8,6 +8,7 @@ asynchronous inference; real-time chunking (arXiv:2506.07339) blends the two chu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +17,6 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
-from torchrl_sparse.envs.tasks import Task
 from torchrl_sparse.rotations import quaternion_to_rot6d
 
 
@@ -47,7 +47,7 @@ class RealtimeExecutor(ChunkExecutor):
         >>> env = make_env("Lift", seeds=[7])
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> policy.sampler = Sampler("ddim", 10)
-        >>> actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift")), latency=0.1)
+        >>> actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices), latency=0.1)
         >>> env.rollout(3, actor)["control", "delay"].flatten().tolist()
         [2, 2, 2]
     """
@@ -118,14 +118,14 @@ class HoldPose(TensorDictModuleBase):
     """Writes the absolute action, [*B, 10 * arms], that keeps the hands where they are, fingers opened.
 
     Args:
-        task: tells where each arm's pose lies in the state.
+        pose_slices: where position and quaternion (xyzw) of each arm lie in ``("observation", "state")``; of a robosuite task,
+            `RobosuiteTask.pose_slices`.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl_sparse.envs.tasks import find_robosuite_task
         >>> state = torch.zeros(2, 19)
         >>> state[:, 13] = 1.0  # x of the quaternion: half a turn about x
-        >>> hold = HoldPose(find_robosuite_task("lift"))
+        >>> hold = HoldPose([(slice(10, 13), slice(13, 17))])
         >>> hold(TensorDict({"observation": {"state": state}}, [2]))["control", "hold"][0].tolist()
         [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0]
     """
@@ -133,12 +133,9 @@ class HoldPose(TensorDictModuleBase):
     in_keys = [keys.STATE]
     out_keys = [keys.HOLD]
 
-    def __init__(self, task: Task):
+    def __init__(self, pose_slices: Sequence[tuple[slice, slice]]):
         super().__init__()
-        self._poses = [
-            (task.state_slice(f"robot{arm}_eef_pos"), task.state_slice(f"robot{arm}_eef_quat_site"))
-            for arm in range(task.arms)
-        ]
+        self._poses = list(pose_slices)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         state = keys.read(tensordict, keys.STATE)

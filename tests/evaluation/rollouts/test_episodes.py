@@ -68,7 +68,7 @@ def test_another_identity_is_refused_and_the_file_left_alone(path):
 def test_a_foreign_file_is_refused_and_left_alone(path, content):
     path.parent.mkdir()
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"bac.jsonl:1: expected"):
+    with pytest.raises(ValueError, match=r"bac.jsonl:1: .*expected"):
         EpisodeLog(path, {"method": "bac"})
     assert path.read_bytes() == content
 
@@ -79,12 +79,12 @@ def test_damage_before_the_last_line_names_the_line(path):
     log.append(episode(1))
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], lines[1][:-9], lines[2]]) + "\n")
-    with pytest.raises(ValueError, match=r"bac.jsonl:2: expected a JSON object"):
+    with pytest.raises(ValueError, match=r"bac.jsonl:2: expected a complete JSON"):
         EpisodeLog(path)
     missing = json.loads(lines[1])
     del missing["queries"]
     path.write_text("\n".join([lines[0], json.dumps(missing)]) + "\n")
-    with pytest.raises(ValueError, match=r"bac.jsonl:2: expected the keys .*queries"):
+    with pytest.raises(ValueError, match=r"bac.jsonl:2: queries: expected"):
         EpisodeLog(path)
 
 

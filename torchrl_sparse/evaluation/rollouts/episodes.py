@@ -1,15 +1,15 @@
-"""What one evaluated episode leaves behind, and the log that survives a killed evaluation."""
+"""The result of an evaluated episode, sums over several, and the log that survives a killed evaluation."""
 
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
-
-_VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,6 @@ class EpisodeResult:
     latency: tuple[float, ...] = ()
     kept: tuple[float, ...] = ()
     fine: tuple[bool, ...] = ()
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> "EpisodeResult":
-        """Inverse of ``dataclasses.asdict``.
-
-        Raises:
-            ValueError: if keys are missing or unknown. What only policies with visual tokens have may be missing.
-        """
-        expected = {field.name for field in fields(cls)}
-        if not expected - {"kept", "fine"} <= set(data) <= expected:
-            raise ValueError(f"expected the keys {sorted(expected)}, got {sorted(data)}")
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
 
 
 @dataclass(frozen=True)
@@ -122,6 +110,12 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
+@dataclass(frozen=True)
+class _Header:
+    episode_log: Literal[1]
+    identity: dict[str, Any]
+
+
 class EpisodeLog:
     """Append-only JSON-lines file of :class:`EpisodeResult`, one per seed, safe against a kill at any moment.
 
@@ -150,20 +144,20 @@ class EpisodeLog:
         self.identity = dict(identity or {})
         self.episodes: dict[int, EpisodeResult] = {}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        header = {"episode_log": _VERSION, "identity": self.identity}
+        header = asdict(_Header(1, self.identity))
         content = self.path.read_bytes() if self.path.exists() else b""
         if (json.dumps(header) + "\n").encode().startswith(content):
             # A new log, or one killed while its header was written.
             self.path.write_bytes(b"")
             self._write(header)
             return
-        # What follows the last newline is torn; it is cut off only once the header has shown whose file
-        # this is.
+        # What follows the last newline is torn; it is cut off only once the header has shown whose file this is.
         whole = content[: content.rfind(b"\n") + 1] or content
-        lines = whole.decode("utf-8").splitlines()
-        self._check_header(self._parse(lines[0], 1))
-        for number, line in enumerate(lines[1:], start=2):
-            self._add(self._parse(line, number), number)
+        first, *lines = whole.splitlines()
+        self._check_identity(parse_json(first, _Header, f"{self.path}:1"))
+        for number, line in enumerate(lines, start=2):
+            episode = parse_json(line, EpisodeResult, f"{self.path}:{number}")
+            self.episodes.setdefault(episode.seed, episode)
         os.truncate(self.path, len(whole))
 
     def append(self, episode: EpisodeResult) -> None:
@@ -187,27 +181,7 @@ class EpisodeLog:
             file.flush()
             os.fsync(file.fileno())
 
-    def _parse(self, line: str, number: int) -> dict[str, Any]:
-        try:
-            data = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{self.path}:{number}: expected a JSON object, got {line[:80]!r}") from error
-        if not isinstance(data, dict):
-            raise ValueError(f"{self.path}:{number}: expected a JSON object, got {type(data).__name__}")
-        return data
-
-    def _check_header(self, header: Mapping[str, Any]) -> None:
-        if header.get("episode_log") != _VERSION:
-            found = header.get("episode_log")
-            raise ValueError(f"{self.path}:1: expected an episode log of version {_VERSION}, got {found!r}")
-        found = header.get("identity")
+    def _check_identity(self, header: _Header) -> None:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
-        if found != json.loads(json.dumps(self.identity)):
-            raise ValueError(f"{self.path}: holds episodes of {found}, expected {self.identity}")
-
-    def _add(self, data: Mapping[str, Any], number: int) -> None:
-        try:
-            episode = EpisodeResult.from_json(data)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{self.path}:{number}: {error}") from error
-        self.episodes.setdefault(episode.seed, episode)
+        if header.identity != json.loads(json.dumps(self.identity)):
+            raise ValueError(f"{self.path}: holds episodes of {header.identity}, expected {self.identity}")

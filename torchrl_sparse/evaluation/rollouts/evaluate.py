@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.runtime.progress import progress
 
-__all__ = ["evaluate", "success_rate"]
+__all__ = ["episode_log", "evaluate", "success_rate"]
 
 
 def evaluate(
@@ -41,14 +42,14 @@ def evaluate(
     Raises:
         As `rollout_episodes`.
     """
-    with tqdm(total=len(seeds), unit="episode", desc=f"{name:>14}") as bar:
+    with progress(name, "episode", len(seeds)) as show:
         return rollout_episodes(
             actor,
             make_env,
             seeds,
             results_file=log,
             identity=identity,
-            on_episode=lambda _, done, total: bar.update(done - bar.n),
+            on_episode=lambda _, done, total: show(done, total),
             **options,
         )
 
@@ -60,3 +61,14 @@ def success_rate(episodes: Sequence[EpisodeResult]) -> float:
     0.5
     """
     return sum(episode.success for episode in episodes) / len(episodes)
+
+
+def episode_log(out: str | os.PathLike, name: str, dense_log: str | os.PathLike | None = None) -> Path:
+    """Return the path of a method's log in the folder ``out``; ``dense_log`` takes the place of that of ``"dense"``.
+
+    >>> episode_log("outputs/lift", "bac").as_posix()
+    'outputs/lift/episodes/bac.jsonl'
+    """
+    if name == "dense" and dense_log is not None:
+        return Path(dense_log)
+    return Path(out) / "episodes" / f"{name}.jsonl"

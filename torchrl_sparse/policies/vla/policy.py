@@ -88,6 +88,16 @@ class VLAPolicy(VLAWrapperBase):
         self.pruner = None
         self.eval()
 
+    # -- the shape of a query ------------------------------------------------------------------------------------------
+
+    n_obs_steps = 1
+    num_inference_steps = 1
+
+    @property
+    def horizon(self) -> int:
+        """Actions of a chunk."""
+        return self.network.config.chunk_size
+
     # -- the pruner ----------------------------------------------------------------------------------------------------
 
     @property

@@ -1,0 +1,5 @@
+"""Benchmarks: from episodes, timed queries and errors of every method to results, figures and films."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

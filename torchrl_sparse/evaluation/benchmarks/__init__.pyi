@@ -1,0 +1,15 @@
+from .diffusion import (
+    draw_methods as draw_methods,
+    make_methods as make_methods,
+    measure_methods as measure_methods,
+    settle_rates as settle_rates,
+)
+from .film import (
+    film_masks as film_masks,
+    film_tokens as film_tokens,
+)
+from .summary import (
+    describe_policy as describe_policy,
+    error_to_dense as error_to_dense,
+    format_benchmark as format_benchmark,
+)

@@ -1,0 +1,142 @@
+"""A benchmark of a diffusion policy: its methods, what is measured of them, and the figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+from tensordict import TensorDictBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.calibration import Calibration
+from torchrl_sparse.control.queries import answer
+from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
+from torchrl_sparse.evaluation.figures.masks import plot_mask_statistics, plot_mask_strip
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
+from torchrl_sparse.evaluation.figures.plots import (
+    plot_error_surge,
+    plot_schedule,
+    plot_similarity,
+)
+from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
+from torchrl_sparse.evaluation.results.report import MethodRun
+from torchrl_sparse.evaluation.results.schema import Results
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
+from torchrl_sparse.evaluation.statistics.fidelity import block_errors
+from torchrl_sparse.methods.diffusion import MethodName, make_method
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.progress import progress
+
+__all__ = ["draw_methods", "make_methods", "measure_methods", "settle_rates"]
+
+_SURGING = ("uniform", "bac_blockwise", "bac")  # whose errors BAC's third figure compares
+
+
+def make_methods(
+    names: Iterable[str],
+    policy: DiffusionPolicy,
+    *,
+    num_updates: int,
+    planners: Path,
+    calibration: Callable[[], Calibration],
+) -> dict[str, DiffusionPolicy]:
+    """Return the policy under each method, and first of all as it is: dense is what all others are compared with.
+
+    Args:
+        names: of methods; the rest as of `make_method`.
+    """
+    options = {"num_updates": num_updates, "planners": planners, "calibration": calibration}
+    return {name: make_method(name, policy, **options) for name in dict.fromkeys(["dense", *names])}
+
+
+def settle_rates(
+    methods: Mapping[str, DiffusionPolicy], episodes: Mapping[str, Sequence[EpisodeResult]]
+) -> None:
+    """Set the rate of each method whose controller moves it to the mean of its episodes, at which it is then timed."""
+    for name, method in methods.items():
+        rates = MethodName.parse(name).rates
+        if len(rates) == 2:
+            method.plan.rate = min(max(totals(episodes[name]).prune_rate, min(rates)), max(rates))
+
+
+def measure_methods(
+    methods: Mapping[str, DiffusionPolicy],
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    queries: TensorDictBase,
+    *,
+    repeats: int,
+    threads: int,
+) -> dict[str, MethodRun]:
+    """Measure latency and action error of all methods on the same queries, and add them to the episodes.
+
+    Args:
+        methods: name -> policy, ``"dense"`` among them.
+        episodes: name -> its episodes.
+        queries: [Q] of dense episodes, with the dense policy's answers; see `record_queries`.
+        repeats: queries that are timed under each method.
+        threads: of PyTorch while timing.
+    """
+    with progress("latency", "round", repeats) as show:
+        latency = time_queries(methods, queries, repeats=repeats, threads=threads, on_round=show)
+    planning = time_planning(_adaptive(methods), queries, threads=threads)
+    return {
+        name: MethodRun(
+            episodes[name],
+            latency[name],
+            error_to_dense(method, answer(method, queries), queries),
+            planning.get(name),
+        )
+        for name, method in methods.items()
+    }
+
+
+def draw_methods(
+    results: Results,
+    methods: Mapping[str, DiffusionPolicy],
+    queries: TensorDictBase,
+    calibration: Calibration,
+    out: Path,
+) -> None:
+    """Write the figures: success against time, every method's mask, how masks change, and where errors surge.
+
+    Args:
+        results: content of ``results.json``.
+        methods: name -> policy, ``"dense"`` among them.
+        queries: [Q] of dense episodes, in order.
+        calibration: of the dense policy, whose similarities are drawn.
+        out: folder of the figures.
+    """
+    plot_pareto(results, out / "pareto.png")
+    plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
+    masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
+    for name, mask in masks.items():
+        ratio = results.methods[name].flops.ratio_to_dense
+        plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
+    for name, method in _adaptive(methods).items():
+        _draw_masks(name, method, queries, out)
+    surging = {name: masks[name] for name in _SURGING if name in masks}
+    if surging:
+        dense = methods["dense"]
+        noise = dense.sample_noise(queries[keys.SEED].squeeze(-1))
+        errors = block_errors(dense.network, dense.sampler, noise, queries[keys.COND], surging)
+        plot_error_surge(
+            {name: error.numpy() for name, error in errors.items()},
+            {name: mask.numpy() for name, mask in surging.items()},
+            out / "error_surge.png",
+        )
+
+
+def _adaptive(methods: Mapping[str, DiffusionPolicy]) -> dict[str, DiffusionPolicy]:
+    """Those whose masks depend on the observation."""
+    return {name: method for name, method in methods.items() if not method.plan.is_static}
+
+
+def _draw_masks(name: str, method: DiffusionPolicy, queries: TensorDictBase, out: Path) -> None:
+    """How the masks change along an episode, and over all queries."""
+    masks = answer(method, queries)[keys.PRUNE_MASK].numpy()
+    plot_mask_statistics(masks, out / f"masks_{name}.png", name=name)
+    step = queries[keys.EPISODE_STEP].flatten()
+    first_episode = (queries[keys.EPISODE_SEED] == queries[keys.EPISODE_SEED][0]).flatten()
+    steps_per_query = int(step[1] - step[0]) if first_episode.sum() > 1 else 1
+    strip = masks[first_episode.numpy()]
+    plot_mask_strip(strip, out / f"strip_{name}.png", name=name, steps_per_query=steps_per_query)

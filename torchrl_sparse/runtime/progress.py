@@ -1,0 +1,24 @@
+"""Progress bars for work that reports how far it is."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+__all__ = ["progress"]
+
+
+@contextmanager
+def progress(description: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar and yield the function ``(done, total)`` that moves it.
+
+    >>> with progress("timing", "round") as show:
+    ...     show(1, 2)
+    """
+    with tqdm(total=total, unit=unit, desc=f"{description:>14}") as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
