@@ -102,7 +102,7 @@ def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]
     # Here, since queries of demonstrations need no simulator.
     from torchrl_sparse.envs.for_policy import instructed_env
 
-    return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
+    return instructed_env(config.task, policy.network.config, chosen_cameras(config.cameras), config.horizon)
 
 
 if __name__ == "__main__":

@@ -133,7 +133,7 @@ def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None
     episodes = evaluate(
         "dense",
         ChunkExecutor(policy, config.n_action_steps),
-        instructed_env(config.task, policy, chosen_cameras(config.cameras)),
+        instructed_env(config.task, policy.network.config, chosen_cameras(config.cameras)),
         range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,

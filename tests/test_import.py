@@ -41,14 +41,17 @@ print("fine")
     assert python(code).endswith("fine")
 
 
-def test_without_transformers_all_but_the_network_imports():
+def test_without_transformers_everything_imports_and_a_network_says_what_it_lacks():
     code = """
-import sys
-sys.modules["transformers"] = None  # any import of it fails
-from torchrl_sparse import BAC, ChunkExecutor, DiffusionPolicy, TokenPruner, VLAConfig
-import torchrl_sparse.networks.vla.flops, torchrl_sparse.networks.vla.text, torchrl_sparse.networks.vla.normalize
+import importlib, pkgutil, sys
+for name in ("transformers", "tokenizers"):
+    sys.modules[name] = None  # any import of it fails
+import torchrl_sparse
+for module in pkgutil.walk_packages(torchrl_sparse.__path__, "torchrl_sparse."):
+    if not module.name.endswith("._native"):  # the compiled library is no module of Python
+        importlib.import_module(module.name)
 try:
-    from torchrl_sparse import VLAPolicy
+    torchrl_sparse.VLAPolicy.from_pretrained("assets/vla")
 except ImportError as error:
     print(error)
 """

@@ -10,8 +10,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse.envs.tasks import find_robosuite_task, find_task
 from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 __all__ = ["diffusion_env", "instructed_env"]
 
@@ -44,13 +44,13 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
 
 
 def instructed_env(
-    task: str, policy: VLAPolicy, cameras: Mapping[str, str], horizon: int | None = None
+    task: str, config: VLAConfig, cameras: Mapping[str, str], horizon: int | None = None
 ) -> Callable[..., EnvBase]:
-    """Return a maker of environments that show and say what ``policy`` reads; its keywords are those of `make_env`.
+    """Return a maker of environments that show and say what a `VLAPolicy` reads; its keywords are those of `make_env`.
 
     Args:
         task: of robosuite, see `make_env`.
-        policy: decides the size of the images.
+        config: of the policy's network; decides the size of the images.
         cameras: as in demonstrations: name of an observation here -> name of the images in the file.
         horizon: steps until an episode is truncated; None for the task's own.
     """
@@ -58,7 +58,7 @@ def instructed_env(
         make_env,
         find_robosuite_task(task).name,
         n_obs_steps=1,
-        image_size=policy.network.config.image_size,
+        image_size=config.image_size,
         object_state=False,
         instruction=True,
         horizon=horizon,

@@ -22,7 +22,7 @@ def policy():
 
 @pytest.fixture(scope="module")
 def env(policy):
-    env = instructed_env("lift_named", policy, CAMERAS)(seeds=SEEDS)
+    env = instructed_env("lift_named", policy.network.config, CAMERAS)(seeds=SEEDS)
     try:
         env.reset()
     except RuntimeError as error:  # no GL library

@@ -1,27 +1,32 @@
-"""The parts of `transformers` that vision-language-action policies are made of; everything else works without it."""
+"""The parts of `transformers` that vision-language-action networks are made of, each imported when it is first used.
 
-try:
-    from transformers import (
-        Dinov2WithRegistersConfig,
-        Dinov2WithRegistersModel,
-        LlamaConfig,
-        LlamaModel,
-        SiglipVisionConfig,
-        SiglipVisionModel,
-    )
-    from transformers.models.llama.modeling_llama import LlamaDecoderLayer, apply_rotary_pos_emb
-except ImportError as error:
-    raise ImportError(
-        f"vision-language-action policies need the extra vla, pip install 'torchrl-sparse[vla]': {error}"
-    ) from error
+So every module of this package imports without the extra ``vla``; making a network does not.
+"""
 
-__all__ = [
-    "Dinov2WithRegistersConfig",
-    "Dinov2WithRegistersModel",
-    "LlamaConfig",
-    "LlamaDecoderLayer",
-    "LlamaModel",
-    "SiglipVisionConfig",
-    "SiglipVisionModel",
-    "apply_rotary_pos_emb",
-]
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOME = {
+    "Dinov2WithRegistersConfig": "transformers",
+    "Dinov2WithRegistersModel": "transformers",
+    "LlamaConfig": "transformers",
+    "LlamaModel": "transformers",
+    "SiglipVisionConfig": "transformers",
+    "SiglipVisionModel": "transformers",
+    "apply_rotary_pos_emb": "transformers.models.llama.modeling_llama",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        part = getattr(import_module(_HOME[name]), name)
+    except ImportError as error:
+        raise ImportError(
+            f"vision-language-action policies need the extra vla, pip install 'torchrl-sparse[vla]': {error}"
+        ) from error
+    globals()[name] = part
+    return part

@@ -13,12 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from torchrl_sparse.networks.vla.backbones import (
-    LlamaConfig,
-    LlamaDecoderLayer,
-    LlamaModel,
-    apply_rotary_pos_emb,
-)
+from torchrl_sparse.networks.vla import backbones
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState
 
@@ -54,8 +49,8 @@ class BidirectionalLlama(nn.Module):
 
     def __init__(self, config: VLAConfig):
         super().__init__()
-        self.llama = LlamaModel(
-            LlamaConfig(
+        self.llama = backbones.LlamaModel(
+            backbones.LlamaConfig(
                 vocab_size=config.vocab_size,
                 hidden_size=config.llm.dim,
                 intermediate_size=config.llm.mlp,
@@ -172,20 +167,20 @@ def visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -
 
 
 def _run_layer(
-    layer: LlamaDecoderLayer,
+    layer: nn.Module,
     hidden: Tensor,
     rotary: tuple[Tensor, Tensor],
     mask: Tensor | None,
     head_dim: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Run one layer; return its output, and its queries and keys, [B, heads, S, head_dim]."""
+    """Run one of Llama's layers; return its output, and its queries and keys, [B, heads, S, head_dim]."""
     attention = layer.self_attn
     normed = layer.input_layernorm(hidden)
     query, key, value = (
         project(normed).unflatten(-1, (-1, head_dim)).transpose(1, 2)
         for project in (attention.q_proj, attention.k_proj, attention.v_proj)
     )
-    query, key = apply_rotary_pos_emb(query, key, *rotary)
+    query, key = backbones.apply_rotary_pos_emb(query, key, *rotary)
     attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
     hidden = hidden + attention.o_proj(attended.transpose(1, 2).flatten(2))
     return hidden + layer.mlp(layer.post_attention_layernorm(hidden)), query, key

@@ -6,12 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from torchrl_sparse.networks.vla.backbones import (
-    Dinov2WithRegistersConfig,
-    Dinov2WithRegistersModel,
-    SiglipVisionConfig,
-    SiglipVisionModel,
-)
+from torchrl_sparse.networks.vla import backbones
 from torchrl_sparse.networks.vla.config import VLAConfig
 
 __all__ = ["FusedProjector", "VisionTowers", "center_crop"]
@@ -49,8 +44,8 @@ class VisionTowers(nn.Module):
     def __init__(self, config: VLAConfig):
         super().__init__()
         shape = {"image_size": config.image_size, "patch_size": config.patch_size}
-        self.dino = Dinov2WithRegistersModel(
-            Dinov2WithRegistersConfig(
+        self.dino = backbones.Dinov2WithRegistersModel(
+            backbones.Dinov2WithRegistersConfig(
                 hidden_size=config.dino.dim,
                 num_hidden_layers=config.dino.layers - 1,
                 num_attention_heads=config.dino.heads,
@@ -60,8 +55,8 @@ class VisionTowers(nn.Module):
             )
         )
         self.dino.layernorm = nn.Identity()
-        self.siglip = SiglipVisionModel(
-            SiglipVisionConfig(
+        self.siglip = backbones.SiglipVisionModel(
+            backbones.SiglipVisionConfig(
                 hidden_size=config.siglip.dim,
                 num_hidden_layers=config.siglip.layers - 1,
                 num_attention_heads=config.siglip.heads,

@@ -1,0 +1,89 @@
+"""Where a vision-language-action model spends its time and what pruning saves, measured; see `results.vla_report`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from torchrl_sparse import keys
+from torchrl_sparse.evaluation.latency.measure import Latency, Machine, measure_latency
+from torchrl_sparse.evaluation.latency.vla_cases import VLACase
+from torchrl_sparse.evaluation.results.schema import DENSE
+from torchrl_sparse.evaluation.results.vla_report import SCHEMA, Helper, Part, VLALatency, VLAMethod, VLAShape
+
+__all__ = ["measure_vla"]
+
+
+def measure_vla(
+    case: VLACase,
+    *,
+    name: str,
+    machine: Machine,
+    repeats: int,
+    warmup: int = 2,
+    on_round: Callable[[int, int], None] | None = None,
+) -> VLALatency:
+    """Time the parts of the dense query and all methods, everything interleaved.
+
+    Args:
+        case: with a method ``"dense"``.
+        name: of its shape.
+        machine: that this runs on.
+        repeats, warmup, on_round: see `measure_latency`.
+    """
+    pruned = [name for name, policy in case.policies.items() if policy.pruner is not None]
+    calls = {("parts", part): call for part, call in case.parts().items()}
+    calls |= {("query", method): lambda method=method: case.answer(method) for method in case.policies}
+    calls |= {(method, helper): call for method in pruned for helper, call in case.helpers(method).items()}
+    weight = next(case.network.parameters())
+    latency = measure_latency(calls, repeats, warmup, device=weight.device, on_round=on_round)
+    shape = VLAShape(
+        name=name,
+        dtype=str(weight.dtype).removeprefix("torch."),
+        parameters=sum(parameter.numel() for parameter in case.network.parameters()),
+        tokens=case.sequence().hidden.shape[1],
+        visual_tokens=case.network.config.num_visual,
+        config=case.network.config.to_dict(),
+    )
+    methods = {method: _method(method, case, latency) for method in case.policies}
+    return VLALatency(SCHEMA, machine, shape, _parts(latency), methods)
+
+
+def _parts(latency: Mapping[tuple[str, str], Latency]) -> dict[str, Part]:
+    whole = latency["query", DENSE].p50
+    timed = {name: times for (kind, name), times in latency.items() if kind == "parts"}
+    rest = max(0.0, whole - sum(times.p50 for times in timed.values()))
+    parts = {name: Part(share=times.p50 / whole, **_percentiles(times)) for name, times in timed.items()}
+    return parts | {"rest": Part(rest, rest / whole)}
+
+
+def _method(name: str, case: VLACase, latency: Mapping[tuple[str, str], Latency]) -> VLAMethod:
+    answer, dense = case.answer(name), case.answer(DENSE)
+    own, flops = latency["query", name], answer[keys.FLOPS].item()
+    expected, speedup = dense[keys.FLOPS].item() / flops, latency["query", DENSE].p50 / own.p50
+    depth = answer[keys.TOKEN_DEPTH]
+    helpers = _helpers({part: t.p50 for (method, part), t in latency.items() if method == name}, own.p50)
+    return VLAMethod(
+        **_percentiles(own),
+        flops=flops,
+        kept=answer[keys.KEPT].item(),
+        tokens_per_layer=tuple(int((depth > layer).sum()) for layer in range(case.network.config.llm.layers)),
+        flops_speedup=expected,
+        speedup=speedup,
+        realised=speedup / expected,
+        helpers=helpers,
+        helper_share=sum(helper.share for helper in helpers.values()),
+    )
+
+
+def _helpers(seconds: dict[str, float], query: float) -> dict[str, Helper]:
+    if "comparing" in seconds:
+        seconds["choosing"] = max(0.0, seconds["choosing"] - seconds["comparing"])
+    return {name: Helper(value, value / query) for name, value in seconds.items()}
+
+
+def _percentiles(latency: Latency) -> dict[str, Any]:
+    p10, p90 = np.percentile(latency.samples, [10, 90])
+    return {"p50_s": latency.p50, "p10_s": float(p10), "p90_s": float(p90), "n": latency.n}
