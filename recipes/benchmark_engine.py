@@ -12,7 +12,6 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 from torch import Tensor
-from tqdm import tqdm
 
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.evaluation.figures.latency import plot_engine_times
@@ -28,6 +27,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
 )
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
 
 QUICK_STEPS = 20
@@ -66,12 +66,12 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
     if compiled:
         drop_uncompilable(variants)
     repeats = 1 if config.quick else entry.repeats
-    with tqdm(total=repeats, unit="round", desc=name) as bar:
+    with progress(name, "round", repeats) as show:
         latency = measure_latency(
             {variant: case_variant.call for variant, case_variant in variants.items()},
             repeats=repeats,
             warmup=1 if config.quick else config.warmup,
-            on_round=lambda done, total: bar.update(done - bar.n),
+            on_round=show,
         )
     return shape_results(case, variants, latency, config.threads)
 

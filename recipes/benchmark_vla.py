@@ -19,17 +19,17 @@ from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.benchmarks.film import film_tokens
-from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
+from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, error_to_dense, format_benchmark
 from torchrl_sparse.evaluation.benchmarks.vla import (
     matched_number,
     matches_last,
-    measure_methods,
     replay_all,
+    time_methods,
 )
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import plot_tokens_per_layer
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.report import build_results
+from torchrl_sparse.evaluation.results.report import MethodRun, build_results
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
@@ -74,18 +74,12 @@ def main(config: DictConfig) -> None:
             )
     policies = {name: actors[name].policy for name in methods}  # in the order asked for
 
+    timing = {"repeats": config.latency_repeats, "threads": config.threads, "device": config.device}
+    latency = time_methods(policies, recorded, **timing)
     answers = {name: replay_all(policy, recorded) for name, policy in policies.items()}
-    runs = measure_methods(
-        policies,
-        episodes,
-        recorded,
-        answers,
-        repeats=config.latency_repeats,
-        threads=config.threads,
-        device=config.device,
-    )
+    errors = {name: error_to_dense(dense, answers[name], answers["dense"]) for name in policies}
     results = build_results(
-        runs,
+        {name: MethodRun(episodes[name], latency[name], errors[name]) for name in policies},
         task=config.task,
         seed=config.seed,
         machine=describe_machine(config.device, config.threads),

@@ -1,4 +1,4 @@
-"""Writes every table of results on the pages anew, from the committed JSON that it shows.
+"""Write every table of results on the pages anew, from the committed JSON that it shows.
 
 python recipes/pages.py
 """

@@ -13,7 +13,6 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.figures.latency import plot_vla_times
@@ -21,6 +20,7 @@ from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, save_vla_results
+from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
 from torchrl_sparse.tokens.base import TokenPruner
@@ -31,14 +31,14 @@ def main(config: DictConfig) -> None:
     with num_threads(config.threads), torch.no_grad():
         policy = make_policy(config.shape, dtype=getattr(torch, config.dtype), device=config.device)
         case = VLACase(policy, make_pruners(config))
-        with tqdm(total=config.repeats, unit="round") as bar:
+        with progress("timing", "round", config.repeats) as show:
             results = measure_vla(
                 case,
                 name=config.shape,
                 machine=describe_machine(config.device, config.threads),
                 repeats=config.repeats,
                 warmup=config.warmup,
-                on_round=lambda done, total: bar.update(done - bar.n),
+                on_round=show,
             )
     out = Path(config.out)
     save_vla_results(results, out / "vla_latency.json")

@@ -27,7 +27,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.transformer import BLOCK_TYPES, TransformerForDiffusion
 
 __all__ = [
     "BLOCK_TYPES",
@@ -50,7 +50,6 @@ __all__ = [
     "validate_mask",
 ]
 
-BLOCK_TYPES = ("SA", "CA", "FFN")
 Reuse = Literal["block", "type", "single"]
 REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)  # a TensorDict holds a rule as its index here
 

@@ -58,17 +58,17 @@ COMMANDED = Thresholds(0.4, 0.2, leave_translation=float("inf"), leave_rotation=
 
 
 def translation_speed(twist: Tensor) -> Tensor:
-    """Eq. 11: the norm [...] of the first three numbers of ``twist`` [..., 6]."""
+    """Return Eq. 11: the norm [...] of the first three numbers of ``twist`` [..., 6]."""
     return torch.linalg.vector_norm(twist[..., :3], dim=-1)
 
 
 def rotation_speed(twist: Tensor) -> Tensor:
-    """Eq. 12: the norm [...] of the last three numbers of ``twist`` [..., 6]."""
+    """Return Eq. 12: the norm [...] of the last three numbers of ``twist`` [..., 6]."""
     return torch.linalg.vector_norm(twist[..., 3:], dim=-1)
 
 
 def fine_mode(twist: Tensor, fine: Tensor, thresholds: Thresholds) -> Tensor:
-    """Whether the next action is a fine one, bool [*B, 1].
+    """Decide whether the next action is a fine one, bool [*B, 1].
 
     Args:
         twist: [*B, arms, 6] translation and rotation of each arm. One slow arm enters; it takes all of them to leave.
@@ -155,7 +155,7 @@ class ActionAwareController(TensorDictModuleBase):
 
     @staticmethod
     def _measured(tensordict: TensorDictBase) -> Tensor:
-        """The velocity of each arm, [*B, arms, 6]."""
+        """Read the velocity of each arm, [*B, arms, 6]."""
         velocity = keys.read(tensordict, keys.EEF_VEL)
         if velocity.shape[-1] % 6:
             raise ValueError(f"{keys.EEF_VEL}: expected 6 numbers per arm, got {velocity.shape[-1]}")
@@ -163,7 +163,7 @@ class ActionAwareController(TensorDictModuleBase):
 
     @staticmethod
     def _commanded(tensordict: TensorDictBase) -> Tensor:
-        """The twist that the last action commanded of each arm, [*B, arms, 6]; zero before the first."""
+        """Read the twist that the last action commanded of each arm, [*B, arms, 6]; zero before the first."""
         chunk = keys.recall(tensordict, keys.CHUNK, (1, _DELTA_DIM), 0.0)
         if chunk.shape[-1] % _DELTA_DIM:
             raise ValueError(

@@ -92,7 +92,7 @@ class ChunkExecutor(TensorDictModuleBase):
         return due if replan is None else due | replan
 
     def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
-        """Runs the policy on the due samples alone and writes what it returns into their rows."""
+        """Run the policy on the due samples alone and write what it returns into their rows."""
         batch = tensordict.batch_size
         index = due.reshape(-1).nonzero().squeeze(-1)
         request = tensordict.select(*self.policy.in_keys, strict=False).reshape(-1)[index]
@@ -109,7 +109,7 @@ class ChunkExecutor(TensorDictModuleBase):
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
 
     def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
-        """The action [*B, A] of this step."""
+        """Return the action [*B, A] of this step."""
         return action_at(tensordict.get(keys.CHUNK), age)
 
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
@@ -119,7 +119,7 @@ class ChunkExecutor(TensorDictModuleBase):
 
 
 def action_at(chunk: Tensor, age: Tensor) -> Tensor:
-    """The action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
+    """Return the action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
     index = age[..., None].expand(*age.shape, chunk.shape[-1])
     return chunk.gather(-2, index).squeeze(-2)
 

@@ -148,7 +148,7 @@ class HoldPose(TensorDictModuleBase):
 
 
 def delay_steps(latency: Tensor, control_freq: float = 20.0) -> Tensor:
-    """Steps, i64, that the environment makes in ``latency`` seconds: an answer that misses a step waits for the next.
+    """Return the steps, i64, that the environment makes in ``latency`` seconds; an answer that misses one waits for the next.
 
     >>> delay_steps(torch.tensor([0.0, 0.001, 0.05, 0.051])).tolist()
     [0, 1, 1, 2]

@@ -23,9 +23,8 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.storage.files import read_tensors, write_tensors
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_tensors, take
+from torchrl_sparse.storage.tensors import check_tensors, read_tensors, take, write_tensors
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")

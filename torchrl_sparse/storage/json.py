@@ -133,7 +133,7 @@ def _check_size(size: int, where: str) -> None:
 
 
 def _fault(error: Mapping[str, Any]) -> str:
-    """What pydantic found, in this package's words."""
+    """Say what pydantic found in this package's words."""
     key = ".".join(str(part) for part in error["loc"][1:])
     place = f"{key}: " if key else ""
     got = repr(error["input"])

@@ -21,9 +21,8 @@ from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
-from torchrl_sparse.storage.files import read_tensors, write_tensors
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, take, write_tensors
 
 __all__ = ["StoredVLA", "read_vla", "write_vla"]
 

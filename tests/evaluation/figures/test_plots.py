@@ -33,7 +33,7 @@ def test_pareto(tmp_path):
     path = pareto.plot_pareto(results, tmp_path / "pareto.png")
     assert os.listdir(tmp_path) == ["pareto.png"]
     pixels = read(path)
-    for name in results["methods"]:
+    for name in results.methods:
         assert has_color(pixels, METHODS[name].color)
 
 

@@ -59,15 +59,15 @@ def test_every_method_answers_the_second_query_with_what_it_remembers_of_the_fir
 
 @torch.no_grad()
 def test_replayed_helpers_do_what_the_query_did(case):
-    watch = case.watch("specprune")
+    recorder = case.record("specprune")
     scored = case.policies["specprune"].pruner.layers_scored(SPEC.num_layers)
-    assert [state.layer for state, _ in watch.scored] == sorted(scored)
-    lengths = [state.hidden.shape[1] for state, _ in watch.answered]
+    assert [state.layer for state, _ in recorder.scored] == sorted(scored)
+    lengths = [state.hidden.shape[1] for state, _ in recorder.answered]
     assert lengths[0] == lengths[1] == case.sequence().hidden.shape[1]
     assert lengths[-1] < lengths[2] < lengths[1]
-    keeps = [keep for _, keep in watch.answered]
-    watch.choose()  # and the answers are the same again
-    again = case.watch("specprune")
+    keeps = [keep for _, keep in recorder.answered]
+    recorder.choose()  # and the answers are the same again
+    again = case.record("specprune")
     for one, (_, other) in zip(keeps, again.answered, strict=True):
         assert (one is None) == (other is None)
         assert one is None or torch.equal(one, other)

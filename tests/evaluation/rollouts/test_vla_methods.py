@@ -113,7 +113,7 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     results = load_results(tmp_path / "results.json").methods
     assert list(results) == ["dense", "specprune@0.2", "fastv@specprune@0.2"]
-    kept = [method["tokens"]["kept_mean"] for method in results.values()]
+    kept = [method.tokens.kept_mean for method in results.values()]
     assert kept[0] == 32
     assert kept[1] < 32
     assert abs(kept[2] - kept[1]) < 2

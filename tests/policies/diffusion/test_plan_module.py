@@ -9,6 +9,8 @@ from torchrl_sparse.blocks import mask as masks
 from torchrl_sparse.blocks.engine import base, denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES
 from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 
 from .test_policy import request
 
@@ -70,6 +72,34 @@ def test_a_rule_that_is_none_or_missing_is_named(policy):
     policy.module["plan"] = mask_alone
     with pytest.raises(KeyError, match=r"expected the key \('diffusion', 'reuse'\), got"):
         policy(request(2))
+
+
+def sag_pruner(policy):
+    torch.manual_seed(1)
+    network = PrunerNetwork(policy.sampler.timesteps.tolist(), policy.num_blocks, (2, 5))
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return SAGPruner(network, PrunerInfo(policy.fingerprint, policy.sampler.name, rate=0.5))
+
+
+@torch.no_grad()
+def test_refresh_reaches_what_a_learned_planner_keeps(policy):
+    policy.plan = sag_pruner(policy)
+    before = policy(request(4))[keys.PRUNE_MASK]
+    last = policy.plan.network.mlp[3]
+    last.weight.data, last.bias.data = -last.weight, -last.bias
+    policy.refresh()
+    assert torch.equal(policy(request(4))[keys.PRUNE_MASK][:, 1:], ~before[:, 1:])
+
+
+@torch.no_grad()
+def test_what_a_learned_planner_keeps_is_not_rounded_by_autocast(policy):
+    policy.plan = sag_pruner(policy)
+    with torch.autocast("cpu"):
+        policy(request(4))
+    logits = policy.plan.network.prune_logits(policy(request(4))[keys.COND])
+    expected = sag_pruner(policy).network.prune_logits(policy(request(4))[keys.COND])
+    assert torch.equal(logits, expected)
 
 
 class PrunesTheFirstStep(Planner):

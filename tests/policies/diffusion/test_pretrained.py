@@ -119,7 +119,7 @@ def test_a_failed_save_leaves_the_old_files(policy, folder, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("disk full")
 
-    monkeypatch.setattr("torchrl_sparse.storage.files.save_file", fail)
+    monkeypatch.setattr("torchrl_sparse.storage.tensors.save_file", fail)
     with pytest.raises(OSError, match="disk full"):
         policy.save_pretrained(folder)
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before

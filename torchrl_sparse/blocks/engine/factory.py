@@ -28,13 +28,19 @@ class EngineEntry(NamedTuple):
     Attributes:
         make: makes it for a network and a sampler; raises ValueError where it does not apply.
         applies: says whether it can run a network on this machine, and if not, why.
+
+    Examples:
+        >>> ENGINES["mine"] = EngineEntry(ReferenceEngine)  # any class that offers what `Engine` says
+        >>> "mine" in ENGINES
+        True
+        >>> del ENGINES["mine"]
     """
 
     make: Callable[[TransformerForDiffusion, Sampler], Engine]
     applies: Applies = _always
 
 
-# By name. "auto" takes the first that applies. An engine of your own: `ENGINES["mine"] = EngineEntry(MyEngine)`.
+# By name; "auto" takes the first that applies.
 ENGINES: dict[str, EngineEntry] = {
     "native": EngineEntry(NativeEngine, native_supports),
     "torch": EngineEntry(TorchEngine),

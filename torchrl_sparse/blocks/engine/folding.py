@@ -30,7 +30,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 
 __all__ = [
     "Affine",
-    "ConditionEncoder",
+    "MemoryEncoder",
     "FoldedLayer",
     "FoldedMemory",
     "after_norm",
@@ -144,7 +144,7 @@ def fold_observation_stem(network: TransformerForDiffusion) -> Affine:
     return Affine(up.weight @ embed.weight.detach().double(), bias)
 
 
-class ConditionEncoder:
+class MemoryEncoder:
     """Memory tokens of all denoising steps, each encoded once; a snapshot of the network's weights.
 
     Args:

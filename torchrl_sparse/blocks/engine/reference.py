@@ -124,7 +124,7 @@ def _block_output(
 
 
 class ComputedRows:
-    """Which rows of the batch compute a block; the mask is read to the host once.
+    """The rows of a batch that compute a block; the mask is read to the host once.
 
     Args:
         mask: bool [B, K, 3L], True = pruned; None prunes nothing.

@@ -32,9 +32,8 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.keys import COND, PRUNE_RATE
-from torchrl_sparse.storage.files import read_tensors, write_tensors
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, write_tensors
 
 __all__ = ["PrunerInfo", "SAGPruner", "check_rates", "rate_threshold"]
 

@@ -10,9 +10,7 @@ from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.queries import answer
-from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
-from torchrl_sparse.evaluation.latency.measure import measure_latency
-from torchrl_sparse.evaluation.results.report import MethodRun
+from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share, mid_episode_query
 from torchrl_sparse.methods.vla import Settings, TokenMethodName, make_pruner
@@ -20,7 +18,7 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.vla.token_budget import replay
 
-__all__ = ["matched_number", "matches_last", "measure_methods", "replay_all"]
+__all__ = ["matched_number", "matches_last", "replay_all", "time_methods"]
 
 
 def matched_number(
@@ -53,34 +51,24 @@ def matches_last(texts: Iterable[str]) -> list[str]:
     return sorted(texts, key=lambda text: TokenMethodName.parse(text).like is not None)
 
 
-def measure_methods(
+def time_methods(
     policies: Mapping[str, VLAPolicy],
-    episodes: Mapping[str, Sequence[EpisodeResult]],
     recorded: Sequence[Sequence[TensorDictBase]],
-    answers: Mapping[str, TensorDictBase],
     *,
     repeats: int,
     threads: int,
     device: str,
-) -> dict[str, MethodRun]:
-    """Measure latency and action error of all methods on the same queries, and add them to the episodes.
+) -> dict[str, Latency]:
+    """Time the middle query of the first recorded episode under each method, interleaved.
 
     Args:
-        policies: name -> policy, ``"dense"`` among them.
-        episodes: name -> its episodes.
-        recorded: queries of dense episodes; the middle one of the first is timed.
-        answers: name -> its answers to all of them, see `replay_all`.
+        policies: name -> policy.
+        recorded: queries of dense episodes, see `recorded_queries`.
         repeats, threads, device: see `measure_latency`.
     """
     calls = {name: partial(answer, p, mid_episode_query(p, recorded[0])) for name, p in policies.items()}
     with progress("latency", "round", repeats) as show:
-        latency = measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=show)
-    return {
-        name: MethodRun(
-            episodes[name], latency[name], error_to_dense(policy, answers[name], answers["dense"])
-        )
-        for name, policy in policies.items()
-    }
+        return measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=show)
 
 
 def replay_all(policy: VLAPolicy, recorded: Sequence[Sequence[TensorDictBase]]) -> TensorDictBase:

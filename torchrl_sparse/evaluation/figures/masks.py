@@ -13,10 +13,11 @@ from torchrl_sparse.evaluation.figures.plots import block_labels, type_legend
 __all__ = ["mask_panel", "plot_mask_statistics", "plot_mask_strip"]
 
 _PANELS = 8
+_TYPES = len(BLOCK_TYPES)
 
 
 def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, steps_per_query: int) -> Path:
-    """The masks of queries along one rollout, side by side (figure 5 of SAG, arXiv:2601.12894).
+    """Draw the masks of queries along one rollout, side by side (figure 5 of SAG, arXiv:2601.12894).
 
     Args:
         masks: bool [Q, K, 3L], True = pruned, queries in order; eight of them are drawn, evenly spread.
@@ -39,14 +40,16 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
         pruned = 100 * masks[query].mean()
         axes.set_title(f"step {query * steps_per_query}\n{pruned:.1f} %", fontsize=9)
     panels[0].set_ylabel("denoising step (0 is the first)")
-    panels[len(panels) // 2].set_xlabel(f"blocks, layer 0 to {masks.shape[2] // 3 - 1} from left to right")
+    panels[len(panels) // 2].set_xlabel(
+        f"blocks, layer 0 to {masks.shape[2] // _TYPES - 1} from left to right"
+    )
     figure.suptitle(f"{name}: masks along a rollout, environment step and share pruned", fontsize=12)
     type_legend(figure)
     return save_figure(figure, path)
 
 
 def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: str) -> Path:
-    """Where a pruner prunes, and how much that depends on the observation.
+    """Draw where a planner prunes, and how much that depends on the observation.
 
     Above: the pruned share of each type of block along the denoising steps. Below: the variance over queries of every
     entry of the mask, 0 where it is always the same and 0.25 where it is a toss of a coin.
@@ -64,7 +67,7 @@ def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: st
     figure, grid = make_figure(9, 6.4, rows=2, columns=1, heights=(1.1, 2), sharex=True)
     above, below = grid[:, 0]
     for kind, color in enumerate(TYPE_COLORS):
-        share = 100 * masks[:, :, kind::3].mean(axis=(0, 2))
+        share = 100 * masks[:, :, kind::_TYPES].mean(axis=(0, 2))
         above.plot(share, color=color, label=BLOCK_TYPES[kind], linewidth=2)
     above.set_ylim(-3, 103)
     above.set_ylabel("pruned (%)")
@@ -83,7 +86,7 @@ def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: st
 
 
 def mask_panel(mask: np.ndarray, height: int) -> np.ndarray:
-    """A mask as an image to set beside a camera's: steps from top to bottom, blocks from left to right.
+    """Make an image of a mask to set beside a camera's: steps from top to bottom, blocks from left to right.
 
     Args:
         mask: bool [K, 3L], True = pruned.
@@ -100,15 +103,15 @@ def mask_panel(mask: np.ndarray, height: int) -> np.ndarray:
 
 
 def _colors(mask: np.ndarray) -> np.ndarray:
-    """f64 [K, 3L, 3]: the colour of the type where a block is computed, grey where it is reused."""
+    """Return f64 [K, 3L, 3]: the colour of the type where a block is computed, grey where it is reused."""
     from matplotlib.colors import to_rgb
 
-    computed = np.array([to_rgb(TYPE_COLORS[block % 3]) for block in range(mask.shape[1])])
+    computed = np.array([to_rgb(TYPE_COLORS[block % _TYPES]) for block in range(mask.shape[1])])
     return np.where(mask[..., None], np.array(to_rgb(REUSED_COLOR)), computed)
 
 
 def _check_masks(masks: np.ndarray) -> np.ndarray:
     masks = np.asarray(masks)
-    if masks.dtype != bool or masks.ndim != 3 or not len(masks) or masks.shape[2] % 3:
+    if masks.dtype != bool or masks.ndim != 3 or not len(masks) or masks.shape[2] % _TYPES:
         raise ValueError(f"masks: expected bool [Q > 0, K, 3L], got {masks.dtype} {list(masks.shape)}")
     return masks

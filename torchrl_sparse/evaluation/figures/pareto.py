@@ -110,7 +110,7 @@ def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntr
 
 
 def _plain_log_axis(axes: Axes, low: float, high: float) -> None:
-    """Ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, in plain numbers."""
+    """Put ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, in plain numbers."""
     for multiples in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
         ticks = [m * 10.0**e for e in range(-6, 7) for m in multiples if low <= m * 10.0**e <= high]
         if len(ticks) >= 3:

@@ -23,20 +23,23 @@ if TYPE_CHECKING:
 
 __all__ = ["block_labels", "plot_error_surge", "plot_schedule", "plot_similarity", "type_legend"]
 
+_TYPES = len(BLOCK_TYPES)
+_FFN = slice(BLOCK_TYPES.index("FFN"), None, _TYPES)  # columns of a mask
+
 
 def block_labels(num_blocks: int) -> list[str]:
-    """Names of the columns of a mask.
+    """Return the names of the columns of a mask.
 
     >>> block_labels(6)
     ['L0 SA', 'L0 CA', 'L0 FFN', 'L1 SA', 'L1 CA', 'L1 FFN']
     """
-    return [f"L{index // 3} {BLOCK_TYPES[index % 3]}" for index in range(num_blocks)]
+    return [f"L{index // _TYPES} {BLOCK_TYPES[index % _TYPES]}" for index in range(num_blocks)]
 
 
 def plot_schedule(
     mask: np.ndarray, path: str | os.PathLike, *, name: str, flops_ratio: float | None = None
 ) -> Path:
-    """Which block is computed at which denoising step.
+    """Draw which block is computed at which denoising step.
 
     Args:
         mask: bool [K, 3L], True = pruned, steps in execution order.
@@ -53,7 +56,7 @@ def plot_schedule(
     num_blocks = mask.shape[1]
     figure, axes = make_figure(9, 1.6 + 0.2 * num_blocks)
     # 0 = reused, 1 + type = computed.
-    code = np.where(mask, 0, 1 + np.arange(num_blocks) % 3).T
+    code = np.where(mask, 0, 1 + np.arange(num_blocks) % _TYPES).T
     axes.imshow(
         code,
         aspect="auto",
@@ -65,8 +68,8 @@ def plot_schedule(
     axes.grid(False)
     axes.set_yticks(range(num_blocks), block_labels(num_blocks), fontsize=9)
     axes.tick_params(axis="y", length=0)
-    for layer in range(1, num_blocks // 3):
-        axes.axhline(3 * layer - 0.5, color="white", linewidth=2)
+    for layer in range(1, num_blocks // _TYPES):
+        axes.axhline(_TYPES * layer - 0.5, color="white", linewidth=2)
     axes.xaxis.get_major_locator().set_params(integer=True)  # there is no step 0.5 in a chain of two
     axes.set_xlabel("denoising step, in execution order (0 is the first call of the network)")
     cost = "" if flops_ratio is None else f", {100 * flops_ratio:.1f} % of dense FLOPs"
@@ -76,7 +79,7 @@ def plot_schedule(
 
 
 def type_legend(figure: Figure) -> None:
-    """What the colours of a mask mean, under the figure."""
+    """Explain the colours of a mask under the figure."""
     from matplotlib.patches import Patch
 
     handles = [
@@ -89,7 +92,7 @@ def type_legend(figure: Figure) -> None:
 
 
 def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
-    """Cosine similarity of each block's output between all pairs of denoising steps (figure 1 of BAC,
+    """Draw the cosine similarity of each block's output between all pairs of denoising steps (figure 1 of BAC,
     arXiv:2506.13456).
 
     Args:
@@ -100,23 +103,23 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
         ValueError: if the shape is another or a value is not finite.
     """
     similarity = np.asarray(similarity, dtype=np.float64)
-    if similarity.ndim != 3 or similarity.shape[0] % 3 or similarity.shape[1] != similarity.shape[2]:
+    if similarity.ndim != 3 or similarity.shape[0] % _TYPES or similarity.shape[1] != similarity.shape[2]:
         raise ValueError(f"similarity: expected shape [3L, K, K], got {list(similarity.shape)}")
     if not np.isfinite(similarity).all():
         raise ValueError("similarity: expected finite values, got NaN or infinity")
-    layers, steps = similarity.shape[0] // 3, similarity.shape[1]
-    figure, grid = make_figure(9, 3.9, rows=3, columns=layers)
+    layers, steps = similarity.shape[0] // _TYPES, similarity.shape[1]
+    figure, grid = make_figure(9, 3.9, rows=_TYPES, columns=layers)
     for index, panel in enumerate(similarity):
-        axes = grid[index % 3, index // 3]
+        axes = grid[index % _TYPES, index // _TYPES]
         image = axes.imshow(panel, vmin=min(similarity.min(), 0.99), vmax=1, cmap="viridis", origin="lower")
         axes.grid(False)
         axes.set_xticks([0, steps - 1])
         axes.set_yticks([0, steps - 1])
-        axes.tick_params(labelbottom=index % 3 == 2, labelleft=index < 3, labelsize=8, length=2)
-        if index % 3 == 0:
-            axes.set_title(f"layer {index // 3}", fontsize=10)
-        if index < 3:
-            axes.set_ylabel(BLOCK_TYPES[index % 3], fontsize=11)
+        axes.tick_params(labelbottom=index % _TYPES == 2, labelleft=index < _TYPES, labelsize=8, length=2)
+        if index % _TYPES == 0:
+            axes.set_title(f"layer {index // _TYPES}", fontsize=10)
+        if index < _TYPES:
+            axes.set_ylabel(BLOCK_TYPES[index % _TYPES], fontsize=11)
     figure.colorbar(image, ax=grid, shrink=0.9, pad=0.01, label="cosine similarity")
     figure.suptitle("Similarity of a block's output between denoising steps", fontsize=12)
     figure.supxlabel("denoising step, in execution order", fontsize=10)
@@ -127,7 +130,7 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
 def plot_error_surge(
     errors: Mapping[str, np.ndarray], masks: Mapping[str, np.ndarray], path: str | os.PathLike
 ) -> Path:
-    """Error of the blocks' outputs along one query under several schedules (figure 3 of BAC,
+    """Draw the error of the blocks' outputs along one query under several schedules (figure 3 of BAC,
     arXiv:2506.13456).
 
     Args:
@@ -150,7 +153,7 @@ def plot_error_surge(
     figure, grid = make_figure(9, 6.2, rows=3, columns=1, heights=(3, 3, 0.34 * len(errors)), sharex=True)
     ffn_axes, all_axes, update_axes = grid[:, 0]
     colors = method_colors(errors)
-    panels = ((ffn_axes, slice(2, None, 3), "FFN blocks"), (all_axes, slice(None), "all blocks"))
+    panels = ((ffn_axes, _FFN, "FFN blocks"), (all_axes, slice(None), "all blocks"))
     for axes, blocks, label in panels:
         for name, error in errors.items():
             axes.plot(error[:, blocks].mean(axis=1), color=colors[name], linewidth=1.8, label=name)
@@ -164,9 +167,9 @@ def plot_error_surge(
 
 
 def _draw_updates(axes: Axes, masks: Mapping[str, np.ndarray], colors: Mapping[str, str]) -> None:
-    """One row per schedule; a step is the darker, the more of its FFN blocks are computed there."""
+    """Draw one row per schedule; a step is the darker, the more of its FFN blocks are computed there."""
     for row, (name, mask) in enumerate(masks.items()):
-        share = (~mask[:, 2::3]).mean(axis=1)
+        share = (~mask[:, _FFN]).mean(axis=1)
         for step in np.flatnonzero(share):
             axes.bar(
                 step, 0.8, 1.0, row - 0.4, color=colors[name], alpha=0.15 + 0.85 * share[step], linewidth=0
@@ -180,7 +183,7 @@ def _draw_updates(axes: Axes, masks: Mapping[str, np.ndarray], colors: Mapping[s
 
 def _check_mask(mask: Any, name: str) -> np.ndarray:
     mask = np.asarray(mask)
-    if mask.dtype != np.bool_ or mask.ndim != 2 or mask.shape[1] % 3 or not mask.size:
+    if mask.dtype != np.bool_ or mask.ndim != 2 or mask.shape[1] % _TYPES or not mask.size:
         raise ValueError(
             f"{name}: expected a bool array of shape [K, 3L], got {mask.dtype} {list(mask.shape)}"
         )

@@ -1,4 +1,4 @@
-"""Pictures of visual-token pruning: what a policy went on looking at, how deep, and how that followed the hand's speed."""
+"""Pictures of visual-token pruning: which tokens a policy kept, how deep, and how that followed the hand's speed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SPEED, _FINE, _QUERY = "#0072B2", "#F2C14E", "#D55E00"
 
 
 def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: int = 1) -> np.ndarray:
-    """The cameras side by side, each patch the darker, the earlier its token was dropped; those never dropped as they are.
+    """Draw the cameras side by side, each patch the darker, the earlier its token was dropped; those never dropped as they are.
 
     Args:
         images: u8 [V, 3, h, w], a query's images.
@@ -57,7 +57,7 @@ def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: i
 
 
 def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path: str | os.PathLike) -> Path:
-    """Pictures of `draw_tokens` along a rollout, from left to right, each camera in a row of its own.
+    """Line up pictures of `draw_tokens` along a rollout, from left to right, each camera in a row of its own.
 
     Args:
         pictures: u8 [h, V * w, 3], one per query that is shown; the V images of each are square.
@@ -91,7 +91,7 @@ def plot_control(
     *,
     kept: np.ndarray | None = None,
 ) -> Path:
-    """When the controller held the motion for fine, over the hand's speed, with the queries marked.
+    """Draw when the controller held the motion for fine, over the hand's speed, with the queries marked.
 
     Args:
         speed: [T] m/s at each step.
@@ -129,7 +129,7 @@ def plot_control(
 
 
 def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: str | os.PathLike) -> Path:
-    """Visual tokens in each decoder layer, mean over queries, of several methods.
+    """Draw the visual tokens in each decoder layer, mean over queries, of several methods.
 
     Args:
         depth: method -> [queries, N] layers that each token reached (``("tokens", "depth")``).
@@ -157,7 +157,7 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
 
 
 def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
-    """What every alpha loses over the tokens that it keeps, with the tolerance and the choice.
+    """Draw what every alpha loses over the tokens that it keeps, with the tolerance and the choice.
 
     Args:
         budget: calibrated.

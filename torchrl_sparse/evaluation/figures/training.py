@@ -14,7 +14,7 @@ __all__ = ["plot_pruner_curves", "read_scalars"]
 
 
 def read_scalars(folder: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Everything that TorchRL's CSV logger wrote: name -> f64 [n, 2] of step and value.
+    """Read everything that TorchRL's CSV logger wrote: name -> f64 [n, 2] of step and value.
 
     A training that was killed and resumed logs the steps since its checkpoint twice; the later entry counts.
 
@@ -36,7 +36,7 @@ def read_scalars(folder: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike, *, rate: float) -> Path:
-    """Fidelity loss and held-out error; prune rate; pruned share of each type of block, over the updates.
+    """Draw fidelity loss and held-out error; prune rate; pruned share of each type of block, over the updates.
 
     Args:
         curves: of :func:`read_scalars`, with ``train/fidelity``, ``train/rate``, ``train/rate_cost`` and

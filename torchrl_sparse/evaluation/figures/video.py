@@ -84,7 +84,7 @@ def write_video(
 
 
 def add_caption(frame: np.ndarray, caption: Caption) -> np.ndarray:
-    """The frame above a bar of two lines: method and step; the latest query, with a lamp lit at queries.
+    """Put a bar of two lines under the frame: method and step; the latest query, with a lamp lit at queries.
 
     Args:
         frame: u8 [h, w, 3].
@@ -135,7 +135,7 @@ def _even(frame: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _font(size: int, bold: bool = False):
-    """DejaVu Sans, which matplotlib brings along, so that videos look the same on every machine."""
+    """Load DejaVu Sans, which matplotlib brings along, so that videos look the same on every machine."""
     import matplotlib
     from PIL import ImageFont
 

@@ -1,7 +1,7 @@
-"""What a benchmark of the engines runs: shapes, queries of different sparsity, and every way of answering them.
+"""The cases of a benchmark of the engines: shapes, queries of different sparsity, and every way of answering them.
 
 A *query kind* is a sampler and a mask (``"dense"``, ``"random91"``, ``"ddim10"`` ...); a *variant* is one way of answering
-one kind of query, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, be it that
+one kind of query, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, though
 diffusers' sampler draws the noise itself.
 """
 
@@ -23,7 +23,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.training.diffusion.published import published_network
 
-__all__ = ["QUICK", "SHAPES", "EngineCase", "Query", "Variant", "make_network"]
+__all__ = ["QUICK", "SHAPES", "EngineCase", "QueryKind", "Variant", "make_network"]
 
 # The published networks by task, and what differs; the robomimic image tasks differ from low_dim in their condition.
 SHAPES = {"low_dim": ("lift", {}), "image": ("lift", {"cond_dim": 137}), "kitchen": ("kitchen", {})}
@@ -38,7 +38,7 @@ _DRAWN_SEED = 1
 
 
 def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
-    """An untrained network of a published shape; ``quick`` makes it small.
+    """Make an untrained network of a published shape; ``quick`` makes it small.
 
     Raises:
         ValueError: on an unknown shape.
@@ -51,7 +51,7 @@ def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
 
 
 @dataclass(frozen=True)
-class Query:
+class QueryKind:
     """One kind of query.
 
     Attributes:
@@ -63,11 +63,11 @@ class Query:
     mask: Tensor | None = None
 
     def evaluations(self) -> Tensor | None:
-        """How often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
+        """Count how often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
         return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0)
 
     def row_evaluations(self, batch: int) -> int | Tensor:
-        """How often each block is computed, counting every row by itself, i64 [3L]; one number if all are as often."""
+        """Count how often each block is computed, every row by itself, i64 [3L]; one number if all are as often."""
         if self.mask is None:
             return batch * self.sampler.num_inference_steps
         return (~self.mask).sum(dim=(0, 1))
@@ -100,7 +100,7 @@ class EngineCase:
         batch: rows B; each has a random mask of its own where masks are random.
         num_steps: denoising steps K of the dense query.
         compiled: also run the eager baseline through ``torch.compile``.
-        bac_mask: of a sampler of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
+        bac_mask: of a schedule of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
             first of the case's own queries, whose observation is noise.
     """
 
@@ -127,12 +127,12 @@ class EngineCase:
         self.queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
 
     def reference(self, kind: str) -> Tensor:
-        """The right answer to a query."""
+        """Return the reference engine's answer to a query, [B, H, A]."""
         query = self.queries[kind]
         return self._call(ReferenceEngine(self.network, query.sampler), query)()
 
     def variants(self) -> dict[str, Variant]:
-        """Everything to time, by name."""
+        """Return all ways of answering all kinds of queries, by name."""
         variants = self._eager_variants()
         variants["reference dense"] = Variant(partial(self.reference, "dense"), "dense", "reference dense")
         runners = {"torch": TorchEngine}
@@ -152,7 +152,7 @@ class EngineCase:
                 variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
         return variants
 
-    def _call(self, engine: Engine, query: Query) -> Callable[[], Tensor]:
+    def _call(self, engine: Engine, query: QueryKind) -> Callable[[], Tensor]:
         noise = self.noise[:, : query.sampler.num_inference_steps].contiguous()
         return partial(engine.denoise, noise, self.cond, query.mask)
 
@@ -176,7 +176,7 @@ class EngineCase:
 
         return call
 
-    def _make_queries(self, generator: torch.Generator, bac_masks: Tensor) -> dict[str, Query]:
+    def _make_queries(self, generator: torch.Generator, bac_masks: Tensor) -> dict[str, QueryKind]:
         ddpm, steps = self._ddpm, self._ddpm.num_inference_steps
         full = torch.linspace(0, steps - 1, round((1 - _PRUNE_RATE) * steps)).round().long()
         full_steps = torch.ones(self.batch, steps, self.network.num_blocks, dtype=torch.bool)
@@ -184,19 +184,19 @@ class EngineCase:
         all_pruned = torch.ones_like(full_steps)
         all_pruned[:, 0] = False
         queries = {
-            "dense": Query(ddpm),
-            "random91": Query(ddpm, self._random_mask(steps, _PRUNE_RATE, generator)),
-            "bac10": Query(ddpm, bac_masks),
-            f"full{len(full)}": Query(ddpm, full_steps),
-            "all-pruned": Query(ddpm, all_pruned),
+            "dense": QueryKind(ddpm),
+            "random91": QueryKind(ddpm, self._random_mask(steps, _PRUNE_RATE, generator)),
+            "bac10": QueryKind(ddpm, bac_masks),
+            f"full{len(full)}": QueryKind(ddpm, full_steps),
+            "all-pruned": QueryKind(ddpm, all_pruned),
         }
         for count in (16, 10, 8):
             count = min(count, steps)
-            queries[f"ddim{count}"] = Query(self._ddim(count))
+            queries[f"ddim{count}"] = QueryKind(self._ddim(count))
             mask = self._random_mask(count, _SHORT_PRUNE_RATE, generator)
-            queries[f"ddim{count}-random50"] = Query(self._ddim(count), mask)
+            queries[f"ddim{count}-random50"] = QueryKind(self._ddim(count), mask)
         # One step, and what a query takes besides its steps.
-        queries["ddim1"] = Query(self._ddim(1))
+        queries["ddim1"] = QueryKind(self._ddim(1))
         return queries
 
     def _ddim(self, num_steps: int) -> Sampler:

@@ -1,9 +1,7 @@
-"""Latency measured so that it can be compared: one process, interleaved, warmed up, synchronised, threads
-named.
+"""Latency measured so that it can be compared: one process, interleaved, warmed up, synchronised, threads named.
 
-Timing one method to the end before the next compares two states of the machine (clock, caches, neighbours)
-as much as two methods. Here every round calls each candidate once, in an order shuffled per round, so that
-a slow minute hits all of them.
+Timing one method to the end before the next compares two states of the machine (clock, caches, neighbours) as much as two
+methods. Here every round calls each candidate once, in an order shuffled per round, so that a slow minute hits all of them.
 """
 
 import os
@@ -43,7 +41,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Machine:
-    """What latencies were measured on: processor, PyTorch's threads, device, PyTorch's version, date and time."""
+    """The machine that latencies were measured on: processor, PyTorch's threads, device, PyTorch's version, date and time."""
 
     cpu: str
     threads: int
@@ -53,7 +51,7 @@ class Machine:
 
 
 def summarize_latency(samples: Sequence[float]) -> Latency:
-    """Percentiles (linear interpolation) of latencies in seconds.
+    """Summarise latencies, in seconds, by percentiles (linear interpolation).
 
     Raises:
         ValueError: if there are none, or one is negative or not finite.

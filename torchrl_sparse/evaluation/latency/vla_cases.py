@@ -1,4 +1,4 @@
-"""What a latency benchmark of vision-language-action models runs: shapes, queries, the parts of a query, and what pruning adds.
+"""The cases of a latency benchmark of vision-language-action models: shapes, queries, parts of a query, and pruning's own work.
 
 Weights are random: they change which tokens go, not what arithmetic costs. Every method answers the second query of an episode,
 in which a tenth of all patches has changed, with what it remembers of the first. Parts and helpers are replayed on tensors of
@@ -49,7 +49,7 @@ _CHANGED = 0.1
 def make_policy(
     shape: str, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> VLAPolicy:
-    """An untrained policy of one of `SHAPES`.
+    """Make an untrained policy of one of `SHAPES`.
 
     Args:
         dtype, device: of the network's weights.
@@ -90,16 +90,16 @@ class VLACase:
             self.queries[name] = remembered.update(second)
 
     def answer(self, name: str) -> TensorDictBase:
-        """What a method answers to its query."""
+        """Return a method's answer to its query."""
         return self.policies[name](self.queries[name].clone(recurse=False))
 
     def sequence(self) -> LayerState:
-        """The decoder's input, [1, S], of a dense query."""
+        """Return the decoder's input, [1, S], of a dense query."""
         policy, query = self._dense
-        return _watched(policy, _FirstLayer(), query).scored[0][0]
+        return _recorded(policy, _FirstLayer(), query).scored[0][0]
 
     def parts(self) -> dict[str, Callable[[], Any]]:
-        """What makes up a dense query, but for reading and laying out its inputs: name -> call."""
+        """Return the parts of a dense query, but for reading and laying out its inputs: name -> call."""
         network, sequence = self.network, self.sequence()
         images = torch.cat([self._dense[1][camera] for camera in network.config.cameras])
         features = network.vision(images)
@@ -111,21 +111,21 @@ class VLACase:
             "action head": lambda: network.head(readout),
         }
 
-    def watch(self, name: str) -> _Watch:
-        """What a method's pruner worked on in its query."""
-        return _watched(self.policies[name], self.policies[name].pruner, self.queries[name])
+    def record(self, name: str) -> _Recorder:
+        """Record what a method's pruner works on in its query."""
+        return _recorded(self.policies[name], self.policies[name].pruner, self.queries[name])
 
     def helpers(self, name: str) -> dict[str, Callable[[], Any]]:
-        """What a pruner adds to its query: name -> call. ``choosing`` is all that it does itself, ``comparing`` included."""
-        watch = self.watch(name)
-        calls = {"choosing": watch.choose}
-        if set(FRAME_KEYS) <= set(watch.in_keys):
+        """Return a pruner's own work in its query: name -> call. ``choosing`` is all of it, ``comparing`` included."""
+        recorder = self.record(name)
+        calls = {"choosing": recorder.choose}
+        if set(FRAME_KEYS) <= set(recorder.in_keys):
             spec = self.network.config.visual_spec
-            calls["comparing"] = lambda: compare_frames(watch.start.clone(recurse=False), spec)
-        if watch.scored:
-            calls["scoring"] = partial(watch.score, self.network.config.llm.heads)
-        if any(keep is not None for _, keep in watch.answered):
-            calls["gathering"] = watch.gather
+            calls["comparing"] = lambda: compare_frames(recorder.start.clone(recurse=False), spec)
+        if recorder.scored:
+            calls["scoring"] = partial(recorder.score, self.network.config.llm.heads)
+        if any(keep is not None for _, keep in recorder.answered):
+            calls["gathering"] = recorder.gather
         return calls
 
 
@@ -136,7 +136,7 @@ class _FirstLayer(TokenPruner):
         return {0}
 
 
-class _Watch(TokenPruner):
+class _Recorder(TokenPruner):
     """Does what another pruner does, notes what it worked on, and does it again."""
 
     def __init__(self, inner: TokenPruner):
@@ -164,7 +164,7 @@ class _Watch(TokenPruner):
         return keep
 
     def choose(self) -> None:
-        """All of the pruner's own work."""
+        """Do all of the pruner's own work."""
         td = self.start.clone(recurse=False)
         self.inner.begin(td)
         for state, _ in self.scored:
@@ -174,27 +174,27 @@ class _Watch(TokenPruner):
         self.inner.end(td)
 
     def score(self, heads: int) -> None:
-        """The scores of all scored layers, on numbers that are as good as queries and keys."""
+        """Compute the scores of all scored layers, on numbers that are as good as queries and keys."""
         for state, rows in self.scored:
             projected = state.hidden.unflatten(-1, (heads, -1)).transpose(1, 2)
             visual_scores(state, projected, projected, rows)
 
     def gather(self) -> None:
-        """The shorter sequences of all layers that dropped tokens."""
+        """Build the shorter sequences of all layers that dropped tokens."""
         for state, keep in self.answered:
             if keep is not None:
                 pack(state, state.alive & (keep | ~state.is_visual))
 
 
-def _watched(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Watch:
-    """What ``pruner`` did in a query of this model."""
-    watch = _Watch(pruner)
-    policy.with_pruner(watch)(query.clone(recurse=False))
-    return watch
+def _recorded(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Recorder:
+    """Record what ``pruner`` does in a query of this model."""
+    recorder = _Recorder(pruner)
+    policy.with_pruner(recorder)(query.clone(recurse=False))
+    return recorder
 
 
 def _queries(policy: VLAPolicy) -> tuple[TensorDict, TensorDict]:
-    """The first two queries of an episode, [1]: noise for images, and the same with some patches drawn anew."""
+    """Make the first two queries of an episode, [1]: noise for images, and the same with some patches drawn anew."""
     config, generator = policy.network.config, torch.Generator().manual_seed(0)
     size, rows = (1, 3, config.image_size, config.image_size), config.grid[0]
     first = TensorDict({keys.INSTRUCTION: [_INSTRUCTION]}, [1])

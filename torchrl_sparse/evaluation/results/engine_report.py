@@ -150,7 +150,7 @@ def _all_weights(case: EngineCase) -> torch.Tensor:
 
 
 def _all_pruned_steps(case: EngineCase, rows: Mapping[str, EngineRow]) -> dict[str, float]:
-    """Seconds of a step that computes nothing, per runner: what all of them take beyond a query of one dense step."""
+    """Return the seconds of a step that computes nothing, per runner: what all take beyond a query of one dense step."""
     steps = case.queries["dense"].sampler.num_inference_steps
     runners = [name.split()[0] for name in rows if name.endswith(" all-pruned")]
     return {

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_sparse.envs.seeds import EVALUATION_SEED
+from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
@@ -99,8 +99,7 @@ def _vla(path: Path) -> dict[str, Table]:
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
-    first = EVALUATION_SEED + results.seed
-    seeds = range(first, first + results.dense.success.n)
+    seeds = evaluation_seeds(results.seed, results.dense.success.n)
     names = {name for pair in pairs for name in pair}
     episodes = {name: list(_episodes(path.parent / "episodes" / f"{name}.jsonl", seeds)) for name in names}
     return _table(results.task, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))

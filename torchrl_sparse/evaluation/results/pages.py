@@ -15,7 +15,7 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
 - ``rows``: which table of a file with several: a shape of an ``engine.json``, or ``methods`` or ``parts`` of a
   ``vla_latency.json``.
 - ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
-- Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per file.
+- Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
 - ``cells="success, % | speed-up"``: side by side, one row per method and one column per task, which holds these columns of the
   method. Of files of the same task the first that has the method counts. ``published=assets/published.json`` puts a paper's
   figures before each (`Published`).
@@ -47,7 +47,7 @@ _OPTIONS = ("methods", "columns", "rows", "pairs", "tasks", "cells", "published"
 
 @dataclass(frozen=True)
 class _Directive:
-    """What one comment asks for."""
+    """Files and options that one comment names."""
 
     files: Sequence[str]
     options: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""The TorchRL collector that runs episodes in this process, in several, or on a Ray cluster, and how it tells of a death."""
+"""The TorchRL collector that runs episodes in this process, in several, or on a Ray cluster, and which of its workers died."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def start_collector(
     max_steps: int | None,
     policy_device: torch.device | str | None,
 ) -> BaseCollector:
-    """A collector without end whose environments have the seeds dealt among them; see `rollout_episodes`.
+    """Start a collector without end, and deal the seeds among its environments; see `rollout_episodes`.
 
     Its batches are [workers, environments, steps] of several processes, else [environments, steps]: of this process or, on
     Ray, of the worker that was ready first.
@@ -82,7 +82,7 @@ def _start_ray(make, actor, frames_per_batch: int, transforms: dict, options: di
 def _batched(
     make_env: Callable[..., EnvBase], shares: Sequence[Sequence[int]], max_steps: int | None
 ) -> EnvBase:
-    """One environment per share of the seeds, stepped as one batch."""
+    """Make one environment per share of the seeds, stepped as one batch."""
     # One function with differing arguments, rather than differing functions, lets SerialEnv take its
     # specs from a single throw-away environment instead of one per worker.
     env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
@@ -90,10 +90,10 @@ def _batched(
 
 
 def lost_workers(collector: BaseCollector, error: Exception) -> str:
-    """Which workers died of themselves, in words; empty if none did and ``error`` is of another kind."""
+    """Name the workers that died of themselves; empty if none did and ``error`` is of another kind."""
     if hasattr(collector, "remote_collectors"):
         return ray_death(error)
-    # What TorchRL raises when a process dies depends on when it notices; that one did is what counts.
+    # TorchRL's exception depends on when it notices the death; that a process is dead counts.
     dead = [
         f"worker {index} ended with exit code {process.exitcode}"
         for index, process in enumerate(getattr(collector, "procs", ()))

@@ -172,7 +172,7 @@ class EpisodeLog:
         self.episodes[episode.seed] = episode
 
     def missing(self, seeds: Iterable[int]) -> list[int]:
-        """The seeds that have no episode yet, in their order."""
+        """Return the seeds that have no episode yet, in their order."""
         return [seed for seed in seeds if seed not in self.episodes]
 
     def _write(self, data: Mapping[str, Any]) -> None:

@@ -79,9 +79,13 @@ def rollout_episodes(
         KeyError: if the actor or the environment leaves out a key that is needed.
         RuntimeError: if workers keep dying without finishing an episode.
 
-    >>> from torchrl_sparse.envs import make_env                                      # doctest: +SKIP
-    >>> rollout_episodes(actor, lambda seeds: make_env("Lift", seeds=seeds), range(100),
-    ...                  results_file="dense.jsonl", identity={"method": "dense"})    # doctest: +SKIP
+    Examples:
+        >>> from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, make_env
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> policy.sampler = Sampler("ddim", 2)
+        >>> make = partial(make_env, "Lift", horizon=12)
+        >>> [episode.queries for episode in rollout_episodes(ChunkExecutor(policy), make, [100_000, 100_001], num_envs=2)]
+        [2, 2]
     """
     seeds = [int(seed) for seed in seeds]
     if len(set(seeds)) != len(seeds):
@@ -123,7 +127,7 @@ def rollout_episodes(
 def _episodes(
     start: Callable[[Sequence[int]], BaseCollector], seeds: Sequence[int]
 ) -> Iterator[EpisodeResult]:
-    """The episode of each seed, as it ends; a collector whose worker dies is replaced by a new one for what is left."""
+    """Yield the episode of each seed as it ends; a collector whose worker dies is replaced by a new one for what is left."""
     pending, failures = list(seeds), 0
     while pending:
         collector = start(pending)
@@ -144,7 +148,7 @@ def _episodes(
 
 
 def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeResult]:
-    """Each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
+    """Yield each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
     running: dict[int, _OpenEpisode] = {}
     for batch in collector:
         for step in batch.unbind(-1):
@@ -194,7 +198,7 @@ class _OpenEpisode:
                 values.append(value.item())
 
     def close(self, seed: int) -> EpisodeResult:
-        """The finished episode."""
+        """Return the finished episode."""
         return EpisodeResult(
             seed,
             self.success,

@@ -1,4 +1,4 @@
-"""How far a sparse query is from the dense one on the same observation and the same noise."""
+"""Errors of a sparse query to the dense one, on the same observation and the same noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["action_error", "block_errors", "relative_error"]
 
 
 def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
-    """Mean and maximum absolute difference of action entries, in the units of the chunks.
+    """Return the mean and maximum absolute difference of action entries, in the units of the chunks.
 
     Args:
         chunks: of the method, [..., H, A].
@@ -35,7 +35,7 @@ def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
 
 
 def relative_error(features: Tensor, dense_features: Tensor) -> Tensor:
-    """``‖x − dense‖₂ / ‖dense‖₂`` of every block's output at every denoising step, averaged over samples.
+    """Return ``‖x − dense‖₂ / ‖dense‖₂`` of every block's output at every denoising step, averaged over samples.
 
     Args:
         features: [3L, K, B, ...] outputs as :class:`FeatureRecorder` returns them.
@@ -67,15 +67,14 @@ def block_errors(
     cond: Tensor,
     masks: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
-    """The error surge (figure 3 of BAC, arXiv:2506.13456): relative errors of the blocks under several
-    schedules.
+    """Return the relative errors of the blocks under several schedules: the error surge (figure 3 of BAC, arXiv:2506.13456).
 
     Args:
         network: the denoiser, in eval mode.
         sampler: the denoising steps, K of them.
         noise: f32 [N, K, H, A], as :func:`~torchrl_sparse.blocks.engine.reference.denoise` takes it.
         cond: encoded observations f32 [N, To, D].
-        masks: name -> sampler, bool [K, 3L], True = pruned.
+        masks: name -> mask, bool [K, 3L], True = pruned.
 
     Returns:
         name -> f64 [K, 3L], see :func:`relative_error`.

@@ -34,7 +34,7 @@ DEFAULT_MARGIN = 0.05
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Success of a method minus success of the reference on the same seeds.
+    """Success of a method minus success of the one that it is compared with, on the same seeds.
 
     Attributes:
         diff: difference of the two success rates, in [-1, 1]; negative where the method is worse.
@@ -42,7 +42,7 @@ class PairedDifference:
         margin: the non-inferiority margin of ``verdict``, a positive difference of rates.
         verdict: see :func:`verdict`.
         won: pairs that only the method solved.
-        lost: pairs that only the reference solved.
+        lost: pairs that only the other solved.
         n: pairs.
     """
 
@@ -56,7 +56,7 @@ class PairedDifference:
 
 
 def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a success rate.
+    """Return Wilson's score interval of a success rate.
 
     Args:
         k: successes, 0 <= k <= n.
@@ -77,7 +77,7 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
 
 def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Tango's score interval of ``(won - lost) / n``, the difference of two paired proportions.
+    """Return Tango's score interval of ``(won - lost) / n``, the difference of two paired proportions.
 
     Args:
         won: pairs in which only the first member succeeds.
@@ -107,7 +107,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
         return -1.0, (z2 - n) / (n + z2)
 
     def excess(delta: float) -> float:
-        """Squared score statistic minus z², times its variance: negative inside the interval."""
+        """Return the squared score statistic minus z², times its variance: negative inside the interval."""
         variance = 2 * _constrained_loss_rate(won, lost, n, delta) + delta * (1 - delta)
         return (won - lost - n * delta) ** 2 - z2 * n * variance
 
@@ -116,7 +116,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
 
 
 def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:
-    """Maximum-likelihood probability of a lost pair under a true difference ``delta`` (Tango 1998)."""
+    """Return the maximum-likelihood probability of a lost pair under a true difference ``delta`` (Tango 1998)."""
     a = 2 * n
     b = -won - lost + (2 * n - won + lost) * delta
     c = -lost * delta * (1 - delta)
@@ -124,7 +124,7 @@ def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:
 
 
 def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
-    """What an interval of a paired difference says about a non-inferiority margin.
+    """Judge an interval of a paired difference by a non-inferiority margin.
 
     ``"non-inferior"`` if the whole interval lies above ``-margin``, ``"inferior"`` if all of it lies below,
     else ``"undecided"``: the episodes do not suffice to tell.
@@ -142,7 +142,7 @@ def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
 
 def paired_difference(
     method: Sequence[bool],
-    reference: Sequence[bool],
+    other: Sequence[bool],
     margin: float = DEFAULT_MARGIN,
     confidence: float = 0.95,
 ) -> PairedDifference:
@@ -155,18 +155,18 @@ def paired_difference(
     >>> result.diff, result.lost, result.verdict
     (-0.25, 1, 'undecided')
     """
-    if len(method) != len(reference) or not len(method):
+    if len(method) != len(other) or not len(method):
         raise ValueError(
-            f"pairs need as many episodes of both, and at least one, got {len(method)} and {len(reference)}"
+            f"pairs need as many episodes of both, and at least one, got {len(method)} and {len(other)}"
         )
-    pairs = [(bool(ours), bool(theirs)) for ours, theirs in zip(method, reference, strict=True)]
+    pairs = [(bool(ours), bool(theirs)) for ours, theirs in zip(method, other, strict=True)]
     won, lost, n = pairs.count((True, False)), pairs.count((False, True)), len(pairs)
     ci = tango_interval(won, lost, n, confidence)
     return PairedDifference((won - lost) / n, ci, margin, verdict(ci, margin), won, lost, n)
 
 
 def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) -> int:
-    """Fewest pairs that can show non-inferiority at all: those that suffice when no pair is discordant.
+    """Return the fewest pairs that can show non-inferiority at all: those that suffice when no pair is discordant.
 
     >>> episodes_needed(0.05)
     73

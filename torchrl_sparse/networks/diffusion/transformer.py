@@ -19,8 +19,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-__all__ = ["TransformerForDiffusion", "optimizer_groups"]
+__all__ = ["BLOCK_TYPES", "TransformerForDiffusion", "optimizer_groups"]
 
+BLOCK_TYPES = ("SA", "CA", "FFN")
 _INIT_STD = 0.02
 _SIZES = ("input_dim", "output_dim", "horizon", "n_obs_steps", "cond_dim", "n_layer", "n_head", "n_emb")
 
@@ -118,7 +119,7 @@ class TransformerForDiffusion(nn.Module):
         _check_config(self.config)
         for name, value in self.config.items():
             setattr(self, name, value)
-        self.num_blocks = 3 * n_layer
+        self.num_blocks = len(BLOCK_TYPES) * n_layer
         self._build()
         self._init_weights()
 
@@ -167,12 +168,12 @@ class TransformerForDiffusion(nn.Module):
         nn.init.normal_(self.cond_pos_emb, std=_INIT_STD)
 
     def embed(self, sample: Tensor) -> Tensor:
-        """Stem: noisy actions [B, H, input_dim] to tokens [B, H, n_emb]."""
+        """Embed noisy actions [B, H, input_dim] as tokens [B, H, n_emb]."""
         self._check("sample", sample, (self.horizon, self.input_dim))
         return self.drop(self.input_emb(sample) + self.pos_emb)
 
     def memory(self, timestep: int | Tensor, cond: Tensor) -> Tensor:
-        """Condition tokens, [B, 1 + To, n_emb].
+        """Encode the condition tokens, [B, 1 + To, n_emb].
 
         Args:
             timestep: a number, or i64 [B].
@@ -189,7 +190,7 @@ class TransformerForDiffusion(nn.Module):
         return self.encoder(self.drop(tokens + self.cond_pos_emb))
 
     def block(self, index: int, x: Tensor, memory: Tensor) -> Tensor:
-        """What block ``index`` adds to the residual stream, [B, H, n_emb]; it is *not* added here.
+        """Compute what block ``index`` adds to the residual stream, [B, H, n_emb]; it is *not* added here.
 
         Args:
             index: ``3 * layer + {0: SA, 1: CA, 2: FFN}``.
@@ -205,13 +206,13 @@ class TransformerForDiffusion(nn.Module):
             >>> torch.equal(net.head_out(x), net(torch.ones(1, 4, 2), 0, torch.ones(1, 2, 3)))
             True
         """
-        layer = self.decoder.layers[index // 3]
-        kind = index % 3
-        if kind == 0:
+        layer, kind = divmod(index, len(BLOCK_TYPES))
+        layer = self.decoder.layers[layer]
+        if BLOCK_TYPES[kind] == "SA":
             y = layer.norm1(x)
             y = layer.self_attn(y, y, y, attn_mask=self.mask, need_weights=False)[0]
             return layer.dropout1(y)
-        if kind == 1:
+        if BLOCK_TYPES[kind] == "CA":
             y = layer.norm2(x)
             y = layer.multihead_attn(y, memory, memory, attn_mask=self.memory_mask, need_weights=False)[0]
             return layer.dropout2(y)
@@ -219,11 +220,11 @@ class TransformerForDiffusion(nn.Module):
         return layer.dropout3(layer.linear2(y))
 
     def head_out(self, x: Tensor) -> Tensor:
-        """Final norm and projection: residual stream [B, H, n_emb] to noise [B, H, output_dim]."""
+        """Project the residual stream [B, H, n_emb], normalised, to noise [B, H, output_dim]."""
         return self.head(self.ln_f(x))
 
     def forward(self, sample: Tensor, timestep: int | Tensor, cond: Tensor) -> Tensor:
-        """Predicted noise, [B, H, output_dim].
+        """Predict the noise, [B, H, output_dim].
 
         Args:
             sample: noisy actions [B, H, input_dim].
@@ -245,7 +246,7 @@ class TransformerForDiffusion(nn.Module):
 
 
 def optimizer_groups(network: nn.Module, weight_decay: float) -> list[dict]:
-    """Parameter groups for AdamW as published: only Linear and attention weights decay.
+    """Return the parameter groups for AdamW as published: only Linear and attention weights decay.
 
     Args:
         network: any module.
@@ -272,7 +273,7 @@ def optimizer_groups(network: nn.Module, weight_decay: float) -> list[dict]:
 
 
 def _causal_masks(horizon: int, num_memory: int) -> tuple[Tensor, Tensor]:
-    """Additive masks [H, H] and [H, 1 + To]: 0 where attention is allowed, -inf elsewhere."""
+    """Make additive masks [H, H] and [H, 1 + To]: 0 where attention is allowed, -inf elsewhere."""
     step = torch.arange(horizon)[:, None]
     hidden = torch.tensor(float("-inf"))
     seen = torch.tensor(0.0)

@@ -22,7 +22,7 @@ _STRIDE = 32
 
 
 def crop_centre(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """The middle ``size`` (height, width) of images [N, 3, h, w].
+    """Crop the middle ``size`` (height, width) of images [N, 3, h, w].
 
     >>> crop_centre(torch.arange(16).view(1, 1, 4, 4), (2, 2)).flatten().tolist()
     [5, 6, 9, 10]
@@ -32,7 +32,7 @@ def crop_centre(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def crop_random(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """A ``size`` (height, width) part of each of the images [N, 3, h, w], each at a place of its own.
+    """Crop a ``size`` (height, width) part of each of the images [N, 3, h, w], each at a place of its own.
 
     Places are drawn from torch's global generator.
 
@@ -48,7 +48,7 @@ def crop_random(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def spatial_softmax(maps: Tensor) -> Tensor:
-    """Where each map looks: the mean place [N, K, 2] under its softmax, (x, y) in [-1, 1], x to the right.
+    """Find where each map looks: the mean place [N, K, 2] under its softmax, (x, y) in [-1, 1], x to the right.
 
     Args:
         maps: [N, K, h, w].
@@ -104,7 +104,7 @@ class VisionEncoder(nn.Module):
     Args:
         cameras: names of the images, ``("history", name)`` in a TensorDict; their features come in this order.
         image_size: height and width of the images, pixels.
-        crop_size: height and width of what the networks see of them.
+        crop_size: height and width of the part that the networks see.
         width: channels of the first stage of the networks, a multiple of 16; 64 is ResNet-18.
 
     Attributes:

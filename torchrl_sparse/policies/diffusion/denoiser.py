@@ -47,8 +47,6 @@ class ActionDenoiser(TensorDictModuleBase):
         )
         shape = (self.network.horizon, self.network.input_dim)
         noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
-        # An encoder under autocast returns half precision.
-        cond = cond.to(noise.dtype)
         actions = self._follow_rules(noise, cond, mask, keys.read(tensordict, keys.REUSE).reshape(-1))
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))

@@ -23,9 +23,8 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
-from torchrl_sparse.storage.files import read_tensors
 from torchrl_sparse.storage.json import read_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, take
 from torchrl_sparse.storage.vla import StoredVLA
 
 __all__ = ["read_openvla_oft"]

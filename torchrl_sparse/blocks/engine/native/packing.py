@@ -23,8 +23,8 @@ from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.folding import (
     Affine,
-    ConditionEncoder,
     FoldedLayer,
+    MemoryEncoder,
     after_norm,
     fold_layers,
     fold_observation_stem,
@@ -87,7 +87,7 @@ class PackedNetwork:
         packed = [
             _Layer(**blocks, **self._pack_memory(layer)) for blocks, layer in zip(loop, layers, strict=True)
         ]
-        tables = self._time_tables(layers, ConditionEncoder(network, sampler.timesteps, torch.float64))
+        tables = self._time_tables(layers, MemoryEncoder(network, sampler.timesteps, torch.float64))
         return Model(
             horizon=network.horizon,
             width=network.n_emb,
@@ -133,7 +133,7 @@ class PackedNetwork:
             "cross_bias": self._columns(layer.cross_out.bias),
         }
 
-    def _time_tables(self, layers: list[FoldedLayer], encoder: ConditionEncoder) -> dict[str, int]:
+    def _time_tables(self, layers: list[FoldedLayer], encoder: MemoryEncoder) -> dict[str, int]:
         """Tabulate folded keys, values [K, L, heads, width] and score biases [K, L, heads] of the time tokens."""
         vectors, bias = fold_tokens(layers, encoder.time_tokens())
         keys, values = vectors.permute(1, 2, 0, 3, 4)

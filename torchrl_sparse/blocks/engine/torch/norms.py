@@ -1,8 +1,7 @@
-"""What is left of layer norms in the PyTorch engine.
+"""Layer norms in the PyTorch engine: a division by a length is all that is left of them.
 
 Nothing ever sees the mean of the residual stream, so what is added to it is centred beforehand, in the weights that make
-it. All that is left of a norm is then a division by a length, ``x / sqrt(|x|^2 + d eps)``, and a factor sqrt(d) that goes
-into the weights behind it.
+it. A norm is then ``x / sqrt(|x|^2 + d eps)`` and a factor sqrt(d), which goes into the weights behind it.
 """
 
 from __future__ import annotations

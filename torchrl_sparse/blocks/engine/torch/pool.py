@@ -39,7 +39,7 @@ class WorkspacePool:
 
     @property
     def captures(self) -> bool:
-        """Whether segments are captured, and a batch has to be padded."""
+        """True if segments are captured, so that batches have to be padded."""
         return self.new_capture is not None
 
     @contextmanager

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.folding import (
     Affine,
-    ConditionEncoder,
     FoldedLayer,
     FoldedMemory,
+    MemoryEncoder,
     after_norm,
     fold_layers,
     fold_tokens,
@@ -59,7 +59,7 @@ class Tables:
         self.head_weight, self.head_bias = transposed(head.weight.to(like)), head.bias.to(like)
         self.memory_mask = None if network.memory_mask is None else network.memory_mask.clone()
         self.fold = TokenFold(layers, like)
-        self.encoder = ConditionEncoder(network, sampler.timesteps)
+        self.encoder = MemoryEncoder(network, sampler.timesteps)
         self.num_steps = sampler.num_inference_steps
         self.time = self._fold_time(layers) if self.encoder.separable else None
         coefficients = sampler.coefficients

@@ -1,0 +1,129 @@
+"""A page names its tables, and gets them from the files that it names."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.evaluation.synthetic import make_results
+from torchrl_sparse.evaluation.results.pages import find_pages, write_pages, write_tables
+from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
+
+ASSETS = Path(__file__).parents[3] / "assets"
+
+
+@pytest.fixture
+def root(tmp_path):
+    save_results(make_results(20, names=("dense", "ddim10", "bac")), tmp_path / "results.json")
+    return tmp_path
+
+
+def page(directive):
+    return f"# Title\n\n<!-- table: {directive} -->\nold\n<!-- end -->\n\nText.\n"
+
+
+def table(directive, root):
+    """The cells of the one table on a page, the heading first."""
+    lines = write_tables(page(directive), root).splitlines()
+    rows = [line for line in lines if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
+    return [cells[0], *cells[2:]]
+
+
+def test_only_what_lies_between_the_comments_changes(root):
+    before = page("results.json")
+    after = write_tables(before, root)
+    assert "old" not in after
+    assert after.splitlines()[:3] == before.splitlines()[:3]
+    assert after.endswith("<!-- end -->\n\nText.\n")
+    assert write_tables(after, root) == after
+
+
+def test_rows_and_columns_are_those_asked_for_in_their_order(root):
+    heading, *rows = table('results.json methods="bac | dense" columns="method | verdict | success, %"', root)
+    assert heading == ["method", "verdict", "success, %"]
+    assert [row[:2] for row in rows] == [["bac", "undecided"], ["dense", "baseline"]]
+    assert [row[0] for row in table("results.json", root)[1:]] == ["dense", "ddim10", "bac"]
+
+
+def test_several_files_are_one_table_or_stand_side_by_side():
+    files = "lift/results.json can/results_400.json can/results.json"
+    heading, *rows = table(f'{files} methods="sag" tasks="Lift | Can"', ASSETS)
+    assert heading[:2] == ["task", "method"]
+    assert [row[:2] for row in rows] == [["Lift", "sag"], ["Can", "sag"], ["Can", "sag"]]
+    cells = f'{files} methods="dense | sag_played | uniform" cells="success, % | speed-up" tasks="Lift | Can"'
+    heading, dense, uniform = table(cells.replace("sag_played | ", ""), ASSETS)
+    assert heading == ["method", "Lift", "Can"]
+    assert dense[2] == "87.0 [83, 90], 1.00×"  # of 400 episodes: the first file that has the method
+    assert uniform[2] == "8.0 [5, 13], 7.94×"
+    with pytest.raises(ValueError, match=r"methods: expected some of dense \| .*, got sag_played"):
+        table(cells, ASSETS)
+
+
+def test_published_figures_stand_before_ours():
+    options = 'methods="dense | bac" cells="success, %" tasks=Can published=published.json'
+    heading, dense, bac = table(f"can/results_400.json {options}", ASSETS)
+    assert heading == ["method", "Can, published", "here"]
+    assert dense == ["full / `dense`", "99", "87.0 [83, 90]"]
+    assert bac == ["BAC / `bac`", "94, 3.42×", "74.2 [70, 78]"]
+
+
+def test_pairs_count_the_episodes_beside_the_results(root):
+    for name, outcomes in {"bac": [True] * 20, "ddim10": [True] * 15 + [False] * 5}.items():
+        log = EpisodeLog(root / "episodes" / f"{name}.jsonl")
+        for index, success in enumerate([*outcomes, False]):  # the last is not of these results
+            log.append(EpisodeResult(100_000 + index, success, 30, 4, 1e9, 0.0))
+    heading, row = table('results.json pairs="bac : ddim10"', root)
+    assert heading == ["method", "against", "success", "difference, points", "verdict"]
+    assert row[:3] == ["bac", "ddim10", "20 : 15"]
+
+
+def test_other_files_of_results_have_their_tables():
+    engine = table(
+        'engine/engine.json rows=low_dim_b4 methods="native dense" columns="variant | × eager"', ASSETS
+    )
+    assert engine == [["variant", "× eager"], ["native dense", engine[1][1]]]
+    assert table("vla_latency/vla_latency.json rows=parts", ASSETS)[-1][0] == "rest"
+    assert table("lift_moving/realtime.json", ASSETS)[1][:3] == ["dense", "0", "0 ms"]
+
+
+@pytest.mark.parametrize(
+    ("directive", "message"),
+    [
+        ("results.json methods=magic", r"methods: expected some of dense \| ddim10 \| bac, got magic"),
+        ("results.json columns=magic", r"columns: expected some of .*, got magic"),
+        ("results.json cells=magic", r"cells: expected some of .*, got magic"),
+        ("results.json rows=magic", r"rows: expected one of methods, got 'magic'"),
+        ("results.json colums=method", r"expected the options methods, .*, got 'colums'"),
+        ('results.json pairs="bac"', r"pairs: expected METHOD : METHOD, got 'bac'"),
+        ("other.json", r"expected a file results\*.json, .*, got other.json"),
+        ("methods=bac", "expected a file of results"),
+        ('results.json methods="bac', "No closing quotation"),
+    ],
+)
+def test_what_cannot_be_followed_is_named_with_page_and_line(root, directive, message):
+    with pytest.raises(ValueError, match=rf"^page:3: {message}"):
+        write_tables(page(directive), root)
+
+
+def test_a_missing_file_or_end_is_named(root):
+    with pytest.raises(FileNotFoundError, match=r"page:3: expected a file .*results_9.json, got none"):
+        write_tables(page("results_9.json"), root)
+    begin = "<!-- table: results.json -->"
+    with pytest.raises(ValueError, match=r"page:1: expected a line <!-- end --> after the table"):
+        write_tables(f"{begin}\n{begin}\n<!-- end -->", root)
+
+
+def test_all_pages_are_written_and_a_dry_run_writes_none(root):
+    (root / "assets").mkdir()
+    shutil.copy(root / "results.json", root / "assets")
+    for name in ("README.md", "assets/README.md", "notes.txt"):
+        (root / name).write_text(page("results.json"))
+    stale = [root / "README.md", root / "assets" / "README.md"]
+    assert find_pages(root) == stale
+    assert write_pages(root, dry=True) == stale
+    assert "old" in stale[0].read_text()
+    assert write_pages(root) == stale
+    assert write_pages(root) == []
+    assert (root / "notes.txt").read_text() == page("results.json")
