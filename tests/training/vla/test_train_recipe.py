@@ -23,9 +23,9 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     settings = [f"demos={demos}", *sizes, *lessons, "checkpoint_every=40", "lr_warmup_steps=2", "threads=1"]
     step, first, second = stop_and_go_on("train_vla", broken, settings)
     assert "3 demonstrations of 3 instructions, 27 steps" in first
-    assert "stopped by SIGTERM, run again to go on" in first
+    assert "stopped by SIGTERM, run again to resume" in first
     assert 40 <= step < 160
-    assert f"going on from step {step}" in second
+    assert f"resumed from step {step}" in second
     assert "step 160 of 160, finished" in second
 
     train_unbroken("train_vla", unbroken, settings)

@@ -13,7 +13,7 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.training.trainer import TrainConfig
+from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.loss import VLALoss
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
@@ -55,7 +55,7 @@ def make_trainer(demos):
 
 
 def run(trainer, until):
-    return [trainer.train_step() for _ in range(until - trainer.step)]
+    return [trainer.train_step()["loss"] for _ in range(until - trainer.step)]
 
 
 def test_loss_is_l1_of_what_the_policy_answers(policy, query):
@@ -100,7 +100,7 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
     first.save(tmp_path / "checkpoint.pt")
     second.load(tmp_path / "checkpoint.pt")
     assert begun + run(second, 6) == losses
-    for ours, theirs in ((second.trained, unbroken.trained), (second.averaged(), unbroken.averaged())):
+    for ours, theirs in ((second.module, unbroken.module), (second.averaged(), unbroken.averaged())):
         assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
 
 
@@ -175,7 +175,7 @@ def test_the_instruction_can_be_learned(make_trainer, demos):
     trainer, losses = make_trainer(max_steps=300, **options), [1.0] * 5
     # whoever ignores the instruction cannot get below 1 / 7: one of seven numbers is 1 or -1, evenly
     while sum(losses[-5:]) / 5 > 0.05 and trainer.step < 250:
-        losses.append(trainer.train_step())
+        losses.append(trainer.train_step()["loss"])
     sample = demos.windows(torch.tensor([[0, 1]]), [keys.IMAGE, keys.WRIST_IMAGE, keys.STATE])
     with torch.no_grad():
         up = trainer.policy(sample.clone())[keys.CHUNK]
