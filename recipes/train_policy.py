@@ -2,8 +2,7 @@
 
     python recipes/train_policy.py demos=data/lift_proficient.h5 out=runs/lift max_steps=20000 batch_size=128
 
-``out/policy``, renewed at each checkpoint, is the policy with averaged weights for
-`DiffusionPolicy.from_pretrained`.
+``out/policy``, renewed at each checkpoint, is the policy with averaged weights for `DiffusionPolicy.from_pretrained`.
 """
 
 from __future__ import annotations
@@ -34,10 +33,9 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    settings = OmegaConf.to_container(config, resolve=True)
     train(
         trainer,
-        settings,
+        OmegaConf.to_container(config, resolve=True),
         export=partial(export, trainer, config),
         evaluate=partial(closed_loop_success, trainer, config),
     )

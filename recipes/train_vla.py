@@ -54,8 +54,8 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         cameras=cameras,
         image_folder=Path(config.out) / "images",
     )
-    lessons = GroundingConfig(**config.grounding)
-    objects = None if lessons == GroundingConfig() else read_objects(config)
+    stages = GroundingConfig(**config.grounding)
+    objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
     if config.init is None:
         policy = untrained_policy(
@@ -63,7 +63,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         )
     else:
         policy = VLAPolicy.from_pretrained(config.init)
-    trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), lessons)
+    trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), stages)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(episodes.data)} steps, {len(trainer.train_rows)} training windows; "

@@ -78,10 +78,10 @@ class VLATrainer(DemonstrationTrainer):
         policy: the policy, trained in place; its normaliser and tokenizer stay as they are.
         demos: demonstrations with images and instructions.
         config: how to train; ``n_action_steps`` is not read: windows may begin at every step of an episode.
-        grounding: lessons that come before the actions; none by default.
+        grounding: stages that come before the actions; none by default.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on, or there are lessons but no ``demos.objects``.
+        ValueError: if ``val_ratio`` leaves no episode to train on, or there are stages but no ``demos.objects``.
     """
 
     def __init__(
@@ -92,10 +92,10 @@ class VLATrainer(DemonstrationTrainer):
         grounding: GroundingConfig | None = None,
     ):
         self.policy, self.demos = policy, demos
-        self.lessons = GroundingConfig() if grounding is None else grounding
+        self.stages = GroundingConfig() if grounding is None else grounding
         self.loss = VLALoss(policy)
         parts = {"network": policy.network}
-        if self.lessons != GroundingConfig():
+        if self.stages != GroundingConfig():
             if demos.objects is None:
                 raise ValueError("grounding: expected the objects' positions in the demonstrations, got none")
             device = next(policy.network.parameters()).device
@@ -110,20 +110,21 @@ class VLATrainer(DemonstrationTrainer):
         device = next(self.module.parameters()).device
         batch = self.demos.windows(rows, observed).to(device)
         with _precision(device, self.config.precision == "bf16"):
-            if self.step >= self.lessons.look_steps + self.lessons.answer_steps:
+            if self.step >= self.stages.locate_steps + self.stages.refer_steps:
                 return self.loss(batch).get("loss")
-            return self._lesson(batch, rows[:, 0])
+            return self._stage_loss(batch, rows[:, 0])
 
-    def _lesson(self, batch: TensorDict, present: Tensor) -> Tensor:
+    def _stage_loss(self, batch: TensorDict, present: Tensor) -> Tensor:
         objects, grounding = self.demos.objects, self.module["grounding"]
         positions = objects.positions[present].to(batch[keys.STATE].device)
-        if self.step < self.lessons.look_steps:
-            return grounding.look(self.policy, batch, positions)
-        return grounding.answer(self.policy, batch, positions, objects.instructions)
+        if self.step < self.stages.locate_steps:
+            return grounding.locate(self.policy, batch, positions)
+        return grounding.refer(self.policy, batch, positions, objects.instructions)
 
     def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LambdaLR:
         """Return a cosine, with a warm-up wherever parts begin to learn that did not before."""
-        begins = (0, self.lessons.look_steps, self.lessons.look_steps + self.lessons.answer_steps)
+        stages = self.stages
+        begins = (0, stages.locate_steps, stages.locate_steps + stages.refer_steps)
 
         def factor(step: int) -> float:
             since = step - max(begin for begin in begins if begin <= step)
@@ -138,7 +139,7 @@ class VLATrainer(DemonstrationTrainer):
 
     def header(self) -> dict[str, dict]:
         return {
-            "config": asdict(self.config) | asdict(self.lessons),
+            "config": asdict(self.config) | asdict(self.stages),
             "network_config": self.policy.network.config.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
@@ -155,7 +156,7 @@ class VLATrainer(DemonstrationTrainer):
             "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.policy.network.config.cameras
         }
         sums[keys.ACTION] = checksum(data[keys.ACTION])
-        if self.lessons != GroundingConfig():
+        if self.stages != GroundingConfig():
             sums["objects"] = checksum(objects.positions.abs())
         return sums
 
