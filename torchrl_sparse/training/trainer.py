@@ -49,6 +49,25 @@ class Trainer(ABC):
     Attributes:
         step: optimiser steps taken.
         total: optimiser steps to take.
+
+    Examples:
+        >>> class Regression(Trainer):
+        ...     def batch_losses(self, index):
+        ...         x = index[:, None].float()
+        ...         return {"loss": (self.module(x) - 2 * x).abs().mean()}
+        ...
+        ...     def validate(self):
+        ...         return {}
+        ...
+        ...     def header(self):
+        ...         return {}
+        >>> from types import SimpleNamespace
+        >>> module, config = nn.Linear(1, 1), SimpleNamespace(batch_size=4, max_grad_norm=0.0, seed=0)
+        >>> adam = torch.optim.Adam(module.parameters(), lr=0.1)
+        >>> trainer = Regression(module, adam, config, num_samples=8, total=50, warmup_steps=5)
+        >>> losses = [trainer.train_step()["loss"] for _ in range(50)]
+        >>> losses[-1] < losses[0]
+        True
     """
 
     def __init__(

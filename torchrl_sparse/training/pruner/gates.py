@@ -63,6 +63,12 @@ def make_gates(
 
     Raises:
         ValueError: for another method.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> gates = make_gates("sag", policy)
+        >>> gates.prune_logits(torch.zeros(2, policy.n_obs_steps, policy.network.cond_dim)).shape
+        torch.Size([2, 100, 24])
     """
     if method not in GATES:
         raise ValueError(f"method: expected one of {', '.join(GATES)}, got {method!r}")

@@ -51,7 +51,7 @@ class InstructedDemonstrations:
             )
 
     def windows(self, rows: Tensor, observed: Sequence) -> TensorDict:
-        """Training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
+        """Return training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
 
         Args:
             rows: as from `Demonstrations.window_rows`; a row that repeats the one before is beyond the end.
