@@ -67,7 +67,7 @@ def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
         f"demos={demos}",
         "num_inference_steps=2",
         "strides=[20]",
-        "reference.share=0.1",
+        "targets.share=0.1",
     )
     output = run("calibrate_timesteps", *options, f"out={work}/timesteps")
     (path,) = (work / "timesteps").iterdir()
@@ -241,12 +241,12 @@ def test_report_makes_one_page_of_what_was_measured(work):
 
 def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedules):
     training = (
-        f"policy={policy}", f"demos={demos}", "sampler={kind: ddim, num_inference_steps: 5}", "reference.share=0.3",
+        f"policy={policy}", f"demos={demos}", "sampler={kind: ddim, num_inference_steps: 5}", "targets.share=0.3",
         "rate=0.5", "train.max_updates=2", "train.batch_size=4", "log_every=1", "checkpoint_every=1",
     )  # fmt: skip
     output = run("train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]")
-    assert "update 2 of 2, finished" in output
-    assert "going on from update 2" in run(
+    assert "step 2 of 2, finished" in output
+    assert "resumed from step 2" in run(
         "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
     )
     assert iio.imread(work / "sag" / "curves.png").std() > 5
@@ -259,8 +259,8 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         f"init={work}/sag/fixed.json",
         "rollouts=1",
     )
-    assert "fixed.json: learned" in output
-    windows, joined = (load_file(work / out / "reference.safetensors")["target"] for out in ("sag", "l2c"))
+    assert "fixed.json: fitted" in output
+    windows, joined = (load_file(work / out / "targets.safetensors")["target"] for out in ("sag", "l2c"))
     assert len(joined) > len(windows)
     taught = [
         CacheSchedule.from_pretrained(work / name).mask() for name in ("sag/fixed.json", "l2c/l2c.json")
@@ -269,7 +269,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "train_pruner", *training, f"out={work}/taught", "train.rate_range=[0.1,0.7]", "train.max_updates=0",
         f"init=[{work}/sag/fixed.json,{work}/l2c/l2c.json]",
     )  # fmt: skip
-    assert "update 0 of 0, finished" in output
+    assert "step 0 of 0, finished" in output
     pruner = SAGPruner.from_pretrained(work / "taught" / "pruner")
     cond = torch.zeros(1, *pruner.network.cond_shape)
     for mask in taught:

@@ -1,4 +1,4 @@
-"""Clocks, process backends and interrupts."""
+"""What a process runs with: threads, a clock, backends for workers, progress bars and signals to stop."""
 
 import lazy_loader as lazy
 

@@ -10,8 +10,9 @@ from diffusers.training_utils import EMAModel
 
 from torchrl_sparse import keys
 from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
-from torchrl_sparse.training.trainer import TrainConfig, batch_indices
+from torchrl_sparse.training.trainer import batch_indices
 
 CONFIG = TrainConfig(max_steps=12, batch_size=8, n_action_steps=4, lr=1e-3, lr_warmup_steps=3, val_ratio=0.2)
 
@@ -27,7 +28,7 @@ def make_trainer(make_network, demos):
 
 
 def run(trainer, until):
-    return [trainer.train_step() for _ in range(until - trainer.step)]
+    return [trainer.train_step()["loss"] for _ in range(until - trainer.step)]
 
 
 def weights(trainer):
@@ -57,7 +58,7 @@ def test_validating_and_saving_change_nothing(make_trainer, tmp_path):
     losses = run(plain, 4)
     seen = []
     for _ in range(4):
-        seen.append(watched.train_step())
+        seen.append(watched.train_step()["loss"])
         assert watched.validate() == watched.validate()
         watched.save(tmp_path / "checkpoint.pt")
     assert seen == losses
@@ -97,7 +98,7 @@ def test_held_out_episodes_are_not_trained_on(make_trainer, demos):
     trainer = make_trainer()
     boundary = int(demos.starts[-3])
     assert trainer.train_rows.max() < boundary <= trainer.val_rows.min()
-    assert make_trainer(val_ratio=0).validate() != make_trainer(val_ratio=0).validate()  # nan
+    assert make_trainer(val_ratio=0).validate() == {}
 
 
 def test_batches_use_every_window_equally_often_across_epochs():
