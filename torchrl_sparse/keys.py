@@ -96,7 +96,7 @@ LATENCY = ("cost", "latency")
 
 
 def history(name: str) -> tuple[str, str]:
-    """Key of the last entries of ``("observation", name)``.
+    """Return the key of the last entries of ``("observation", name)``.
 
     >>> history("image")
     ('history', 'image')
@@ -105,7 +105,7 @@ def history(name: str) -> tuple[str, str]:
 
 
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """The entry under ``key``.
+    """Return the entry under ``key``.
 
     Raises:
         KeyError: if there is none; the message names the key and those that are there.
@@ -124,7 +124,7 @@ def recall(
     fill: float,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """What an earlier call wrote under ``key``, [*B, *shape]; ``fill`` for samples that were never called before.
+    """Return the entry of an earlier call under ``key``, [*B, *shape]; ``fill`` for samples without one.
 
     An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
     although some of its rows have it. The others get rows of the same shape.

@@ -129,7 +129,7 @@ def collect(
     backend: str = "process",
     on_episode: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Collects demonstrations into ``path``, going on where a killed run stopped.
+    """Collect demonstrations into ``path``, resuming where a killed run stopped.
 
     Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the
     end. Calling again after that only reports.
@@ -173,7 +173,7 @@ def collect(
 def _seeds_made(
     parts: Path, collection: Collection, env: EnvBase | None, workers: int, backend: str
 ) -> Iterator[int]:
-    """Makes one episode after the other, and yields its seed."""
+    """Make one episode after the other, and yield its seed."""
     if workers == 1 and backend == "process":
         own = cache(lambda: find_task(collection.task).make() if env is None else env)
         return (_make_part(parts, collection, own, seed) for seed in itertools.count(collection.seed))
@@ -186,7 +186,7 @@ def _part(parts: Path, seed: int) -> Path:
 
 
 def _make_part(parts: Path, collection: Collection, environment: Callable[[], EnvBase], seed: int) -> int:
-    """Makes the episode of a seed, unless it is there; returns the seed."""
+    """Make the episode of a seed, unless it is there; return the seed."""
     if not _part(parts, seed).exists():
         task = find_task(collection.task)
         write_episode(_part(parts, seed), demonstrate(task, environment(), seed, collection.quality))

@@ -13,7 +13,7 @@ __all__ = ["read_instruction", "read_instructions"]
 
 
 def read_instruction(demo: h5py.Group) -> str | None:
-    """The instruction of one demonstration; None if it has none.
+    """Read the instruction of one demonstration; None if it has none.
 
     Raises:
         ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
@@ -29,7 +29,7 @@ def read_instruction(demo: h5py.Group) -> str | None:
 
 
 def read_instructions(path: str | Path) -> list[str]:
-    """The instruction of every demonstration of a robomimic file, in the order of `read_demos`.
+    """Read the instruction of every demonstration of a robomimic file, in the order of `read_demos`.
 
     Raises:
         FileNotFoundError: if there is no file.

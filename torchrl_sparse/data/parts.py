@@ -13,7 +13,7 @@ __all__ = ["check_same", "claim_parts", "parts_of"]
 
 
 def parts_of(path: Path) -> Path:
-    """The folder of parts of a file.
+    """Return the folder of parts of a file.
 
     >>> parts_of(Path("data/lift.h5")).name
     'lift.h5.parts'
@@ -22,7 +22,7 @@ def parts_of(path: Path) -> Path:
 
 
 def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
-    """The folder of parts of ``path``, made or found again for the same settings.
+    """Make the folder of parts of ``path``, or find it again for the same settings.
 
     Raises:
         ValueError: if it holds parts that were made with other settings.
@@ -38,7 +38,7 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
 
 
 def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    """Raises ValueError unless ``where`` was made with the settings asked for."""
+    """Raise ValueError unless ``where`` was made with the settings asked for."""
     different = [
         f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]
     ]

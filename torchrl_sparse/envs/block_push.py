@@ -93,12 +93,12 @@ class BlockPushEnv(SeededEnv):
         return 2 if self._is_solved() else int(self._entered.any())
 
     def _distances(self) -> np.ndarray:
-        """Between the centres of blocks (rows) and targets (columns), f64 [2, 2], m."""
+        """Return the distances between the centres of blocks (rows) and targets (columns), f64 [2, 2], m."""
         blocks = np.stack([self.scene.block_pose(i)[:2] for i in range(2)])
         return np.linalg.norm(blocks[:, None] - self.targets[:, :2], axis=-1)
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """u8 [height, width, 3] picture of the workspace; there is one view, whatever the ``camera``."""
+        """Return a u8 [height, width, 3] picture of the workspace; there is one view, whatever the ``camera``."""
         return self.scene.render(height, width)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -60,22 +60,22 @@ class SeededEnv(EnvBase):
 
     @abstractmethod
     def _start(self, seed: int) -> None:
-        """Puts the simulator where the episode of ``seed`` begins."""
+        """Put the simulator where the episode of ``seed`` begins."""
 
     @abstractmethod
     def _advance(self, action: np.ndarray) -> float:
-        """One step under a checked action, f64 of the action spec's shape; returns its reward."""
+        """Take one step under a checked action, f64 of the action spec's shape; return its reward."""
 
     @abstractmethod
     def _observe_state(self) -> np.ndarray:
-        """The state, [Ds]."""
+        """Return the state, [Ds]."""
 
     @abstractmethod
     def _is_solved(self) -> bool:
         """Tell whether the task's predicate holds now."""
 
     def _parts_done(self) -> int:
-        """Parts of the task done so far in this episode."""
+        """Return parts of the task done so far in this episode."""
         raise NotImplementedError
 
     # -- specs ---------------------------------------------------------------------------------------------------------

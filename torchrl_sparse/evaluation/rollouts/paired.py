@@ -213,7 +213,7 @@ class _OpenEpisode:
 
 
 def _prune_rate(row: TensorDictBase) -> float:
-    """Of a query: the share of its blocks that were pruned or, where there are visual tokens, of those; else 0."""
+    """Return the pruned share of a query's blocks or, where there are visual tokens, of those; else 0."""
     if (mask := row.get(keys.PRUNE_MASK, None)) is not None:
         return float(mask.float().mean())
     if (kept := row.get(keys.KEPT, None)) is not None:

@@ -163,14 +163,14 @@ class VLATrainer(DemonstrationTrainer):
 
 @contextmanager
 def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
-    """Autocast to bf16 if asked for. There the gradient of the fused attention is slower than plain products on a CPU."""
+    """Enter autocast to bf16 if asked for, where the gradient of fused attention is slower than plain products on a CPU."""
     plain = sdpa_kernel(SDPBackend.MATH) if bf16 and device.type == "cpu" else nullcontext()
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16), plain:
         yield
 
 
 def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
+    """Return parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
     parameters = [*network.parameters()]
     matrices = [parameter for parameter in parameters if parameter.ndim > 1]
     vectors = [parameter for parameter in parameters if parameter.ndim <= 1]
