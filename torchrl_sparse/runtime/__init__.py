@@ -1,4 +1,4 @@
-"""What a process runs with: threads, a clock, backends for workers, progress bars and signals to stop."""
+"""The process: threads, a clock, backends for workers, progress bars and signals to stop."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""What trainings on demonstrations share: their configuration, windows, held-out episodes and averaged weights."""
+"""Base of trainings on demonstrations: their configuration, windows, held-out episodes and averaged weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["DemonstrationTrainer", "TrainConfig", "split_windows"]
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How to train; defaults as published for low-dimensional robomimic (arXiv:2303.04137, Table VII).
+    """Options of a training; defaults as published for low-dimensional robomimic (arXiv:2303.04137, Table VII).
 
     Attributes:
         max_steps: optimiser steps; the cosine of the learning rate ends there.

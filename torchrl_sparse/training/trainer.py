@@ -1,4 +1,4 @@
-"""What all trainings share: seeds, batches, the optimiser and its learning rate, and checkpoints.
+"""Base of all trainings: seeds, batches, the optimiser and its learning rate, and checkpoints.
 
 Everything random in step s (which samples, timesteps, noise, dropout) follows from ``(seed, s)``; a training that is stopped
 and resumed therefore ends bit by bit as if it had not been.
@@ -22,7 +22,7 @@ __all__ = ["StepConfig", "Trainer", "batch_indices", "checksum", "step_seed"]
 
 
 class StepConfig(Protocol):
-    """What the configuration of any training says of a step.
+    """Options of a step that every training has.
 
     Attributes:
         batch_size: samples in a step.

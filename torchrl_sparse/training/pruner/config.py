@@ -1,4 +1,4 @@
-"""How gates are trained."""
+"""Options of the training of gates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Cost = Literal["blocks", "flops", "seconds"]
 
 @dataclass(frozen=True)
 class PrunerConfig:
-    """How to train; defaults as published.
+    """Options of a training; defaults as published.
 
     Attributes:
         rate: target prune rate rho, in (0, 1), of what ``cost`` counts.
