@@ -47,6 +47,23 @@ def schedules(work, policy):
     return work / "schedules"
 
 
+def test_a_policy_is_evaluated(work, policy):
+    options = (
+        "episodes=2",
+        "horizon=9",
+        "sampler={kind: ddpm, num_inference_steps: 4}",
+        f"out={work}/played",
+    )
+    line = f"{policy}: success 0/2 [0.00, 0.66], score 0.000 (standard error 0.000), steps 9.0"
+    assert line in run("evaluate_policy", f"policy={policy}", *options)
+    log = work / "played" / "episodes" / "dense.jsonl"
+    played = log.read_bytes()
+    assert line in run("evaluate_policy", f"policy={policy}", *options)
+    assert log.read_bytes() == played
+    refused = run("evaluate_policy", f"policy={policy}", "demos=demos.h5", *options, expect=1)
+    assert "demos: expected none for lift, which does not tell its ways" in refused
+
+
 def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
     options = (
         f"policy={policy}",
