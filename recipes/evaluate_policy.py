@@ -1,4 +1,4 @@
-"""Plays episodes with one policy and says how it did; kill it at any moment and run it again to go on.
+"""Play episodes with one policy and sum them up; kill it at any moment and run it again to go on.
 
     python recipes/evaluate_policy.py task=pusht policy=runs/pusht/policy episodes=20
     python recipes/evaluate_policy.py task=block_push policy=runs/block_push/policy demos=data/block_push.h5 \
@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
 
 
 def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
-    """One episode per seed, read from the log as far as they are there."""
+    """Play one episode per seed, read from the log as far as they are there."""
     task = find_task(config.task)
     n_action_steps = config.n_action_steps or published_shape(task.name).n_action_steps
     played = {"task": task.name, "n_action_steps": n_action_steps, "horizon": config.horizon}
@@ -62,7 +62,7 @@ def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
 
 
 def summarize(episodes: list[EpisodeResult]) -> str:
-    """What the episodes came to, in a line."""
+    """Sum episodes up in a line."""
     n, k = len(episodes), sum(episode.success for episode in episodes)
     low, high = wilson_interval(k, n)
     scores = torch.tensor([episode.score for episode in episodes])
@@ -85,7 +85,7 @@ def describe_ways(ways: list[int]) -> str:
 
 
 def demonstrated_ways(config: DictConfig) -> list[int]:
-    """The ways of demonstrations, to compare with the policy's."""
+    """Return the ways of demonstrations, to compare with the policy's."""
     if config.demos is None:
         return []
     if find_task(config.task).name != "BlockPush":

@@ -73,7 +73,7 @@ def convert_pusht(path: str | Path, out: str | Path) -> int:
 
 
 def _observations(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The state of `PushTEnv`, f64 [N, 20], in each row."""
+    """Return the state of `PushTEnv`, f64 [N, 20], in each row."""
     agent, block, angle = np.split(arrays["state"].astype(np.float64), [2, 4], axis=1)
     keypoints = np.stack([block_keypoints(*pose) for pose in zip(block, angle[:, 0], strict=True)])
     if (far := np.abs(keypoints - arrays["keypoint"]).max()) > _TOLERANCE:

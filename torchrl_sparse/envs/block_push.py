@@ -113,7 +113,7 @@ class BlockPushEnv(SeededEnv):
 
 
 def way_of(states: np.ndarray) -> int:
-    """The way of an episode with these states, [T, 16], as `BlockPushEnv` tells it; -1 if no block enters a square.
+    """Return the way of an episode with these states, [T, 16], as `BlockPushEnv` tells it; -1 if no block enters a square.
 
     >>> states = np.zeros((2, 16))
     >>> states[:, [0, 10, 13]] = [0.5, 0.1, 0.3]  # x of block 0 and of both squares; block 1 stays at 0
@@ -127,10 +127,10 @@ def way_of(states: np.ndarray) -> int:
 
 
 def _distances(blocks: np.ndarray, squares: np.ndarray) -> np.ndarray:
-    """Between the centres of blocks (rows) and squares (columns), both [..., 2, 2]; [..., 2, 2], m."""
+    """Return the distances, [..., 2, 2] in m, between centres of blocks (rows) and squares (columns), both [..., 2, 2]."""
     return np.linalg.norm(blocks[..., :, None, :] - squares[..., None, :, :], axis=-1)
 
 
 def _first(inside: np.ndarray) -> int:
-    """Index of the first block and square that fit, in a flattened bool [2, 2]; -1 if none do."""
+    """Return the index of the first block and square that fit, in a flattened bool [2, 2]; -1 if none do."""
     return int(inside.argmax()) if inside.any() else -1

@@ -81,7 +81,7 @@ class SeededEnv(EnvBase):
         raise NotImplementedError
 
     def _way(self) -> int:
-        """Which of its ways the task is being done in this episode, from 0; -1 until that shows."""
+        """Number, from 0, of the way in which the task is being done in this episode; -1 until that shows."""
         raise NotImplementedError
 
     # -- specs ---------------------------------------------------------------------------------------------------------

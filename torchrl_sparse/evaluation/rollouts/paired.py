@@ -229,7 +229,7 @@ class _OpenEpisode:
 
 
 def _count(row: TensorDictBase, key: NestedKey) -> int | None:
-    """What the environment counts at the end of a step, None where it does not."""
+    """Return a count of the environment at the end of a step, None where it keeps none."""
     value = row["next"].get(key, None)
     return None if value is None else int(value)
 

@@ -1,4 +1,4 @@
-"""How many of a task's ways episodes take: a policy that knows one of several equally good ones has collapsed."""
+"""Ways of doing a task that episodes take: a policy that knows one of several equally good ones has collapsed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["way_entropy"]
 
 
 def way_entropy(ways: Iterable[int]) -> float:
-    """Entropy, in bits, of the ways that episodes took; 0 if all took the same one, 2 if four are as frequent.
+    """Return the entropy, in bits, of the ways that episodes took; 0 if all took the same one, 2 if four are as frequent.
 
     It is that of the frequencies, so a few episodes have less than the policy that they come from: of four equal ways and 20
     episodes it is 1.9 in the mean.
