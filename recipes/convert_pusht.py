@@ -1,4 +1,4 @@
-"""Makes demonstrations to train on of the human ones of Push-T that Diffusion Policy published.
+"""Make demonstrations to train on of the human ones of Push-T that Diffusion Policy published.
 
     python recipes/convert_pusht.py demos=pusht_human.npz out=data/pusht_human.h5
     python recipes/train_policy.py task=pusht demos=data/pusht_human.h5
