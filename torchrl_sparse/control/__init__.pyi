@@ -3,6 +3,10 @@ from .action_aware import (
     Thresholds as Thresholds,
 )
 from .chunk_executor import ChunkExecutor as ChunkExecutor
+from .queries import (
+    answer as answer,
+    record_queries as record_queries,
+)
 from .realtime_executor import (
     HoldPose as HoldPose,
     RealtimeExecutor as RealtimeExecutor,

@@ -36,6 +36,10 @@ from .rollouts import (
     rollout_episodes as rollout_episodes,
     totals as totals,
 )
+from .rollouts.evaluate import (
+    evaluate as evaluate,
+    success_rate as success_rate,
+)
 from .statistics import (
     action_error as action_error,
     block_errors as block_errors,

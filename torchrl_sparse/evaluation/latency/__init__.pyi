@@ -5,3 +5,7 @@ from .measure import (
     measure_latency as measure_latency,
     summarize_latency as summarize_latency,
 )
+from .queries import (
+    time_planning as time_planning,
+    time_queries as time_queries,
+)

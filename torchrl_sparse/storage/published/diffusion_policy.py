@@ -28,7 +28,7 @@ __all__ = ["read_diffusion_policy"]
 
 
 def read_diffusion_policy(path: str | Path) -> StoredPolicy:
-    """Reads a checkpoint of ``DiffusionTransformerLowdimPolicy`` or ``DiffusionTransformerHybridImagePolicy``.
+    """Read a checkpoint of ``DiffusionTransformerLowdimPolicy`` or ``DiffusionTransformerHybridImagePolicy``.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -118,7 +118,7 @@ def _epoch(payload: Mapping) -> int | None:
 
 
 def _weights(config: PublishedConfig, payload: Mapping) -> tuple[str, dict[str, StoredTensor]]:
-    """The state dict to use, by preference the averaged one, and what it is called."""
+    """Return the state dict to use, by preference the averaged one, and what it is called."""
     states = _mapping("state_dicts", payload.get("state_dicts"))
     averaged = "ema_model" in states
     if not averaged and config.get("training.use_ema", bool, False):
