@@ -49,7 +49,6 @@ def check_limits(read: Callable, path: Path) -> str | None:
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files) < SMALL_FILE
     cost = measure(read, path)
-    print(cost)
     assert cost.seconds < SECONDS
     assert cost.megabytes < MEGABYTES
     if cost.error is not None:

@@ -125,5 +125,5 @@ def _state(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
 def _make(file: Path, field: str, kind: Callable[..., T], arguments: dict[str, Any]) -> T:
     try:
         return kind(**arguments)
-    except (KeyError, TypeError, ValueError) as error:  # KeyError: names that no module may have
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{file}: {field}: {error}") from error

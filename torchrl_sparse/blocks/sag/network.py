@@ -215,7 +215,7 @@ def _check(timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool,
         raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
     if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
         raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
-    check_size("timesteps: length", len(timesteps), _MAX_CELLS)
+    check_size("timesteps", len(timesteps), _MAX_CELLS)
     check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
     check_size("width", sizes["width"], _MAX_TOKEN)
     check_size("n_layer", sizes["n_layer"], _MAX_LAYERS)

@@ -21,12 +21,13 @@ from torch import Tensor, nn
 
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["BLOCK_TYPES", "TransformerForDiffusion", "optimizer_groups"]
+__all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion", "optimizer_groups"]
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
 _INIT_STD = 0.02
 # Attention masks are as large as the square of the horizon, and a layer takes a millisecond to make.
-_MAX_WIDTH, _MAX_TOKENS, _MAX_LAYERS = 1 << 16, 4096, 256
+_MAX_WIDTH, _MAX_TOKENS = 1 << 16, 4096
+MAX_LAYERS = 256
 
 
 class SinusoidalPosEmb(nn.Module):
@@ -290,8 +291,8 @@ def _check_config(config: dict) -> None:
         check_size(name, config[name], _MAX_WIDTH)
     for name in ("horizon", "n_obs_steps"):
         check_size(name, config[name], _MAX_TOKENS)
-    check_size("n_layer", config["n_layer"], _MAX_LAYERS)
-    check_size("n_cond_layers", config["n_cond_layers"], _MAX_LAYERS, least=0)
+    check_size("n_layer", config["n_layer"], MAX_LAYERS)
+    check_size("n_cond_layers", config["n_cond_layers"], MAX_LAYERS, least=0)
     if config["n_emb"] % config["n_head"]:
         raise ValueError(
             f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"

@@ -191,7 +191,8 @@ def _group_norm(channels: int) -> nn.GroupNorm:
 
 
 def _check(cameras: list[str], image_size: list[int], crop_size: list[int], width: int) -> None:
-    if not 1 <= len(set(cameras)) == len(cameras) <= _MAX_CAMERAS:
+    named = all(isinstance(name, str) and name and "." not in name for name in cameras)  # as modules are
+    if not named or not 1 <= len(set(cameras)) == len(cameras) <= _MAX_CAMERAS:
         raise ValueError(
             f"cameras: expected different names, 1 to {_MAX_CAMERAS} of them, got {reprlib.repr(cameras)}"
         )

@@ -87,7 +87,7 @@ class PublishedConfig:
         return value
 
     def names(self, path: str) -> list[str] | None:
-        """The names in the list at ``path``, or of the entries of the dict there; None if there is neither.
+        """Return the names in the list at ``path``, or of the entries of the dict there; None if there is neither.
 
         Raises:
             ValueError: if there are too many, or it holds anything but names.
@@ -101,7 +101,7 @@ class PublishedConfig:
         return list(found)
 
     def _find(self, path: str, depth: int) -> Any:
-        """The entry at ``path``; what was found is kept, or references to references would multiply."""
+        """Return the entry at ``path``; what was found is kept, or references to references would multiply."""
         if path.count(".") > _MAX_DEPTH:
             raise ValueError(f"cfg: {path[:80]}: expected a path of at most {_MAX_DEPTH} levels")
         if path not in self._found:

@@ -109,7 +109,7 @@ _READERS = {
 
 
 def _epoch(payload: Mapping) -> int | None:
-    """The epoch that the weights are of, in a pickle of its own; None if there is none."""
+    """Return the epoch of the weights, which has a pickle of its own; None if there is none."""
     data = _mapping("pickles", payload.get("pickles", {})).get("epoch")
     epoch = read_pickle(data) if isinstance(data, bytes) else data
     if epoch is not None and type(epoch) is not int:
