@@ -11,25 +11,25 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
 class Killer(threading.Thread):
-    """Waits for a worker that it has not seen, then for the next of ``delays`` (seconds), and sends it the next signal.
+    """Waits for a worker that it has not seen, then for the next of ``delays`` (seconds), and ends it by one signal or another.
 
-    Attributes:
-        killed: how many workers it has killed so far.
+    Makes the file ``done`` after the last.
     """
 
-    def __init__(self, delays, signals=SIGNALS):
+    def __init__(self, delays, done):
         super().__init__(daemon=True)
-        self.delays, self.signals, self.killed, self.seen = delays, signals, 0, set()
+        self.delays, self.done = delays, done
 
     def run(self):
+        seen = set()
         for number, delay in enumerate(self.delays):
-            while not (new := workers() - self.seen):
+            while not (new := workers() - seen):
                 time.sleep(0.005)
-            self.seen |= new
             time.sleep(delay)
+            seen |= new | workers()
             with suppress(ProcessLookupError):
-                os.kill(min(new), self.signals[number % len(self.signals)])
-                self.killed += 1
+                os.kill(min(new), SIGNALS[number % len(SIGNALS)])
+        self.done.touch()
 
 
 def workers():

@@ -5,6 +5,7 @@ import os
 import random
 import signal
 import sys
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -89,26 +90,40 @@ def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, back
     assert len(log.read_text().splitlines()) == 1 + len(SEEDS)
 
 
-def kill_while_starting(monkeypatch, backend, delays):
-    """Runs all episodes while workers are killed, each so many seconds after its fork."""
+class HeldEnv(FakeEnv):
+    """Takes no step before a file is there."""
+
+    def __init__(self, seeds, go):
+        super().__init__(seeds)
+        self.go = go
+
+    def _step(self, tensordict):
+        while not self.go.exists():
+            time.sleep(0.01)
+        return super()._step(tensordict)
+
+
+def kill_while_starting(monkeypatch, backend, go, delays):
+    """Runs all episodes while workers are killed before their first batch, each so many seconds after its fork."""
     monkeypatch.setattr(paired, "_FAILURES", len(delays) + 1)
-    killer = Killer(delays)
+    killer = Killer(delays, go)
     killer.start()
-    with pytest.warns(RuntimeWarning, match="episodes are run anew"):
-        episodes = run(FakeEnv, workers=2, num_envs=2, backend=backend)
-    assert killer.killed >= 1
+    with pytest.warns(RuntimeWarning, match="episodes are run anew") as warned:
+        episodes = run(partial(HeldEnv, go=go), workers=2, num_envs=2, backend=backend)
+    assert 1 <= len(warned) <= len(delays)
     assert episodes == run(FakeEnv)
     assert multiprocessing.active_children() == []
 
 
-def test_workers_that_are_killed_while_they_start_are_replaced(monkeypatch, backend):
-    kill_while_starting(monkeypatch, backend, [0.0, 1.0])
+def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path, monkeypatch, backend):
+    kill_while_starting(monkeypatch, backend, tmp_path / "go", [0.0, 1.0])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_workers_that_are_killed_at_ten_moments_are_replaced(monkeypatch, backend, seed):
-    kill_while_starting(monkeypatch, backend, random.Random(seed).choices(range(12), k=10))
+def test_workers_that_are_killed_at_ten_moments_are_replaced(tmp_path, monkeypatch, backend, seed):
+    drawn = random.Random(seed)
+    kill_while_starting(monkeypatch, backend, tmp_path / "go", [8 * drawn.random() for _ in range(10)])
 
 
 def test_workers_that_do_not_start_in_time_are_given_up(monkeypatch):

@@ -133,8 +133,10 @@ class _ProcessCollector(MultiSyncCollector):
 def _exit_codes(processes: Sequence[BaseProcess]) -> dict[int, int]:
     """Return the exit codes of the workers that ended of themselves other than well."""
     left = {index: process for index, process in enumerate(processes) if not process._closed}
-    if left:  # a broken pipe is noticed before the process has ended
-        connection.wait([process.sentinel for process in left.values()], timeout=_REAPING)
+    sentinels = {process.sentinel: process for process in left.values()}
+    # A broken pipe is noticed before its process has ended, and the end of that before it can be asked for its code.
+    for sentinel in connection.wait(sentinels, timeout=_REAPING) if sentinels else ():
+        sentinels[sentinel].join(_REAPING)
     codes = {index: process.exitcode for index, process in left.items() if process.exitcode}
     # TorchRL terminates those that are alive when it finds a dead one.
     return {index: code for index, code in codes.items() if code != -signal.SIGTERM} or codes
