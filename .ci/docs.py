@@ -1,4 +1,4 @@
-"""What the site is made of, a script of mkdocs-gen-files: the pages with all they link to, and the API's public names.
+"""Contents of the site, a script of mkdocs-gen-files: the pages with all they link to, and the API's public names.
 
 A public name is one that the stub of a package re-exports. It is documented on the page of the package whose module defines it,
 and the page of the library itself lists what ``import torchrl_sparse`` offers.
