@@ -25,7 +25,7 @@ from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}
-METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
+METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 
 
 def run(recipe, *options, expect=0):
