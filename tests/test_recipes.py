@@ -18,7 +18,7 @@ from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
-METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
+METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 
 
 @pytest.fixture(scope="module")
