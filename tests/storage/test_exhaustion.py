@@ -8,9 +8,9 @@ from safetensors.torch import load_file, save_file
 
 from tests.limits import SMALL_FILE, check_limits
 from torchrl_sparse import CacheSchedule, DiffusionPolicy, SAGPruner
-from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo
+from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.vla.config import VLAConfig
