@@ -43,7 +43,7 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
-from torchrl_sparse.networks.diffusion.sampler import split_sampler
+from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import read_json
 
@@ -124,7 +124,7 @@ class CacheSchedule:
         for name in ("num_inference_steps", "num_layers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)!r}")
-        split_sampler(self.sampler)
+        SamplerName.parse(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:
