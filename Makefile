@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint install sanitize
+.PHONY: demo test lint docs install sanitize
 
 install: $(VENV)/.installed
 
@@ -23,6 +23,11 @@ test: install
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+# The pages and the API reference, in site/. The variables silence the theme's and a plugin's announcements.
+docs: install
+	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict --quiet
 
 # The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.
 SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined

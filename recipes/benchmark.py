@@ -1,4 +1,4 @@
-"""Benchmarks a policy: dense against accelerated, paired, with a table, plots and videos.
+"""Benchmark a policy: dense against accelerated, paired, with a table, plots and videos.
 
     python recipes/benchmark.py task=lift methods=[dense,ddim10,bac] episodes=50 seed=0 out=outputs/lift
 

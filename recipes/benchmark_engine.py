@@ -1,4 +1,4 @@
-"""Benchmarks the engines: what a query costs in the published implementation, and in ours, dense and pruned.
+"""Benchmark the engines: what a query costs in the published implementation, and in ours, dense and pruned.
 
     python recipes/benchmark_engine.py out=outputs/engine threads=1
 
@@ -77,7 +77,7 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
 
 
 def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
-    """A policy's network and the mask of its BAC schedule, which is refused if it was made for another policy."""
+    """Load a policy's network and the mask of its BAC schedule, which is refused if it was made for another policy."""
     policy = DiffusionPolicy.from_pretrained(folder)
     policy.plan = BAC.from_pretrained(folder / "bac.json")
     return policy.network, policy.plan.schedule.mask()

@@ -1,4 +1,4 @@
-"""Benchmarks a vision-language-action policy: dense against pruned visual tokens, paired, with a table, plots and videos.
+"""Benchmark a vision-language-action policy: dense against pruned visual tokens, paired, with a table, plots and videos.
 
     python recipes/benchmark_vla.py policy=runs/vla_lift_named/policy methods=[dense,specprune,fastv@specprune]
 

@@ -1,4 +1,4 @@
-"""Computes the BAC schedules of a trained policy from one dense query.
+"""Compute the BAC schedules of a trained policy from one dense query.
 
 python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
 """

@@ -1,4 +1,4 @@
-"""Steps one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
+"""Step one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
 
     python recipes/libero_smoke.py                         # random weights: does everything fit together?
     python recipes/libero_smoke.py policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_policy(config: DictConfig) -> VLAPolicy:
-    """The policy in a folder, or a small one with random weights."""
+    """Load the policy in a folder, or make a small one with random weights."""
     if config.policy is not None:
         policy = VLAPolicy.from_pretrained(config.policy)
     else:
@@ -56,7 +56,7 @@ def make_policy(config: DictConfig) -> VLAPolicy:
 
 
 def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase:
-    """``steps`` steps of the suite's task, [T]."""
+    """Run ``steps`` steps of the suite's task, [T]."""
     env = make_libero_env(suite, config.task_id, image_size=policy.network.config.image_size)
     actor = ChunkExecutor(policy, config.n_action_steps, ActionAwareController())
     collector = Collector(
@@ -76,7 +76,7 @@ def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase
 
 
 def draw(policy: VLAPolicy, queries: TensorDictBase, path: Path) -> Path:
-    """Both cameras at a few queries, darker where tokens were dropped."""
+    """Draw both cameras at a few queries, darker where tokens were dropped."""
     shown = np.unique(np.linspace(0, len(queries) - 1, _SHOWN).round().astype(int)).tolist()
     pictures = [
         draw_tokens(

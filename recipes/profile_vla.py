@@ -1,4 +1,4 @@
-"""Benchmarks a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
+"""Benchmark a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
 
     python recipes/profile_vla.py                                                      # reduced shape, one CPU thread
     python recipes/profile_vla.py shape=published device=cuda dtype=bfloat16           # the published 7B shape
@@ -47,7 +47,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_pruners(config: DictConfig) -> dict[str, TokenPruner | None]:
-    """SpecPrune at every alpha, the others at every share, and dense."""
+    """Make SpecPrune at every alpha, the others at every share, and dense."""
     pruners: dict[str, TokenPruner | None] = {DENSE: None}
     pruners |= {f"specprune, alpha {alpha:g}": SpecPrune(alpha=alpha) for alpha in config.alphas}
     pruners |= {f"fastv, {share:.0%}": FastVPruner(share) for share in config.shares}

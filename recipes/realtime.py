@@ -80,7 +80,7 @@ def main(config: DictConfig) -> None:
 def evaluate_delayed(
     name: str, policy: DiffusionPolicy, steps: int, make_env, seeds: range, config: DictConfig
 ) -> list[EpisodeResult]:
-    """Episodes of one method whose answers come ``steps`` late."""
+    """Run the episodes of one method whose answers come ``steps`` late."""
     hold = HoldPose(find_robosuite_task(config.task).pose_slices)
     actor = RealtimeExecutor(
         policy,

@@ -1,4 +1,4 @@
-"""Trains a vision-language-action policy. Stop it at any moment; the same command goes on, equal to the last bit.
+"""Train a vision-language-action policy. Stop it at any moment; the same command resumes it, equal to the last bit.
 
     python recipes/collect_demos.py task=lift_named episodes=600 out=data/lift_named_proficient.h5
     python recipes/render_demos.py task=lift_named
@@ -16,7 +16,6 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.images import chosen_cameras
@@ -24,18 +23,12 @@ from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
 from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.networks.vla.config import VLAConfig
-from torchrl_sparse.networks.vla.network import VLANetwork
-from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
-from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.rotations import ABSOLUTE_DIM
+from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.loop import train
-from torchrl_sparse.training.trainer import TrainConfig
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
-
-SIZES = {"tiny": VLAConfig.tiny, "small": VLAConfig.small, "published": VLAConfig}
+from torchrl_sparse.training.vla.untrained import untrained_policy
 
 
 @hydra.main(version_base=None, config_path=".", config_name="train_vla")
@@ -47,26 +40,30 @@ def main(config: DictConfig) -> None:
     train(
         trainer,
         settings,
-        save=partial(save, trainer, config),
+        export=partial(export, trainer, config),
         evaluate=partial(closed_loop_success, trainer, config),
     )
 
 
 def make_trainer(config: DictConfig) -> VLATrainer:
-    """Reads the demonstrations and builds a policy that fits them, or takes the one to start from."""
+    """Read the demonstrations and build what is trained on them."""
+    cameras = chosen_cameras(config.cameras)
     episodes = read_demos(
         config.demos,
         find_robosuite_task(config.task).proprioception_keys,
-        cameras=chosen_cameras(config.cameras),
+        cameras=cameras,
         image_folder=Path(config.out) / "images",
     )
-    lessons = GroundingConfig(**config.grounding)
-    objects = None if lessons == GroundingConfig() else read_objects(config)
+    stages = GroundingConfig(**config.grounding)
+    objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
-    policy = (
-        untrained_policy(demos, config) if config.init is None else VLAPolicy.from_pretrained(config.init)
-    )
-    trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), lessons)
+    if config.init is None:
+        policy = untrained_policy(
+            demos, config.size, cameras=[*cameras], changes=config.network, seed=config.seed
+        )
+    else:
+        policy = VLAPolicy.from_pretrained(config.init)
+    trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), stages)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(episodes.data)} steps, {len(trainer.train_rows)} training windows; "
@@ -75,46 +72,18 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     return trainer
 
 
-def untrained_policy(demos: InstructedDemonstrations, config: DictConfig) -> VLAPolicy:
-    """A network that fits the demonstrations, with random weights."""
-    data = demos.episodes.data
-    action = data[keys.ACTION]
-    grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
-    words = sorted({word for text in demos.instructions for word in text.lower().split()})
-    torch.manual_seed(config.seed)
-    return VLAPolicy(
-        VLANetwork(make_config(config, data)),
-        QuantileNormalizer.fit(data[keys.STATE], action, gripper=grippers),
-        WordTokenizer(words),
-    )
-
-
 def read_objects(config: DictConfig) -> ObjectPositions:
-    """Where the objects are that the task's instructions name, in the order of these."""
+    """Return where the objects are that the task's instructions name, in the order of these."""
     positions = read_demos(config.demos, ["object_positions"]).data[keys.STATE]
     return ObjectPositions(
         positions.unflatten(1, (-1, 3)), find_robosuite_task(config.task).instructions
     ).standardised()
 
 
-def make_config(config: DictConfig, data: TensorDict) -> VLAConfig:
-    """The size that was asked for, with what the demonstrations decide."""
-    if config.size not in SIZES:
-        raise ValueError(f"size: expected one of {', '.join(SIZES)}, got {config.size!r}")
-    cameras = [["observation", name] for name in chosen_cameras(config.cameras)]
-    decided = {
-        "cameras": cameras,
-        "image_size": data[tuple(cameras[0])].shape[-1],
-        "state_dim": data[keys.STATE].shape[-1],
-        "action_dim": data[keys.ACTION].shape[-1],
-    }
-    fields = OmegaConf.merge(SIZES[config.size]().to_dict(), config.network, decided)
-    return VLAConfig.from_dict(OmegaConf.to_container(fields, resolve=True))
-
-
-def save(trainer: VLATrainer, config: DictConfig) -> None:
-    trainer.save(Path(config.out) / "checkpoint.pt")
-    averaged_policy(trainer).save_pretrained(Path(config.out) / "policy")
+def export(trainer: VLATrainer, config: DictConfig) -> Path:
+    path = Path(config.out) / "policy"
+    averaged_policy(trainer).save_pretrained(path)
+    return path
 
 
 def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
@@ -122,7 +91,7 @@ def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
 
 
 def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None:
-    """Success rate of the averaged weights on episodes that no demonstration was made from; None without robosuite."""
+    """Return the success rate of the averaged weights on development episodes; None without robosuite."""
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor

@@ -15,6 +15,8 @@ constant                          shape, dtype           meaning
 ``EPISODE_SEED``                  i64 [*B, 1]            the seed that fixed this episode's initial state
 ``EPISODE_STEP``                  i64 [*B, 1]            environment steps since the reset
 ``EPISODE_COMPLETED``             i64 [*B, 1]            parts of the task done so far, where a benchmark counts them
+``EPISODE_WAY``                   i64 [*B, 1]            which of its ways the task is being done, where an environment tells;
+                                                         -1 until that shows
 ``HISTORY_STATE``                 f32 [*B, To, Ds]       the last To states, oldest first
 ``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
@@ -62,6 +64,7 @@ SUCCESS = "success"
 EPISODE_SEED = ("episode", "seed")
 EPISODE_STEP = ("episode", "step")
 EPISODE_COMPLETED = ("episode", "completed")
+EPISODE_WAY = ("episode", "way")
 HISTORY_STATE = ("history", "state")
 IS_INIT = "is_init"
 
@@ -96,7 +99,7 @@ LATENCY = ("cost", "latency")
 
 
 def history(name: str) -> tuple[str, str]:
-    """Key of the last entries of ``("observation", name)``.
+    """Return the key of the last entries of ``("observation", name)``.
 
     >>> history("image")
     ('history', 'image')
@@ -105,7 +108,7 @@ def history(name: str) -> tuple[str, str]:
 
 
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """The entry under ``key``.
+    """Return the entry under ``key``.
 
     Raises:
         KeyError: if there is none; the message names the key and those that are there.
@@ -124,7 +127,7 @@ def recall(
     fill: float,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """What an earlier call wrote under ``key``, [*B, *shape]; ``fill`` for samples that were never called before.
+    """Return the entry of an earlier call under ``key``, [*B, *shape]; ``fill`` for samples without one.
 
     An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
     although some of its rows have it. The others get rows of the same shape.

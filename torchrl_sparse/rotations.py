@@ -16,12 +16,12 @@ ABSOLUTE_DIM = 10
 
 
 def matrix_to_rot6d(matrix: np.ndarray) -> np.ndarray:
-    """[..., 3, 3] rotation matrices to [..., 6] first two rows."""
+    """Return [..., 3, 3] rotation matrices to [..., 6] first two rows."""
     return matrix[..., :2, :].reshape(*matrix.shape[:-2], 6)
 
 
 def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
-    """[..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
+    """Return [..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
 
     Raises:
         ValueError: if the last axis is not 6, or the two rows are parallel or zero.
@@ -35,7 +35,7 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
 
 
 def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
-    """[..., 3] rotation vectors (rad) to [..., 6].
+    """Return [..., 3] rotation vectors (rad) to [..., 6].
 
     >>> rotvec_to_rot6d(np.zeros(3))
     array([1., 0., 0., 0., 1., 0.])
@@ -45,7 +45,7 @@ def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
 
 
 def quaternion_to_rot6d(quat: np.ndarray) -> np.ndarray:
-    """[..., 4] unit quaternions (xyzw) to [..., 6].
+    """Return [..., 4] unit quaternions (xyzw) to [..., 6].
 
     >>> quaternion_to_rot6d(np.array([0.0, 0.0, 0.0, 1.0]))
     array([1., 0., 0., 0., 1., 0.])
@@ -55,27 +55,27 @@ def quaternion_to_rot6d(quat: np.ndarray) -> np.ndarray:
 
 
 def rot6d_to_rotvec(rot6d: np.ndarray) -> np.ndarray:
-    """[..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
+    """Return [..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
     matrix = rot6d_to_matrix(rot6d)
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(*rot6d.shape[:-1], 3)
 
 
 def pose_to_absolute(pose: np.ndarray) -> np.ndarray:
-    """[..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
+    """Return [..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
     arms = _split_arms(pose, POSE_DIM)
     absolute = np.concatenate([arms[..., :3], rotvec_to_rot6d(arms[..., 3:6]), arms[..., 6:]], axis=-1)
     return absolute.reshape(*pose.shape[:-1], -1)
 
 
 def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
-    """[..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
+    """Return [..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
     arms = _split_arms(absolute, ABSOLUTE_DIM)
     pose = np.concatenate([arms[..., :3], rot6d_to_rotvec(arms[..., 3:9]), arms[..., 9:]], axis=-1)
     return pose.reshape(*absolute.shape[:-1], -1)
 
 
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
-    """The one of +q and -q (xyzw) that is nearer to the Panda's rest orientation, gripper down: (1, 1, 0, 0) / sqrt(2).
+    """Return the one of +q and -q (xyzw) that is nearer to the Panda's rest orientation, gripper down: (1, 1, 0, 0) / sqrt(2).
 
     Both are the same rotation. Conventions that look at w flip where w crosses zero, which is where a downward gripper lives,
     and a policy would see a jump where nothing moved.

@@ -1,4 +1,4 @@
-"""Runs a training recipe as a user does: stops it, runs it again, and, beside it, trains without a break."""
+"""Run a training recipe as a user does: stop it, run it again and, beside it, train without a break."""
 
 import signal
 import subprocess
@@ -13,7 +13,7 @@ from torchrl_sparse.runtime.threads import num_threads
 
 
 def stop_and_go_on(recipe, out, settings):
-    """Terminates the recipe after its first checkpoint and runs it again; the step it stopped at, and what both printed."""
+    """Terminate the recipe after its first checkpoint and run it again; return the step of the stop and what both printed."""
     process = _start(recipe, [*settings, f"out={out}"])
     deadline = time.monotonic() + 120
     while not (out / "checkpoint.pt").exists() and time.monotonic() < deadline:
@@ -31,9 +31,9 @@ def train_unbroken(recipe, out, settings):
         config = hydra.compose(recipe, [*settings, f"out={out}"])
     trainer = module.make_trainer(config)
     with num_threads(1):
-        while trainer.step < trainer.config.max_steps:
+        while trainer.step < trainer.total:
             trainer.train_step()
-    module.save(trainer, config)
+    module.export(trainer, config)
 
 
 def _start(recipe, arguments):

@@ -31,6 +31,7 @@ class StaticGates(nn.Module):
     """
 
     rate_input = False
+    is_static = True
 
     def __init__(self, num_steps: int, num_blocks: int) -> None:
         super().__init__()

@@ -86,7 +86,7 @@ class _ScheduleFile:
 
 @dataclass(frozen=True)
 class CacheSchedule:
-    """Which blocks are computed at which denoising steps, and for which policy that was decided.
+    """Blocks that are computed at each denoising step, and the policy for which that was decided.
 
     Attributes:
         method: name of the method that made it, e.g. ``"bac"``.

@@ -23,7 +23,7 @@ _DELTA_DIM = 7  # three of translation, three of rotation, the gripper
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When fine mode is entered and left. In m/s and rad/s for measured velocity, in action units for commands.
+    """Thresholds at which fine mode is entered and left. In m/s and rad/s for measured velocity, in action units for commands.
 
     Attributes:
         translation, rotation: a hand slower than both, and not rising, enters fine mode.

@@ -82,11 +82,11 @@ class ChunkExecutor(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, self._serve(tensordict, age))
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
-        """i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
+        """Return i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
         return keys.recall(tensordict, keys.AGE, (1,), self.n_action_steps)
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
-        """bool [*B, 1]: samples without an action to serve."""
+        """Return bool [*B, 1]: samples without an action to serve."""
         due = keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
         replan = tensordict.get(keys.REPLAN, None)
         return due if replan is None else due | replan

@@ -90,18 +90,18 @@ class RealtimeExecutor(ChunkExecutor):
         tensordict.set(keys.MEANWHILE, torch.where(due[..., None], meanwhile, old))
 
     def _delay(self, tensordict: TensorDictBase) -> Tensor:
-        """i64 [*B, 1]: steps that the latest query takes."""
+        """Return i64 [*B, 1]: steps that the latest query takes."""
         return keys.recall(tensordict, keys.DELAY, (1,), 0)
 
     def _new_delay(self, tensordict: TensorDictBase) -> Tensor:
-        """i64 [*B, 1]: steps that the query just made takes."""
+        """Return i64 [*B, 1]: steps that the query just made takes."""
         if self.latency is None:
             return delay_steps(keys.read(tensordict, keys.LATENCY), self.control_freq)
         latency = torch.tensor([self.latency], device=tensordict.device)
         return delay_steps(latency, self.control_freq).expand(*tensordict.batch_size, 1)
 
     def _play_on(self, tensordict: TensorDictBase, before: TensorDictBase) -> Tensor:
-        """f32 [*B, n, A]: what is left of the chunk played ``before``; entry 0 is for the present step."""
+        """Return f32 [*B, n, A]: what is left of the chunk played ``before``; entry 0 is for the present step."""
         chunk = tensordict.get(keys.CHUNK)
         left = _shift(keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0), self._age(before) + 1)
         hold = self.hold(tensordict.select(*self.hold.in_keys)).get(keys.HOLD)
@@ -157,7 +157,7 @@ def delay_steps(latency: Tensor, control_freq: float = 20.0) -> Tensor:
 
 
 def _shift(chunk: Tensor, by: Tensor) -> Tensor:
-    """[*B, n, A] from entry ``by``, i64 [*B, 1], on; the last entry is repeated."""
+    """Return [*B, n, A] from entry ``by``, i64 [*B, 1], on; the last entry is repeated."""
     length = chunk.shape[-2]
     index = (by + torch.arange(length, device=chunk.device)).clamp(max=length - 1)
     return chunk.gather(-2, index[..., None].expand(*index.shape, chunk.shape[-1]))

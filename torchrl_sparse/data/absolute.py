@@ -39,7 +39,7 @@ _TOLERANCE = 1e-3
 
 
 def convert_demos(path: str | Path, out: str | Path) -> int:
-    """Copies a robomimic file with absolute actions and with the observations that policies of the task read.
+    """Copy a robomimic file with absolute actions and with the observations that policies of the task read.
 
     Images, simulator states, rewards, attributes and filter keys are copied; one demonstration at a time is in memory. A
     killed conversion goes on where it stopped, from ``<out>.parts``; ``out`` appears when it is complete. Calling again
@@ -109,7 +109,7 @@ class AbsoluteActions:
         self._controllers = [_recorded_osc(robot, control.arm) for robot in self.env.sim_env.robots]
 
     def convert(self, states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
-        """One demonstration.
+        """Convert one demonstration.
 
         Args:
             states: [T, S] simulator states before each action.
@@ -139,7 +139,7 @@ class AbsoluteActions:
         return {"actions": goals} | {key: np.stack(values) for key, values in observed.items()}
 
     def _goal(self, osc: Any, delta: np.ndarray, last: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """World-frame position [3] and rotation matrix [3, 3] that the controller aims at."""
+        """Return the world-frame position [3] and rotation matrix [3, 3] that the controller aims at."""
         osc.update(force=True)
         osc.set_goal(delta)
         position, rotation = osc.goal_pos, osc.goal_ori
@@ -158,12 +158,12 @@ class AbsoluteActions:
             )
 
     def close(self) -> None:
-        """Frees the simulator."""
+        """Free the simulator."""
         self.env.close()
 
 
 def _recorded_osc(robot: Any, settings: Mapping[str, Any]) -> Any:
-    """robosuite's OSC controller with recorded settings, for the goals that it sets."""
+    """Make robosuite's OSC controller with recorded settings, for the goals that it sets."""
     from robosuite.controllers.parts.arm.osc import OperationalSpaceController
 
     own = robot.part_controllers["right"]
@@ -215,7 +215,7 @@ def _saying(where: str | Path) -> Iterator[None]:
 
 
 def _check_hands(where: str, demo: h5py.Group, arrays: Mapping[str, np.ndarray], length: int) -> None:
-    """States of another robot, table or version of the task would put the hand elsewhere."""
+    """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
     for key, value in arrays.items():
         if key.endswith("eef_pos") and key in demo:
             far = np.linalg.norm(read_array(where, demo, key, length) - value, axis=1).max()

@@ -26,7 +26,7 @@ _FAILURES = 3
 def in_order(
     task: Callable[[int], None], first: int, workers: int, *, backend: str = "process"
 ) -> Iterator[int]:
-    """Calls ``task(first)``, ``task(first + 1)``, ... in workers and yields each number once it is done, in order.
+    """Call ``task(first)``, ``task(first + 1)``, ... in workers and yield each number once it is done, in order.
 
     A worker that dies is reported as a warning; what it and the others had under way is done again.
 
@@ -97,7 +97,7 @@ class _RayPool(Executor):
         self._open: set[Any] = set()
 
     def submit(self, task: Callable[[int], None], number: int) -> Future:
-        """Hands a task out."""
+        """Hand a task out."""
         reference = self._call.remote(task, number)
         self._open.add(reference)
         future = reference.future()
@@ -105,7 +105,7 @@ class _RayPool(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Interrupts what is under way and waits until it has ended."""
+        """Interrupt what is under way and wait until it has ended."""
         import ray
 
         running = list(self._open)

@@ -17,7 +17,7 @@ _DAMAGE = (OSError, KeyError, RuntimeError)  # h5py reports damaged files throug
 
 @contextmanager
 def open_demos(path: str | Path) -> Iterator[h5py.File]:
-    """A demonstration file, open for reading.
+    """Open a demonstration file for reading.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -39,7 +39,7 @@ def open_demos(path: str | Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Turns what h5py raises on damaged files into a ValueError that begins with ``where``."""
+    """Turn what h5py raises on damaged files into a ValueError that begins with ``where``."""
     try:
         yield
     except _DAMAGE as error:
@@ -47,7 +47,7 @@ def naming(where: str) -> Iterator[None]:
 
 
 def demo_names(path: str | Path, file: h5py.File, filter_key: str | None = None) -> list[str]:
-    """Names of the demonstrations of an open file, in the order of their numbers.
+    """Return the names of the demonstrations of an open file, in the order of their numbers.
 
     Args:
         path: the file, for messages.
@@ -75,7 +75,7 @@ def demo_names(path: str | Path, file: h5py.File, filter_key: str | None = None)
 
 
 def read_array(where: str, demo: h5py.Group, name: str, length: int) -> np.ndarray:
-    """One array f64 [length, n] of a demonstration, all of its numbers finite.
+    """Return one array f64 [length, n] of a demonstration, all of its numbers finite.
 
     Raises:
         ValueError: beginning with ``where``, if it is missing, damaged or of another shape.

@@ -57,7 +57,7 @@ class Episode:
 
 
 def write_episode(path: Path, episode: Episode) -> None:
-    """Writes one episode as a file of its own. A kill leaves either the whole file or none."""
+    """Write one episode as a file of its own. A kill leaves either the whole file or none."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         _fill(file.create_group("demo"), episode)
 
@@ -71,7 +71,7 @@ def episode_length(path: Path) -> tuple[int, bool]:
 def merge_episodes(
     path: Path, parts: Iterable[Path], *, env_args: Mapping[str, Any], collection: Mapping[str, Any]
 ) -> None:
-    """Joins episode files into one demonstration file, ``demo_0`` onwards in the order given.
+    """Join episode files into one demonstration file, ``demo_0`` onwards in the order given.
 
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
@@ -88,7 +88,7 @@ def merge_episodes(
 
 
 def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:
-    """The group ``data`` with its attributes, mappings as json, and an empty group for each demonstration.
+    """Create the group ``data`` with its attributes, mappings as json, and an empty group for each demonstration.
 
     Made before anything is filled in, the index of demonstrations lies at the front of the file, so that one which is cut
     off later still tells which demonstration broke.
@@ -102,7 +102,7 @@ def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]
 
 
 def copy_attributes(source: h5py.Group, target: h5py.Group) -> None:
-    """All attributes of one demonstration to another."""
+    """Copy all attributes of one demonstration to another."""
     for name, value in source.attrs.items():
         target.attrs[name] = value
 

@@ -29,7 +29,7 @@ def chosen_cameras(cameras: Mapping[str, str | None]) -> dict[str, str]:
 def read_images(
     path: str | Path, data: h5py.Group, lengths: Mapping[str, int], key: str, folder: str | Path | None
 ) -> Tensor:
-    """Images u8 [N, 3, h, w] of all demonstrations, one demonstration in memory at a time.
+    """Read images u8 [N, 3, h, w] of all demonstrations, one demonstration in memory at a time.
 
     Args:
         path: the file, for messages.
@@ -58,7 +58,7 @@ def read_images(
 def _episodes(
     path: str | Path, data: h5py.Group, lengths: Mapping[str, int], key: str
 ) -> Iterator[np.ndarray]:
-    """u8 [T, 3, h, w] of each demonstration, all of one height and width."""
+    """Return u8 [T, 3, h, w] of each demonstration, all of one height and width."""
     frame: tuple[int, ...] | None = None
     for name, length in lengths.items():
         where = f"{path}, {name}, obs/{key}"
@@ -72,7 +72,7 @@ def _episodes(
 
 
 def _read_episode(where: str, demo: h5py.Group, key: str, length: int) -> np.ndarray:
-    """u8 [T, 3, h, w]."""
+    """Return u8 [T, 3, h, w]."""
     with naming(where):
         images = np.asarray(demo[f"obs/{key}"])
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[-1] != 3 or len(images) != length:

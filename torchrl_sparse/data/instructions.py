@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["read_instruction", "read_instructions"]
 
 
 def read_instruction(demo: h5py.Group) -> str | None:
-    """The instruction of one demonstration; None if it has none.
+    """Read the instruction of one demonstration; None if it has none.
 
     Raises:
         ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
     """
     text = demo.attrs.get("ep_meta", "{}")
     try:
-        words = dict(json.loads(text)).get("lang")
+        words = parse_json(text, dict[str, Any], "ep_meta").get("lang")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {text!r}") from error
     if words is None or isinstance(words, str):
@@ -29,7 +30,7 @@ def read_instruction(demo: h5py.Group) -> str | None:
 
 
 def read_instructions(path: str | Path) -> list[str]:
-    """The instruction of every demonstration of a robomimic file, in the order of `read_demos`.
+    """Read the instruction of every demonstration of a robomimic file, in the order of `read_demos`.
 
     Raises:
         FileNotFoundError: if there is no file.

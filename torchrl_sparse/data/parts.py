@@ -1,19 +1,18 @@
-"""A folder of finished parts beside a file in the making, so that long work goes on where a kill stopped it."""
+"""A folder of finished parts beside a file in the making, so that long work resumes where a kill stopped it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = ["check_same", "claim_parts", "parts_of"]
 
 
 def parts_of(path: Path) -> Path:
-    """The folder of parts of a file.
+    """Return the folder of parts of a file.
 
     >>> parts_of(Path("data/lift.h5")).name
     'lift.h5.parts'
@@ -22,7 +21,7 @@ def parts_of(path: Path) -> Path:
 
 
 def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
-    """The folder of parts of ``path``, made or found again for the same settings.
+    """Make the folder of parts of ``path``, or find it again for the same settings.
 
     Raises:
         ValueError: if it holds parts that were made with other settings.
@@ -31,14 +30,13 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
     parts.mkdir(parents=True, exist_ok=True)
     note = parts / "settings.json"
     if not note.exists():
-        with atomic_path(note) as temporary:
-            temporary.write_text(json.dumps(settings, indent=1))
-    check_same(note, json.loads(note.read_text()), settings)
+        write_json(note, settings)
+    check_same(note, read_json(note, dict[str, Any]), settings)
     return parts
 
 
 def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    """Raises ValueError unless ``where`` was made with the settings asked for."""
+    """Raise ValueError unless ``where`` was made with the settings asked for."""
     different = [
         f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]
     ]

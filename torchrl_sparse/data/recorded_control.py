@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import h5py
 import numpy as np
 
 from torchrl_sparse.rotations import POSE_DIM
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["RecordedControl", "read_control"]
 
@@ -49,7 +49,7 @@ class RecordedControl:
 
 
 def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
-    """The controller of an open demonstration file; None if it names none.
+    """Read the controller of an open demonstration file; None if it names none.
 
     Raises:
         ValueError: naming the file, if ``env_args`` are damaged or describe anything but one OSC_POSE controller.
@@ -58,7 +58,7 @@ def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
     if text is None:
         return None
     try:
-        env_args = json.loads(text)
+        env_args = parse_json(text, dict[str, Any], "env_args")
         kwargs = env_args["env_kwargs"]
         config, robots = kwargs["controller_configs"], kwargs["robots"]
         arm, is_old = _arm_settings(config)
@@ -71,7 +71,7 @@ def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
 
 
 def _arm_settings(config: Mapping[str, Any] | list) -> tuple[Mapping[str, Any], bool]:
-    """Settings of one arm in robosuite 1.5's terms, and whether they were written by 1.4 or earlier."""
+    """Return the settings of one arm in robosuite 1.5's terms, and whether they were written by 1.4 or earlier."""
     configs = config if isinstance(config, list) else [config]
     if any(other != configs[0] for other in configs):
         raise ValueError("arms with different controllers")

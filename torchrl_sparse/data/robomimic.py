@@ -49,13 +49,13 @@ class Demonstrations:
         return len(self.starts) - 1
 
     def episode(self, index: int) -> TensorDict:
-        """The rows of one episode."""
+        """Return the rows of one episode."""
         return self.data[int(self.starts[index]) : int(self.starts[index + 1])]
 
     def window_rows(
         self, horizon: int, n_obs_steps: int, n_action_steps: int, episodes: Sequence[int] | None = None
     ) -> Tensor:
-        """Rows of all training windows, i64 [W, horizon], as Diffusion Policy's sampler cuts them.
+        """Return rows of all training windows, i64 [W, horizon], as Diffusion Policy's sampler cuts them.
 
         A window may begin up to ``n_obs_steps - 1`` rows before its episode and end up to
         ``n_action_steps - 1`` after it; rows outside repeat the first or last one. None crosses episodes.
@@ -83,7 +83,7 @@ class Demonstrations:
         return rows
 
     def windows(self, rows: Tensor, n_obs_steps: int) -> TensorDict:
-        """Training samples [B] of windows ``rows`` i64 [B, H].
+        """Return training samples [B] of windows ``rows`` i64 [B, H].
 
         Returns:
             ``("history", name)`` [B, To, ...] of each observation, and ``"action"`` [B, H, A]; action ``To - 1``
@@ -105,7 +105,7 @@ def read_demos(
     image_folder: str | Path | None = None,
     poses: bool = True,
 ) -> Demonstrations:
-    """All demonstrations of a robomimic file, in the order of their numbers.
+    """Read all demonstrations of a robomimic file, in the order of their numbers.
 
     Args:
         path: HDF5 file.
@@ -161,7 +161,7 @@ def _read_episode(
     state_keys: Sequence[str],
     convert: Callable[[str, np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """State [T, Ds] and converted action [T, A] of one demonstration, f32."""
+    """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32."""
     with naming(where):
         demo = data[name]
         length = int(demo.attrs["num_samples"])
@@ -171,7 +171,7 @@ def _read_episode(
 
 
 def _absolute_poses(where: str, pose: np.ndarray, control: RecordedControl | None) -> np.ndarray:
-    """Absolute actions [T, 10 * arms] of recorded poses [T, 7 * arms]."""
+    """Return absolute actions [T, 10 * arms] of recorded poses [T, 7 * arms]."""
     if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
         raise ValueError(f"{where}: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
     if control is not None and control.are_deltas(pose):

@@ -72,7 +72,7 @@ def _draw_pose(
     avoid: float | None = None,
     gap: float = 0.0,
 ) -> np.ndarray:
-    """x, y around ``center``, drawn again while x lies within ``gap`` of ``avoid``, and a yaw."""
+    """Draw x, y around ``center``, again while x lies within ``gap`` of ``avoid``, and a yaw."""
     for _ in range(_ATTEMPTS):
         x = center[0] + rng.uniform(-spread[0], spread[0])
         y = center[1] + rng.uniform(-spread[1], spread[1])
@@ -95,7 +95,7 @@ class BlockPushScene:
         self._ending = weakref.finalize(self, _disconnect, self.client)  # its own clean-up fails at exit
 
     def reset(self, start: Start) -> None:
-        """Builds everything anew: restoring a state would keep contacts of the last episode in the solver's memory."""
+        """Build everything anew: restoring a state would keep contacts of the last episode in the solver's memory."""
         client = self.client
         client.resetSimulation()
         client.setGravity(0, 0, -9.8)
@@ -116,29 +116,29 @@ class BlockPushScene:
             client.stepSimulation()
 
     def step(self, target: np.ndarray) -> None:
-        """0.1 s in which the tip is drawn towards ``target``, f64 [2], m."""
+        """Draw the tip towards ``target``, f64 [2], m, for 0.1 s."""
         for _ in range(SUBSTEPS):
             self._anchor = self._anchor + _PACE * (target - self._anchor)
             self.client.changeConstraint(self._hold, (*self._anchor, _TIP_HEIGHT), maxForce=_TIP_FORCE)
             self.client.stepSimulation()
 
     def tip_position(self) -> np.ndarray:
-        """f64 [2], m."""
+        """Return f64 [2], m."""
         return np.array(self.client.getBasePositionAndOrientation(self.tip)[0][:2])
 
     def block_pose(self, index: int) -> np.ndarray:
-        """f64 [3]: x and y in m, yaw in rad."""
+        """Return f64 [3]: x and y in m, yaw in rad."""
         position, quaternion = self.client.getBasePositionAndOrientation(self.blocks[index])
         return np.array([*position[:2], self.client.getEulerFromQuaternion(quaternion)[2]])
 
     def place_block(self, index: int, pose: np.ndarray) -> None:
-        """Puts a block at rest at x, y (m) and yaw (rad)."""
+        """Put a block at rest at x, y (m) and yaw (rad)."""
         quaternion = self.client.getQuaternionFromEuler((0, 0, pose[2]))
         position = (pose[0], pose[1], BLOCK_SIZE / 2)
         self.client.resetBasePositionAndOrientation(self.blocks[index], position, quaternion)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        """u8 [height, width, 3] from in front of the robot, by pybullet's own renderer, which needs no GL library."""
+        """Return u8 [height, width, 3] from in front of the robot, by pybullet's own renderer, which needs no GL library."""
         client = self.client
         view = client.computeViewMatrix((1.0, 0.0, 0.75), (0.4, 0.0, 0.0), (0, 0, 1))
         projection = client.computeProjectionMatrixFOV(50, width / height, 0.1, 3.0)
@@ -147,7 +147,7 @@ class BlockPushScene:
         return np.reshape(pixels, (height, width, 4))[..., :3].astype(np.uint8)
 
     def close(self) -> None:
-        """Frees the simulator."""
+        """Free the simulator."""
         self._ending()
 
     def _add_box(self, half, position, yaw, *, mass, colour, solid=True) -> int:

@@ -89,14 +89,14 @@ class KitchenEnv(SeededEnv):
         return float(len(done))
 
     def _feasible(self, target: np.ndarray) -> np.ndarray:
-        """The joint positions to command, f64 [9]: what is within reach of the observed ones in one step, and in bounds."""
+        """Return the joint positions to command, f64 [9]: within reach of the observed ones in one step, and in bounds."""
         robot, present = self.sim_env, self._observed[:_JOINTS]
         reach = robot.robot_vel_bound[:_JOINTS].T * robot.dt
         bounds = robot.robot_pos_bound[:_JOINTS].T
         return np.clip(present + np.clip(target - present, *reach), *bounds)
 
     def _sense(self) -> None:
-        """Observes all positions, f64 [30], noise included."""
+        """Observe all positions, f64 [30], noise included."""
         noise = _NOISE_RATIO * _NOISE * self._rng.uniform(-1.0, 1.0, len(_NOISE))
         self._observed = self.sim_env.data.qpos + noise
 
@@ -115,8 +115,9 @@ class KitchenEnv(SeededEnv):
         return len(self.completed)
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """u8 [height, width, 3] picture from behind the robot; there is one view, whatever the ``camera``. The first call
-        decides on the size.
+        """Return a u8 [height, width, 3] picture from behind the robot; there is one view, whatever the ``camera``.
+
+        The first call decides on the size.
 
         Raises:
             RuntimeError: if no GL library is installed; the message says which package brings one.

@@ -44,7 +44,7 @@ def make_libero_env(
     init_state_mode: str = "cycle",
     **kwargs: Any,
 ) -> TransformedEnv:
-    """One task of a suite: both cameras, upright; position, rotation vector and fingers; velocity; instruction; ``"is_init"``.
+    """Make one task of a suite: upright cameras; position, rotation vector and fingers; velocity; instruction; ``"is_init"``.
 
     Args:
         suite: one of `SUITES`.
@@ -114,7 +114,7 @@ class RotationVectorState(Transform):
         super().__init__(in_keys=[_POSE], out_keys=[keys.STATE])
 
     def _apply_transform(self, pose: Tensor) -> Tensor:
-        """[*B, 8] of position, quaternion (xyzw) and fingers, [*B, 9]."""
+        """Return [*B, 8] of position, quaternion (xyzw) and fingers, [*B, 9]."""
         return torch.cat([pose[..., :3], rotation_vector(pose[..., 3:7]), pose[..., 7:]], -1)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -127,7 +127,7 @@ class RotationVectorState(Transform):
 
 
 def rotation_vector(quaternion: Tensor) -> Tensor:
-    """Rotation vector, [..., 3] in rad, of a unit quaternion [..., 4] (xyzw); its angle lies between 0 and 2 pi.
+    """Return rotation vector, [..., 3] in rad, of a unit quaternion [..., 4] (xyzw); its angle lies between 0 and 2 pi.
 
     As in robosuite, and so in the states that published checkpoints were trained on, the sign of w decides which of the two
     turns it is, not which is shorter.

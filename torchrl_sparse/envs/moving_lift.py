@@ -54,7 +54,7 @@ class LiftMoving(Lift):
 
 
 def cube_path(pose: np.ndarray, *, start: float = 0.0) -> Path:
-    """The path of a cube that starts at ``pose``: a sine along each axis of the table.
+    """Return the path of a cube that starts at ``pose``: a sine along each axis of the table.
 
     Args:
         pose: f64 [7] position (m) and quaternion; every bit counts.
@@ -79,5 +79,5 @@ def cube_path(pose: np.ndarray, *, start: float = 0.0) -> Path:
 
 
 def _pull(goal: tuple[np.ndarray, np.ndarray], position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Acceleration, f64 [2] m/s², towards a point of the path."""
+    """Return the acceleration, f64 [2] m/s², towards a point of the path."""
     return _STIFFNESS * (goal[0] - position) + _DAMPING * (goal[1] - velocity)

@@ -81,7 +81,7 @@ class SpacedSampler(UniformRandomSampler):
 
 
 def _cube(colour: str, rng: np.random.Generator) -> BoxObject:
-    """A cube like Lift's red one, of another colour."""
+    """Make a cube like Lift's red one, of another colour."""
     material = CustomMaterial(
         texture=f"Wood{colour.capitalize()}",
         tex_name=f"{colour}wood",

@@ -94,7 +94,7 @@ class PushTEnv(SeededEnv):
         return bool(self._coverage > self.sim_env.success_threshold)
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """u8 [height, width, 3] picture of the world from above; there is one view, whatever the ``camera``.
+        """Return a u8 [height, width, 3] picture of the world from above; there is one view, whatever the ``camera``.
 
         Raises:
             RuntimeError: if OpenCV cannot be imported, for want of a GL library.
@@ -107,7 +107,7 @@ class PushTEnv(SeededEnv):
 
 
 def block_keypoints(position: Sequence[float], angle: float) -> np.ndarray:
-    """`KEYPOINTS` of a block at ``position`` (pixels), turned by ``angle`` (rad), f64 [9, 2].
+    """Return `KEYPOINTS` of a block at ``position`` (pixels), turned by ``angle`` (rad), f64 [9, 2].
 
     >>> block_keypoints((100.0, 200.0), np.pi / 2)[1].round(2).tolist()
     [101.19, 139.02]

@@ -61,7 +61,7 @@ class CameraRenderer:
         atexit.register(self.close)  # a context that outlives EGL itself complains at exit
 
     def follow(self, sim: Any) -> bool:
-        """Renders another simulator from now on; False, and nothing changes, if its meshes or textures are others.
+        """Render another simulator from now on; False, and nothing changes, if its meshes or textures are others.
 
         To make a renderer takes as long as dozens of images: everything is copied into a new GL context.
         """
@@ -74,7 +74,7 @@ class CameraRenderer:
         self._model, self._data = sim.model._model, sim.data._data
 
     def image(self, camera: str) -> np.ndarray:
-        """u8 [height, width, 3], top row first.
+        """Return u8 [height, width, 3], top row first.
 
         Raises:
             ValueError: if the model has no camera of that name.
@@ -99,7 +99,7 @@ class CameraRenderer:
         return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def _out_of_view(self, camera: int) -> np.ndarray:
-        """bool [geoms], those whose bounding box lies beyond one side of what the camera sees, or behind it."""
+        """Return bool [geoms], those whose bounding box lies beyond one side of what the camera sees, or behind it."""
         model, data = self._model, self._data
         centre, half = model.geom_aabb[:, None, :3], model.geom_aabb[:, None, 3:]
         axes = data.geom_xmat.reshape(-1, 3, 3)
@@ -113,7 +113,7 @@ class CameraRenderer:
         return bounded & np.any([side.all(1) for side in beyond], axis=0)
 
     def close(self) -> None:
-        """Frees the GL context. Call once."""
+        """Free the GL context. Call once."""
         atexit.unregister(self.close)
         self._gl.make_current()
         self._context.free()

@@ -153,7 +153,7 @@ class RobosuiteEnv(SeededEnv):
         self._ask_for(state.instruction)
 
     def get_initial_state(self) -> InitialState:
-        """The present state, to start another episode from: ``env.reset(initial_state=state)``."""
+        """Return the present state, to start another episode from: ``env.reset(initial_state=state)``."""
         # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
         model_xml = self._restored_xml or self.sim_env.model.get_xml()
         state = self.sim_env.sim.get_state().flatten()
@@ -169,7 +169,7 @@ class RobosuiteEnv(SeededEnv):
         return self.sim_env.instruction if self.task.has_choice else self.task.instructions[0]
 
     def _ask_for(self, recorded: str | None) -> None:
-        """Tells the simulator what counts: the caller's words, else the recorded ones, else those that the seed drew."""
+        """Tell the simulator what counts: the caller's words, else the recorded ones, else those that the seed drew."""
         if not self.task.has_choice:
             return
         words = self._instruction if isinstance(self._instruction, str) else recorded
@@ -189,7 +189,7 @@ class RobosuiteEnv(SeededEnv):
     # -- observations --------------------------------------------------------------------------------------------------
 
     def raw_observation(self) -> Mapping[str, np.ndarray]:
-        """The parts of the state by robosuite's names, f64, in the order in which they are concatenated."""
+        """Return the parts of the state by robosuite's names, f64, in the order in which they are concatenated."""
         # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
         self.sim_env._update_observables(force=True)
         observed = self.sim_env._get_observations(force_update=True)
@@ -212,20 +212,20 @@ class RobosuiteEnv(SeededEnv):
         return out
 
     def object_positions(self) -> np.ndarray:
-        """f64 [3 n], m: where the n objects of the scene are, in the world frame."""
+        """Return f64 [3 n], m: where the n objects of the scene are, in the world frame."""
         sim, objects = self.sim_env.sim, self.sim_env.model.mujoco_objects
         bodies = [sim.model.body_name2id(thing.root_body) for thing in objects]
         return sim.data.body_xpos[bodies].reshape(-1)
 
     def _eef_velocity(self) -> np.ndarray:
-        """Velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
+        """Return the velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
         data = self.sim_env.sim.data
         sites = [robot.gripper["right"].important_sites["grip_site"] for robot in self.sim_env.robots]
         twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in sites]
         return np.concatenate([part for twist in twists for part in twist])
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
-        """u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
+        """Return a u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
         size, sim = (height, width), self.sim_env.sim
         renderer = self._renderers.get(size)
         if renderer is not None and not renderer.follow(sim):

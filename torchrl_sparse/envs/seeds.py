@@ -1,4 +1,4 @@
-"""Which episodes are for what, by the first of their seeds: nothing is tested on what it was trained or tuned on.
+"""Ranges of seeds by the purpose of their episodes: nothing is tested on what it was trained or tuned on.
 
 Demonstrations begin at seed 0. Ranges are far longer than anybody's number of episodes.
 """

@@ -106,7 +106,7 @@ class RobosuiteTask(_Named):
 
     @property
     def has_choice(self) -> bool:
-        """Whether episodes differ in what they ask for."""
+        """True where episodes differ in what they ask for."""
         return len(self.instructions) > 1
 
     def check_instruction(self, words: str) -> None:

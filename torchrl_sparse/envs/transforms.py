@@ -35,7 +35,7 @@ def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEn
 
 
 def state_history(n_obs_steps: int) -> list[Transform]:
-    """Transforms that write ``("history", "state")``, f32 [*B, n_obs_steps, Ds], oldest first."""
+    """Return transforms that write ``("history", "state")``, f32 [*B, n_obs_steps, Ds], oldest first."""
     if n_obs_steps < 1:
         raise ValueError(f"n_obs_steps: expected at least 1, got {n_obs_steps}")
     return [
@@ -45,7 +45,7 @@ def state_history(n_obs_steps: int) -> list[Transform]:
 
 
 def image_history(n_obs_steps: int, cameras: Sequence[tuple[str, str]]) -> list[Transform]:
-    """Transforms that write ``("history", name)``, u8 [*B, n_obs_steps, 3, h, w], of images ``("observation", name)``."""
+    """Return transforms that write ``("history", name)``, u8 [*B, n_obs_steps, 3, h, w], of ``("observation", name)``."""
     if not cameras:
         return []
     histories = [keys.history(name) for _, name in cameras]
@@ -95,7 +95,7 @@ class EndEffectorVelocity(Transform):
 
 
 def rotation_between(before: Tensor, after: Tensor) -> Tensor:
-    """Rotation vector, [..., 3] rad in the world frame, that turns quaternion ``before`` into ``after`` ([..., 4], xyzw)."""
+    """Return rotation vector, [..., 3] rad, world frame, that turns quaternion ``before`` into ``after`` ([..., 4], xyzw)."""
     xyz0, w0 = before[..., :3], before[..., 3:]
     xyz1, w1 = after[..., :3], after[..., 3:]
     xyz = w0 * xyz1 - w1 * xyz0 - torch.linalg.cross(xyz1, xyz0)  # after * conjugate(before)

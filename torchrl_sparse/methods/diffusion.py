@@ -107,7 +107,7 @@ def move_rate(rates: tuple[float, ...]) -> ActionAwareController | None:
 
 @dataclass(frozen=True)
 class Method:
-    """How to make a method.
+    """Recipe of a method.
 
     Attributes:
         make: returns planner and sampler; ValueError where the inputs do not allow it.

@@ -63,7 +63,7 @@ class Normalizer(nn.Module):
         state_mode: Literal["global", "range"] = "global",
         poses: bool = True,
     ) -> Normalizer:
-        """Normaliser of a data set.
+        """Fit a normaliser to a data set.
 
         Args:
             state: [N, Ds].
@@ -88,15 +88,15 @@ class Normalizer(nn.Module):
         return cls(scale.clone(), offset.clone(), *(_pose_map(action) if poses else _range_map(action)))
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """States [..., Ds] in environment units to the policy's."""
+        """Map states [..., Ds] in environment units to the policy's."""
         return state * self.state_scale + self.state_offset
 
     def normalize_action(self, action: Tensor) -> Tensor:
-        """Actions [..., A] in environment units to the policy's."""
+        """Map actions [..., A] in environment units to the policy's."""
         return action * self.action_scale + self.action_offset
 
     def unnormalize_action(self, action: Tensor) -> Tensor:
-        """Actions [..., A] of the policy to environment units."""
+        """Map actions [..., A] of the policy to environment units."""
         return (action - self.action_offset) / self.action_scale
 
 

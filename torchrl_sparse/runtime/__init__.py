@@ -1,4 +1,4 @@
-"""Clocks, process backends and interrupts."""
+"""The process: threads, a clock, backends for workers, progress bars and signals to stop."""
 
 import lazy_loader as lazy
 

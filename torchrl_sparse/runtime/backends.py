@@ -1,4 +1,4 @@
-"""Where workers run: processes of this machine, or a Ray cluster. Ray is optional and imported only when it is asked for."""
+"""Backends for workers: processes of this machine, or a Ray cluster. Ray is optional and imported only on demand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BACKENDS = ("process", "ray")
 
 
 def check_backend(backend: str, workers: int) -> None:
-    """Raises ValueError for an unknown backend or no worker."""
+    """Raise ValueError for an unknown backend or no worker."""
     if backend not in _BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(_BACKENDS)}, got {backend!r}")
     if workers < 1:
@@ -23,7 +23,7 @@ def check_backend(backend: str, workers: int) -> None:
 
 
 def backend_runtime(backend: str, workers: int) -> AbstractContextManager[None]:
-    """What has to be up while ``workers`` work: nothing for processes, a cluster for Ray.
+    """Return a context in which ``workers`` can run: nothing for processes, a cluster for Ray.
 
     A cluster that this process is connected to, or that the variable ``RAY_ADDRESS`` names ("auto" for one that ``ray start``
     made on this machine), is used and left running. Otherwise a local one of ``workers`` CPUs lives as long as the block.
@@ -60,7 +60,7 @@ def _ray_runtime(workers: int) -> Iterator[None]:
 
 
 def ray_death(error: BaseException) -> str:
-    """Which Ray worker died, in words; empty if ``error`` says something else, such as what a worker's own work raised."""
+    """Return which Ray worker died, in words; empty if ``error`` is another, such as one that a worker's own work raised."""
     errors = _import_ray().exceptions
     deaths = (
         errors.RayActorError,

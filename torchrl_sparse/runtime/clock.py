@@ -8,7 +8,7 @@ __all__ = ["synchronised_clock"]
 
 
 def synchronised_clock(device: torch.device) -> float:
-    """Seconds of a monotonic clock, read when everything that was queued on ``device`` is done.
+    """Return seconds of a monotonic clock, once everything that was queued on ``device`` is done.
 
     >>> start = synchronised_clock(torch.device("cpu"))
     >>> synchronised_clock(torch.device("cpu")) >= start

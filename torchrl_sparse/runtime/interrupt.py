@@ -1,31 +1,52 @@
-"""Stopping long work cleanly."""
+"""Stopping long work at a signal, cleanly."""
 
 from __future__ import annotations
 
 import signal
+from types import TracebackType
 
 __all__ = ["StopSignal"]
 
 
 class StopSignal:
-    """Remembers SIGINT or SIGTERM so that the step in progress is finished and saved; a second one kills.
+    """Note SIGINT and SIGTERM within a ``with`` block, so that the work in progress can be finished and saved.
+
+    After the first signal, and at the end of the block, the handlers from before the block are back: a second signal ends
+    the program as usual.
 
     Attributes:
-        name: name of the signal that came; None while there was none.
+        name: of the signal that came, e.g. ``"SIGTERM"``; None while there was none.
+
+    Raises:
+        ValueError: by Python when entered elsewhere than in the main thread.
 
     Examples:
-        >>> stop = StopSignal()
-        >>> stop.name is None
+        >>> with StopSignal() as stop:
+        ...     stop.name is None
         True
     """
 
     def __init__(self) -> None:
         self.name: str | None = None
+
+    def __enter__(self) -> StopSignal:
         self._previous = {
             number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)
         }
+        return self
 
-    def _note(self, number: int, _frame: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: object) -> None:
         self.name = signal.Signals(number).name
-        for each, handler in self._previous.items():
-            signal.signal(each, handler)
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)

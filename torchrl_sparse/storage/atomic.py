@@ -10,7 +10,7 @@ __all__ = ["atomic_path"]
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path beside ``path``, moved onto it when the block ends well and removed when it raises; what a kill
+    """Lend a temporary path beside ``path``, moved onto it when the block ends well and removed when it raises; what a kill
     leaves of it is overwritten by the next try.
 
     The folder is made if it is missing. The temporary file keeps the suffix, since writers choose a format

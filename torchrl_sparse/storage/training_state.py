@@ -1,22 +1,33 @@
-"""Checkpoints that a training goes on from."""
+"""Checkpoints from which a training is resumed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
 import torch
 
-__all__ = ["read_checkpoint"]
+from torchrl_sparse.storage.atomic import atomic_path
+
+__all__ = ["read_checkpoint", "write_checkpoint"]
 
 
-def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict]) -> dict[str, Any]:
-    """What a trainer saved. Nothing in the file is executed.
+def write_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint. A kill leaves the old file or the new one, never a part of one."""
+    with atomic_path(path) as temporary:
+        torch.save(dict(state), temporary)
+
+
+def read_checkpoint(
+    path: str | Path, fields: Set[str], header: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Read a checkpoint. Nothing in the file is executed.
 
     Args:
         path: the file.
         fields: names of everything that it must hold.
-        header: those that must be equal, since a training can only go on as it was begun.
+        header: the fields that must be equal: how the training was set up.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -33,13 +44,16 @@ def read_checkpoint(path: str | Path, fields: set[str], header: dict[str, dict])
         ) from error
     if not isinstance(state, dict) or set(state) != fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(f"{path}: expected a training checkpoint with {sorted(fields)}, got {found}")
+        raise ValueError(
+            f"{path}: expected a training checkpoint of this version with {sorted(fields)}, got {found}; "
+            f"move it away to begin anew"
+        )
     for name, expected in header.items():
         if state[name] != expected:
             raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
     return state
 
 
-def _difference(expected: dict, found: dict) -> str:
+def _difference(expected: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
     return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)

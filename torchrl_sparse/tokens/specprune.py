@@ -277,7 +277,7 @@ class SpecPrune(TokenPruner):
         return state.keep_visual(retain_set(td.get(_CARRIED), td.get(_CHANGED), local))
 
     def _prune_further(self, state: LayerState) -> Tensor:
-        """The ``keep_share`` of the living visual tokens with the highest running score."""
+        """Return the ``keep_share`` of the living visual tokens with the highest running score."""
         alive = state.visual_alive
         count = (alive.sum(-1, keepdim=True) * self.options.keep_share).ceil().long()
         return state.keep_visual(best(state.td.get(_RUNNING), count, alive))

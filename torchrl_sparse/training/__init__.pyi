@@ -1,19 +1,14 @@
+from .demonstrations import TrainConfig as TrainConfig
 from .diffusion import (
     DiffusionLoss as DiffusionLoss,
     PolicyTrainer as PolicyTrainer,
 )
-from .loop import (
-    make_logger as make_logger,
-    train as train,
-)
+from .loop import train as train
 from .pruner import (
     PrunerConfig as PrunerConfig,
     PrunerTrainer as PrunerTrainer,
 )
-from .trainer import (
-    TrainConfig as TrainConfig,
-    Trainer as Trainer,
-)
+from .trainer import Trainer as Trainer
 from .vla import (
     VLATrainer as VLATrainer,
 )

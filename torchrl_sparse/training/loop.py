@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,62 +13,74 @@ from tqdm import tqdm
 from torchrl_sparse.runtime.interrupt import StopSignal
 from torchrl_sparse.training.trainer import Trainer
 
-__all__ = ["make_logger", "train"]
+__all__ = ["CHECKPOINT", "train"]
+
+CHECKPOINT = "checkpoint.pt"
 
 
 def train(
     trainer: Trainer,
     settings: Mapping[str, Any],
     *,
-    save: Callable[[], None],
-    evaluate: Callable[[], float | None],
+    export: Callable[[], Path],
+    evaluate: Callable[[], float | None] | None = None,
 ) -> None:
-    """Goes on from ``out/checkpoint.pt`` if it is there, and steps until ``max_steps`` or a signal to stop; saves at the end.
+    """Train until ``trainer.total`` or a signal to stop, from ``out/checkpoint.pt`` if it is there; save at the end.
 
     Args:
         trainer: what to train.
-        settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger`` and ``wandb_mode``, see
-            `make_logger`, which gets ``train/loss``, ``train/lr``, ``train/seconds_per_step``, ``val/loss`` and
-            ``eval/success``; ``log_every``, ``checkpoint_every`` and ``eval_every``, steps between two of each (0: none).
-        save: writes ``out/checkpoint.pt`` and ``out/policy``.
-        evaluate: the success rate of the policy so far, in [0, 1]; None where it cannot be measured.
+        settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger`` ("csv" or "wandb") and
+            ``wandb_mode``, of what is logged under ``out/log``; ``log_every``, ``checkpoint_every`` and, with ``evaluate``,
+            ``eval_every``, steps between two of each (``eval_every`` 0: none).
+        export: write what was trained so far, for its users; return where. Called with each checkpoint.
+        evaluate: return the success rate so far, in [0, 1], or None where it cannot be measured.
+
+    Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and
+    ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of `Trainer.validate` and ``eval/success``.
 
     Raises:
         ValueError: if the checkpoint belongs to another training, see `Trainer.load`.
     """
-    out = Path(settings["out"])
-    if (out / "checkpoint.pt").exists():
-        trainer.load(out / "checkpoint.pt")
-        print(f"{out / 'checkpoint.pt'}: going on from step {trainer.step}")
-    logger = make_logger(settings["logger"], out, settings=settings, wandb_mode=settings["wandb_mode"])
-    stop = StopSignal()
-    log_every, checkpoint_every, eval_every = (
-        settings[f"{name}_every"] for name in ("log", "checkpoint", "eval")
-    )
-    total, losses, last = trainer.config.max_steps, [], time.perf_counter()
-    with tqdm(total=total, initial=trainer.step, unit="step", mininterval=2) as bar:
-        while trainer.step < total and stop.name is None:
+    checkpoint = Path(settings["out"]) / CHECKPOINT
+    if checkpoint.exists():
+        trainer.load(checkpoint)
+        print(f"{checkpoint}: resumed from step {trainer.step}")
+    eval_every = settings["eval_every"] if evaluate else 0
+    logger, losses, since = _make_logger(settings), [], time.perf_counter()
+
+    def log(metrics: Mapping[str, float], group: str) -> None:
+        logger.log_metrics({f"{group}/{name}": value for name, value in metrics.items()}, step=trainer.step)
+
+    with (
+        StopSignal() as stop,
+        tqdm(total=trainer.total, initial=trainer.step, unit="step", mininterval=2) as bar,
+    ):
+        while trainer.step < trainer.total and stop.name is None:
             losses.append(trainer.train_step())
             bar.update()
-            if trainer.step % log_every == 0:
-                now = time.perf_counter()
-                metrics = {"train/loss": sum(losses) / len(losses), "train/lr": trainer.lr}
-                metrics["train/seconds_per_step"] = (now - last) / len(losses)
-                bar.set_postfix(loss=f"{metrics['train/loss']:.4f}")
-                logger.log_metrics(metrics, step=trainer.step)
-                losses, last = [], now
-            if trainer.step % checkpoint_every == 0:
-                save()
-                logger.log_metrics({"val/loss": trainer.validate()}, step=trainer.step)
+            if trainer.step % settings["log_every"] == 0:
+                now, means = time.perf_counter(), _means(losses)
+                means |= {"lr": trainer.lr, "seconds_per_step": (now - since) / len(losses)}
+                bar.set_postfix(loss=f"{means['loss']:.4f}")
+                log(means, "train")
+                losses, since = [], now
+            if trainer.step % settings["checkpoint_every"] == 0:
+                trainer.save(checkpoint)
+                export()
+                log(trainer.validate(), "held_out")
             if eval_every and trainer.step % eval_every == 0 and (rate := evaluate()) is not None:
                 tqdm.write(f"step {trainer.step}: success rate {rate:.2f}")
-                logger.log_metrics({"eval/success": rate}, step=trainer.step)
-    save()
-    how = f"stopped by {stop.name}, run again to go on" if stop.name else "finished"
-    print(f"{out / 'policy'}: step {trainer.step} of {total}, {how}")
+                log({"success": rate}, "eval")
+        trainer.save(checkpoint)
+        path = export()
+    how = f"stopped by {stop.name}, run again to resume" if stop.name else "finished"
+    print(f"{path}: step {trainer.step} of {trainer.total}, {how}")
 
 
-def make_logger(kind: str, folder: str | Path, *, settings: Mapping[str, Any], wandb_mode: str) -> Logger:
-    """TorchRL's logger ``kind``, "csv" or "wandb", writing under ``folder/log``; wandb also keeps the ``settings``."""
-    wandb = {"project": "torchrl_sparse", "mode": wandb_mode, "config": dict(settings)}
-    return get_logger(kind, str(Path(folder).resolve()), "log", wandb_kwargs=wandb)
+def _means(losses: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {name: sum(step[name] for step in losses) / len(losses) for name in losses[0]}
+
+
+def _make_logger(settings: Mapping[str, Any]) -> Logger:
+    wandb = {"project": "torchrl_sparse", "mode": settings["wandb_mode"], "config": dict(settings)}
+    return get_logger(settings["logger"], str(Path(settings["out"]).resolve()), "log", wandb_kwargs=wandb)

@@ -7,8 +7,7 @@ from transformers import LlamaConfig, LlamaModel
 
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, pack, row_attention
-from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind
-from torchrl_sparse.tokens.base import TokenPruner
+from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
 
 BATCH, VISUAL, TEXT, SLOTS = 3, 8, 4, 14
 
@@ -33,7 +32,7 @@ def sequence():
     return LayerState(0, hidden, alive, positions, kind, kind == TokenKind.TEXT, VISUAL, td)
 
 
-class Drop(TokenPruner):
+class Drop(LayerHooks):
     """Drops visual tokens ``ids`` after a layer; remembers every state that it is shown."""
 
     def __init__(self, layer, ids):
@@ -74,31 +73,31 @@ def reference(decoder):
 
 @torch.no_grad()
 def test_it_is_llama_without_the_causal_mask(decoder, reference, sequence):
-    ours = decoder(sequence, TokenPruner()).hidden
+    ours = decoder(sequence).hidden
     torch.testing.assert_close(ours, manual_attention(reference, sequence.hidden, causal=False))
     assert (ours - manual_attention(reference, sequence.hidden, causal=True)).abs().max() > 0.1
 
 
 @torch.no_grad()
 def test_a_later_token_changes_an_earlier_output(decoder, sequence):
-    before = decoder(sequence, TokenPruner()).hidden
+    before = decoder(sequence).hidden
     sequence.hidden = sequence.hidden.clone()
     sequence.hidden[:, -1] += 1.0
-    after = decoder(sequence, TokenPruner()).hidden
+    after = decoder(sequence).hidden
     assert ((after - before)[:, 0].abs().amax(-1) > 1e-3).all()
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("layer", range(4))
 def test_keeping_all_is_dense_bit_by_bit(decoder, sequence, layer):
-    dense = decoder(sequence, TokenPruner())
+    dense = decoder(sequence)
     pruned = decoder(sequence, Drop(layer, [[], [], []]))
     assert torch.equal(pruned.hidden, dense.hidden)
 
 
 @torch.no_grad()
 def test_positions_stay_and_only_visual_tokens_go(decoder, sequence):
-    class Everything(TokenPruner):
+    class Everything(LayerHooks):
         def after_layer(self, index, state):
             self.state = state
             return torch.zeros_like(state.alive)

@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torchrl_sparse import DiffusionPolicy, Normalizer, TransformerForDiffusion, keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
-from torchrl_sparse.training.trainer import TrainConfig
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_windows_pair_pictures_with_the_actions_taken_then(demos):
 
 def test_loss_falls(make_trainer):
     trainer = make_trainer(max_steps=80, lr=3e-3, batch_size=16, lr_warmup_steps=5)
-    losses = [trainer.train_step() for _ in range(80)]
+    losses = [trainer.train_step()["loss"] for _ in range(80)]
     assert sum(losses[-10:]) < 0.8 * sum(losses[:10])
 
 

@@ -44,7 +44,7 @@ def test_a_start_that_does_not_fall_is_refused(start):
 
 
 def test_the_error_is_that_of_the_executed_actions_of_the_chain(policy):
-    reference = TensorDict(
+    targets = TensorDict(
         {
             keys.COND: torch.randn(20, 2, 5),
             keys.SEED: torch.arange(20)[:, None],
@@ -52,7 +52,7 @@ def test_the_error_is_that_of_the_executed_actions_of_the_chain(policy):
         },
         [20],
     )
-    error = demonstration_error(policy, reference, [70, 20], n_action_steps=3)
+    error = demonstration_error(policy, targets, [70, 20], n_action_steps=3)
     policy.sampler = Sampler("ddim", timesteps=[70, 20])
-    actions = policy.denoise(policy.sample_noise(torch.arange(20)), reference[keys.COND])
-    assert error == pytest.approx((actions - reference["target"])[:, 1:4].abs().mean().item(), rel=1e-5)
+    actions = policy.denoise(policy.sample_noise(torch.arange(20)), targets[keys.COND])
+    assert error == pytest.approx((actions - targets["target"])[:, 1:4].abs().mean().item(), rel=1e-5)

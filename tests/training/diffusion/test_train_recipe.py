@@ -31,9 +31,9 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     often = ["checkpoint_every=50", "log_every=10", "lr_warmup_steps=2", "threads=1"]
     settings = [f"demos={demos}", *sizes, *often]
     step, first, second = stop_and_go_on("train_policy", broken, settings)
-    assert "stopped by SIGTERM, run again to go on" in first
+    assert "stopped by SIGTERM, run again to resume" in first
     assert 50 <= step < 400
-    assert f"going on from step {step}" in second
+    assert f"resumed from step {step}" in second
     assert "step 400 of 400, finished" in second
     assert len((broken / "log/scalars/train/lr.csv").read_text().splitlines()) >= 39
 

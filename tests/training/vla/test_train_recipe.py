@@ -19,13 +19,13 @@ def demos(tmp_path_factory):
 def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     broken, unbroken = tmp_path / "broken", tmp_path / "unbroken"
     sizes = ["size=tiny", "network.chunk_size=3", "+network.llm.layers=2", "batch_size=2", "max_steps=160"]
-    lessons = ["grounding.look_steps=30", "grounding.answer_steps=30"]
-    settings = [f"demos={demos}", *sizes, *lessons, "checkpoint_every=40", "lr_warmup_steps=2", "threads=1"]
+    stages = ["grounding.locate_steps=30", "grounding.refer_steps=30"]
+    settings = [f"demos={demos}", *sizes, *stages, "checkpoint_every=40", "lr_warmup_steps=2", "threads=1"]
     step, first, second = stop_and_go_on("train_vla", broken, settings)
     assert "3 demonstrations of 3 instructions, 27 steps" in first
-    assert "stopped by SIGTERM, run again to go on" in first
+    assert "stopped by SIGTERM, run again to resume" in first
     assert 40 <= step < 160
-    assert f"going on from step {step}" in second
+    assert f"resumed from step {step}" in second
     assert "step 160 of 160, finished" in second
 
     train_unbroken("train_vla", unbroken, settings)
@@ -35,9 +35,9 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
 
     # from there once more: the first step of a warm-up moves nothing, and sizes are those of the policy
     again = tmp_path / "again"
-    no_lessons = ["grounding.look_steps=0", "grounding.answer_steps=0"]
+    no_stages = ["grounding.locate_steps=0", "grounding.refer_steps=0"]
     still = [f"demos={demos}", f"init={broken}/policy", "size=small", "max_steps=1", "batch_size=2"]
-    train_unbroken("train_vla", again, still + no_lessons)
+    train_unbroken("train_vla", again, still + no_stages)
     weights = [load_file(out / "policy/model.safetensors") for out in (broken, again)]
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(weights[1][name], value) for name, value in weights[0].items())

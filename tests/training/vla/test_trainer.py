@@ -13,7 +13,7 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.training.trainer import TrainConfig
+from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.loss import VLALoss
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
@@ -55,7 +55,7 @@ def make_trainer(demos):
 
 
 def run(trainer, until):
-    return [trainer.train_step() for _ in range(until - trainer.step)]
+    return [trainer.train_step()["loss"] for _ in range(until - trainer.step)]
 
 
 def test_loss_is_l1_of_what_the_policy_answers(policy, query):
@@ -100,7 +100,7 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
     first.save(tmp_path / "checkpoint.pt")
     second.load(tmp_path / "checkpoint.pt")
     assert begun + run(second, 6) == losses
-    for ours, theirs in ((second.trained, unbroken.trained), (second.averaged(), unbroken.averaged())):
+    for ours, theirs in ((second.module, unbroken.module), (second.averaged(), unbroken.averaged())):
         assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
 
 
@@ -112,7 +112,7 @@ def things(demos):
     return ObjectPositions(torch.stack([place, 1 - place], 1), ["lift the cube", "lower the cube"])
 
 
-def test_lessons_come_before_the_actions_and_leave_the_policy_as_it_was_built(make_trainer, demos, things):
+def test_stages_come_before_the_actions_and_leave_the_policy_as_it_was_built(make_trainer, demos, things):
     options = {"max_steps": 200, "batch_size": 8, "val_ratio": 0.0, "lr": 3e-3}
     trainer = make_trainer(replace(demos, objects=things), GroundingConfig(100, 97), **options)
     network = trainer.policy.network
@@ -141,7 +141,7 @@ def test_warm_up_begins_at_nothing_unless_there_is_none(make_trainer, warmup, fi
     assert make_trainer(lr_warmup_steps=warmup).lr == 1e-3 * first
 
 
-def test_a_training_with_lessons_goes_on_to_the_last_bit(make_trainer, demos, things, tmp_path):
+def test_a_training_with_stages_resumes_to_the_last_bit(make_trainer, demos, things, tmp_path):
     settings = (replace(demos, objects=things), GroundingConfig(2, 2))
     unbroken, first, second = (make_trainer(*settings) for _ in range(3))
     losses = run(unbroken, 6)
@@ -149,15 +149,15 @@ def test_a_training_with_lessons_goes_on_to_the_last_bit(make_trainer, demos, th
     first.save(tmp_path / "checkpoint.pt")
     second.load(tmp_path / "checkpoint.pt")
     assert begun + run(second, 6) == losses
-    with pytest.raises(ValueError, match=r"checkpoint.pt: made with another config: look_steps is"):
+    with pytest.raises(ValueError, match=r"checkpoint.pt: made with another config: locate_steps is"):
         make_trainer(settings[0], GroundingConfig(1, 3)).load(tmp_path / "checkpoint.pt")
 
 
-def test_lessons_without_positions_are_refused(make_trainer):
+def test_stages_without_positions_are_refused(make_trainer):
     with pytest.raises(ValueError, match="grounding: expected the objects' positions"):
-        make_trainer(grounding=GroundingConfig(look_steps=5))
-    with pytest.raises(ValueError, match="look_steps >= 0"):
-        GroundingConfig(look_steps=-1)
+        make_trainer(grounding=GroundingConfig(locate_steps=5))
+    with pytest.raises(ValueError, match="locate_steps >= 0"):
+        GroundingConfig(locate_steps=-1)
     with pytest.raises(ValueError, match=r"positions: expected \[N, 2, 3\]"):
         ObjectPositions(torch.zeros(5, 3, 3), ["lift", "lower"])
 
@@ -175,7 +175,7 @@ def test_the_instruction_can_be_learned(make_trainer, demos):
     trainer, losses = make_trainer(max_steps=300, **options), [1.0] * 5
     # whoever ignores the instruction cannot get below 1 / 7: one of seven numbers is 1 or -1, evenly
     while sum(losses[-5:]) / 5 > 0.05 and trainer.step < 250:
-        losses.append(trainer.train_step())
+        losses.append(trainer.train_step()["loss"])
     sample = demos.windows(torch.tensor([[0, 1]]), [keys.IMAGE, keys.WRIST_IMAGE, keys.STATE])
     with torch.no_grad():
         up = trainer.policy(sample.clone())[keys.CHUNK]

@@ -43,6 +43,8 @@ class PrunerNetwork(nn.Module):
         torch.Size([7, 4, 6, 2])
     """
 
+    is_static = False
+
     def __init__(
         self,
         timesteps: Sequence[int],

@@ -91,10 +91,10 @@ class Expert(ABC):
 
     @abstractmethod
     def waypoints(self) -> Sequence[Waypoint]:
-        """One waypoint per arm for the present state."""
+        """Return one waypoint per arm for the present state."""
 
     def command(self) -> np.ndarray:
-        """f64 [7 * arms] absolute command: position (m), rotation vector (rad), gripper."""
+        """Return f64 [7 * arms] absolute command: position (m), rotation vector (rad), gripper."""
         pairs = zip(map(self.hand, range(len(self.sim_env.robots))), self.waypoints(), strict=True)
         return np.concatenate([self._step_towards(hand, waypoint) for hand, waypoint in pairs])
 
@@ -108,7 +108,7 @@ class Expert(ABC):
     # -- what an expert sees ----------------------------------------------------------------------
 
     def hand(self, arm: int = 0) -> Hand:
-        """The hand of one arm."""
+        """Return the hand of one arm."""
         data = self.sim_env.sim.data
         robot = self.sim_env.robots[arm]
         site = robot.eef_site_id["right"]
@@ -121,7 +121,7 @@ class Expert(ABC):
         )
 
     def body(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Position f64 [3] and rotation f64 [3, 3] of a body."""
+        """Return the position f64 [3] and rotation f64 [3, 3] of a body."""
         data = self.sim_env.sim.data
         index = self.sim_env.sim.model.body_name2id(name)
         return data.body_xpos[index].copy(), data.body_xmat[index].reshape(3, 3).copy()
@@ -138,7 +138,7 @@ class Expert(ABC):
         slack: float = 0.01,
         turn: float = 0.0,
     ) -> np.ndarray:
-        """f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
+        """Return f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
 
         Args:
             hand: where the hand is.
@@ -159,18 +159,18 @@ class Expert(ABC):
 
 
 def at(hand: Hand, goal: np.ndarray, rotation: np.ndarray, *, position: float, angle: float = 0.1) -> bool:
-    """Is the hand within ``position`` m and ``angle`` rad of a pose?"""
+    """Tell whether the hand is within ``position`` m and ``angle`` rad of a pose."""
     turn = Rotation.from_matrix(rotation @ hand.rotation.T).magnitude()
     return bool(np.linalg.norm(hand.position - goal) < position and turn < angle)
 
 
 def downward(yaw: float) -> np.ndarray:
-    """f64 [3, 3] of a hand that points straight down, turned by ``yaw`` rad about the vertical."""
+    """Return f64 [3, 3] of a hand that points straight down, turned by ``yaw`` rad about the vertical."""
     return Rotation.from_euler("z", yaw).as_matrix() @ DOWNWARD
 
 
 def nearest(angle: float, reference: float, period: float) -> float:
-    """The equivalent of ``angle`` modulo ``period`` that is nearest to ``reference``, rad.
+    """Return the equivalent of ``angle`` modulo ``period`` that is nearest to ``reference``, rad.
 
     >>> round(nearest(3.0, 0.0, 3.0), 6)
     0.0
@@ -179,5 +179,5 @@ def nearest(angle: float, reference: float, period: float) -> float:
 
 
 def clipped(vector: np.ndarray, length: float) -> np.ndarray:
-    """The vector, shortened to ``length`` where it is longer."""
+    """Return the vector, shortened to ``length`` where it is longer."""
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-9))

@@ -41,7 +41,7 @@ class BlockPushExpert:
         self._speed, self._push_speed = rng.uniform(*_SPEED), rng.uniform(*_PUSH_SPEED)
 
     def command(self, state: np.ndarray) -> np.ndarray:
-        """The shift of the tip's target, f64 [2] in m, in a state [16] of `BlockPushEnv`."""
+        """Return the shift of the tip's target, f64 [2] in m, in a state [16] of `BlockPushEnv`."""
         state = np.asarray(state, np.float64)
         blocks, tip, squares = state[[[0, 1], [3, 4]]], state[8:10], state[[[10, 11], [13, 14]]]
         block, square = self._next(blocks, squares)
@@ -53,7 +53,7 @@ class BlockPushExpert:
         return self._walk(tip, blocks[block] - _BEHIND * ahead, blocks)
 
     def _next(self, blocks: np.ndarray, squares: np.ndarray) -> tuple[int, int]:
-        """The pair to work on: the first of the order that is not done, unless the other block stands where its push begins."""
+        """Return the pair to work on: the first in order that is not done, unless the other block is where its push begins."""
         left = [(b, s) for b, s in self._order if np.linalg.norm(blocks[b] - squares[s]) > _HOME]
         for block, square in left:
             begin = blocks[block] - _BEHIND * _direction(blocks[block], squares[square])
@@ -62,7 +62,7 @@ class BlockPushExpert:
         return (left or self._order)[0]
 
     def _walk(self, tip: np.ndarray, goal: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-        """A step towards ``goal`` that goes round blocks."""
+        """Return a step towards ``goal`` that goes round blocks."""
         gap = goal - tip
         distance = max(float(np.linalg.norm(gap)), 1e-9)
         heading = gap / distance
@@ -72,18 +72,18 @@ class BlockPushExpert:
 
 
 def _direction(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The unit vector from one point to another, f64 [2]."""
+    """Return the unit vector from one point to another, f64 [2]."""
     away = end - start
     return away / max(float(np.linalg.norm(away)), 1e-9)
 
 
 def _beside(ahead: np.ndarray, offset: np.ndarray) -> float:
-    """Signed distance of ``offset`` to the line along the unit vector ``ahead``, to its left."""
+    """Return the signed distance of ``offset`` to the line along the unit vector ``ahead``, to its left."""
     return float(ahead[0] * offset[1] - ahead[1] * offset[0])
 
 
 def _go_round(heading: np.ndarray, offset: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """``heading``, or a direction round a block if the way to the goal leads too close to it.
+    """Return ``heading``, or a direction round a block if the way to the goal leads too close to it.
 
     Args:
         heading: unit vector.

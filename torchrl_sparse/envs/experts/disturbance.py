@@ -50,7 +50,7 @@ class Disturbance:
         self._miss_drift = rng.uniform(-1.0, 1.0, 2) if misses else np.zeros(2)
 
     def __call__(self, clean: np.ndarray, present: np.ndarray) -> np.ndarray:
-        """The command to execute.
+        """Return the command to execute.
 
         Args:
             clean: f64 [7 * arms] the expert's command.
@@ -106,7 +106,7 @@ class Disturbance:
         return self._missed_steps < self._miss_steps and bool(self._missed_steps or near)
 
     def _miss(self, command: np.ndarray, present: np.ndarray) -> None:
-        """Closes the fingers, then takes the hand away as if they held something."""
+        """Close the fingers, then take the hand away as if they held something."""
         command[6] = 1.0
         if self._missed_steps >= _CLOSING_STEPS:
             command[:3] = present + _MISS_RISE * np.array([*self._miss_drift, 1.0])

@@ -30,7 +30,7 @@ class LiftExpert(Expert):
         return [Waypoint(self.above(hand, grasp) + ahead, aligned, OPEN)]
 
     def lead(self) -> np.ndarray:
-        """f64 [3] by how much to aim ahead of the cube, m."""
+        """Return f64 [3], m, to aim ahead of the cube."""
         return np.zeros(3)
 
 

@@ -65,12 +65,12 @@ class NutAssemblySquareExpert(Expert):
         return Waypoint(goal + grip, downward(hand.yaw + turned), CLOSED, pace)
 
     def _misalignment(self, hand: Hand, nut: np.ndarray) -> float:
-        """Horizontal distance of the nut to the peg, m, now or in a moment, whichever is larger."""
+        """Return the horizontal distance of the nut to the peg, m, now or in a moment, whichever is larger."""
         now = nut[:2] - self._peg[:2]
         return float(max(np.linalg.norm(now), np.linalg.norm(now + _FORESIGHT * hand.velocity[:2])))
 
     def _place(self, hand: Hand, nut: np.ndarray, turn: float, around: bool) -> np.ndarray:
-        """Over the peg, or short of it while there is much to turn or the stretched arm tilts the hand."""
+        """Return the place over the peg, or short of it while there is much to turn or the stretched arm tilts the hand."""
         tilted = hand.tilt > 0.1 and np.linalg.norm(nut[:2] - self._peg[:2]) < 0.08
         waiting = 0.0 if around else max(np.clip(abs(turn) / 0.5 - 0.2, 0.0, 1.0), float(tilted))
         return np.array([self._peg[0] - waiting * _BACK, self._peg[1], nut[2]])
@@ -84,7 +84,7 @@ class NutAssemblySquareExpert(Expert):
 
 
 def grasp_yaw(nut_yaw: float, hand_yaw: float) -> float:
-    """The hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis.
+    """Return the hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis.
 
     Where the nuts lie, the forearm is nearly vertical, and yaws far from 0 make the wrist almost singular:
     they cost twice. The hand's present yaw keeps a choice once it is made.
@@ -99,14 +99,14 @@ def grasp_yaw(nut_yaw: float, hand_yaw: float) -> float:
 
 
 def _turn_left(hand_yaw: float, nut_yaw: float) -> float:
-    """The turn that brings the nut into its yaw on the peg, round the way that the hand can reach, rad."""
+    """Return the turn that brings the nut into its yaw on the peg, round the way that the hand can reach, rad."""
     turn = nearest(_PLACED_YAW - nut_yaw, 0.0, 2 * np.pi)
     ways = [turn, turn - np.sign(turn) * 2 * np.pi]
     return min(ways, key=lambda way: (not _reachable(hand_yaw + way), abs(way)))
 
 
 def _part(turn: float) -> float:
-    """The beginning of a turn, since the shorter way round would be taken of one beyond pi."""
+    """Return the beginning of a turn, since the shorter way round would be taken of one beyond pi."""
     return float(np.clip(turn, -1.0, 1.0))
 
 
@@ -115,7 +115,7 @@ def _yaw(rotation: np.ndarray) -> float:
 
 
 def _unwrapped(yaw: float) -> float:
-    """The equivalent yaw within the last joint's range."""
+    """Return the equivalent yaw within the last joint's range."""
     return nearest(yaw, sum(_YAW_LIMITS) / 2, 2 * np.pi)
 
 

@@ -74,7 +74,7 @@ class Style:
 
 
 def _operator(name: str, speed: float, sloppiness: float, hesitation: float) -> Operator:
-    """An operator whose paths wander in proportion to ``sloppiness`` (1 is the proficient one)."""
+    """Return an operator whose paths wander in proportion to ``sloppiness`` (1 is the proficient one)."""
     return Operator(
         name=name,
         reach=(0.85 * 0.07 * speed, 1.15 * 0.07 * speed),
@@ -108,7 +108,7 @@ OPERATORS: Mapping[str, tuple[Operator, ...]] = {
 
 
 def draw_operator(quality: str, rng: np.random.Generator) -> Operator:
-    """One of the operators of a quality.
+    """Draw one of the operators of a quality.
 
     Raises:
         ValueError: if there is no such quality; the message lists those there are.

@@ -58,7 +58,7 @@ class PickPlaceCanExpert(Expert):
         return Waypoint(goal, downward(0.0), CLOSED)
 
     def _over_bin(self, can: np.ndarray, margin: float) -> bool:
-        """Is the can's centre over its quarter of the bin, ``margin`` m or more from the edge?"""
+        """Tell whether the can's centre is over its quarter of the bin, ``margin`` m or more from the edge."""
         room = np.asarray(self.sim_env.bin_size[:2]) / 4 - margin
         return bool((np.abs(can[:2] - self._bin[:2]) < room).all())
 

@@ -72,7 +72,7 @@ class PushTExpert:
         self._way: list[_Point] = []
 
     def command(self, state: np.ndarray) -> np.ndarray:
-        """The agent's target position, f64 [2] in pixels, in a state [20] of `PushTEnv`."""
+        """Return the agent's target position, f64 [2] in pixels, in a state [20] of `PushTEnv`."""
         state = np.asarray(state, np.float64)
         agent = state[18:]
         while self._way and np.linalg.norm(self._way[0].position - agent) < self._way[0].near:
@@ -84,7 +84,7 @@ class PushTExpert:
         return agent + gap * min(1.0, lead / max(float(np.linalg.norm(gap)), 1e-9))
 
     def _plan(self, agent: np.ndarray, position: np.ndarray, angle: float) -> list[_Point]:
-        """The way to the best push, the push, and back off."""
+        """Plan the way to the best push, the push, and the way back."""
         best, best_rate = [_Point(np.full(2, WINDOW / 2))], -np.inf
         before = _error(position, angle)
         for begin, direction in self._candidates(position, angle):
@@ -116,7 +116,7 @@ class PushTExpert:
                         yield begin, -turn @ outward
 
     def _try(self, begin: np.ndarray, direction: np.ndarray, position: np.ndarray, angle: float):
-        """Pushes in the copy: yields each length and the outline's distance to the goal after it."""
+        """Push in the copy: yield each length and the outline's distance to the goal after it."""
         block, agent, space = self._copy.block, self._copy.agent, self._copy.space
         block.angle, block.position = angle, tuple(position)
         block.velocity, block.angular_velocity = (0.0, 0.0), 0.0
@@ -134,7 +134,7 @@ class PushTExpert:
 
 
 def block_pose(keypoints: np.ndarray) -> tuple[np.ndarray, float]:
-    """Position f64 [2], pixels, and angle, rad, of the block with these keypoints [9, 2].
+    """Return the position f64 [2], pixels, and angle, rad, of the block with these keypoints [9, 2].
 
     >>> from torchrl_sparse.envs.pusht import block_keypoints
     >>> position, angle = block_pose(block_keypoints((100.0, 200.0), 0.7))
@@ -159,12 +159,12 @@ _GOAL_OUTLINE = _outline(GOAL[:2], GOAL[2])
 
 
 def _error(position: np.ndarray, angle: float) -> float:
-    """Mean distance of the outline's corners to where they should be, pixels."""
+    """Return the mean distance of the outline's corners to where they should be, pixels."""
     return float(np.linalg.norm(_outline(position, angle) - _GOAL_OUTLINE, axis=1).mean())
 
 
 def _distance(points: np.ndarray, position: np.ndarray, angle: float) -> np.ndarray:
-    """Distance of points [n, 2] to the block, pixels; 0 inside it."""
+    """Return the distance of points [n, 2] to the block, pixels; 0 inside it."""
     own = (points - position) @ _rotation(angle)
     bar = np.linalg.norm(np.maximum(np.abs(own - [0, 15]) - [60, 15], 0), axis=-1)
     stem = np.linalg.norm(np.maximum(np.abs(own - [0, 75]) - [15, 45], 0), axis=-1)
@@ -176,7 +176,7 @@ def _is_free(point: np.ndarray, position: np.ndarray, angle: float) -> bool:
 
 
 def _walk(agent: np.ndarray, goal: np.ndarray, position: np.ndarray, angle: float) -> list[np.ndarray]:
-    """Points on a way to ``goal`` that does not touch the block: straight, or out, round and in again."""
+    """Return points on a way to ``goal`` that does not touch the block: straight, or out, round and in again."""
     way = agent + np.linspace(0, 1, 20)[:, None] * (goal - agent)
     if (_distance(way[1:], position, angle) > _RADIUS + 2).all():
         return [goal]

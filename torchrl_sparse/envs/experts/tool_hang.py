@@ -46,7 +46,7 @@ class Pose:
     rotation: np.ndarray
 
     def point(self, local: np.ndarray) -> np.ndarray:
-        """f64 [3] where a point of the body is in the world, m."""
+        """Return f64 [3] where a point of the body is in the world, m."""
         return self.position + self.rotation @ local
 
 
@@ -82,7 +82,7 @@ class ToolHangExpert(Expert):
 
     @staticmethod
     def _insert(hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
-        """The next step down the hole; ``off`` is the tip's f64 [3] offset from the centre of the hole's rim, m."""
+        """Return the next step down the hole; ``off`` is the tip's f64 [3] offset from the centre of the hole's rim, m."""
         tip = frame.point(FRAME_TIP)
         goal = tip - np.array([off[0], off[1], descent(off, frame.rotation[:, 2])])
         turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
@@ -90,7 +90,7 @@ class ToolHangExpert(Expert):
 
     @staticmethod
     def _stand_up(hand: Hand, frame: Pose, off: np.ndarray) -> Waypoint:
-        """The next step of the frame to over the hole, and of its tip into it once they are aligned."""
+        """Return the next step of the frame to over the hole, and of its tip into it once they are aligned."""
         tip = frame.point(FRAME_TIP)
         turn = Rotation.from_matrix(_STANDING @ frame.rotation.T)
         ahead = [np.abs(off[:2] + time * hand.velocity[:2]).max() for time in (0.0, _FORESIGHT)]
@@ -128,7 +128,7 @@ class ToolHangExpert(Expert):
 
     @staticmethod
     def _thread(hand: Hand, frame: Pose, tool: Pose, hole: np.ndarray) -> Waypoint:
-        """Brings the tool's hole, at ``hole`` m from the hook, over its upturned end, and round the corner."""
+        """Bring the tool's hole, at ``hole`` m from the hook, over its upturned end, and round the corner."""
         threaded = around(hole)
         goal, pitch = along_hook(hole) if threaded else over_hook(hole)
         turn = Rotation.from_matrix(frame.rotation @ hanging(pitch) @ tool.rotation.T)
@@ -146,24 +146,24 @@ _HOOK_AXES = np.diag([-1.0, 1.0, 1.0])  # from (outward, sideways, up) to the fr
 
 
 def from_hook(frame: Pose, point: np.ndarray) -> np.ndarray:
-    """f64 [3] of a point of the world, m from the hook's corner: outward along the arm, sideways and along the rod."""
+    """Return f64 [3] of a point of the world, m from the hook's corner: outward along the arm, sideways and along the rod."""
     return _HOOK_AXES @ frame.rotation.T @ (point - frame.point(FRAME_HOOK))
 
 
 def in_hole(off: np.ndarray) -> bool:
-    """Is a tip, ``off`` f64 [3] m from the centre of the hole's rim, in the hole?"""
+    """Tell whether a tip, ``off`` f64 [3] m from the centre of the hole's rim, is in the hole."""
     return bool(off[2] < -0.005 and np.abs(off[:2]).max() < _INSIDE)
 
 
 def descent(off: np.ndarray, up: np.ndarray) -> float:
-    """By how much, m, a frame with its tip in the hole may go down: not at all while its rod would land on the rim."""
+    """Return the way, m, that a frame with its tip in the hole may go down: none while its rod would land on the rim."""
     misfit = np.abs(off[:2] - off[2] * up[:2] / up[2]).max()  # of the rod's axis, at the height of the rim
     at_rod = _ROD_END[0] < -off[2] < _ROD_END[1]
     return float(np.clip(0.015 - 30.0 * max(0.0, misfit - (_ROD_FIT if at_rod else 0.003)), -0.005, 0.015))
 
 
 def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float, float]) -> bool:
-    """Are the fingers around a body's grip, and as far apart as it is wide?
+    """Tell whether the fingers are around a body's grip, and as far apart as it is wide.
 
     Args:
         hand: whose fingers.
@@ -179,7 +179,7 @@ def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float
 
 
 def around(hole: np.ndarray) -> bool:
-    """Is the tool's hole, its centre ``hole`` f64 [3] m from the hook's corner, around the hook?"""
+    """Tell whether the tool's hole, its centre ``hole`` f64 [3] m from the hook's corner, is around the hook."""
     outward, sideways, up = hole
     around_end = -0.008 < up < _HOOK_TOP + 0.001 and abs(outward) < 0.008
     around_arm = outward < 0.0 and abs(up) < 0.009
@@ -212,13 +212,13 @@ def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def hanging(pitch: float) -> np.ndarray:
-    """f64 [3, 3] rotation of the tool in the frame's axes: handle outward, ``pitch`` rad below the arm's direction."""
+    """Return f64 [3, 3] rotation of the tool in the frame's axes: handle outward, ``pitch`` rad below the arm's direction."""
     c, s = np.cos(pitch), np.sin(pitch)
     return _HOOK_AXES @ np.array([[c, 0.0, s], [0.0, -1.0, 0.0], [-s, 0.0, c]])
 
 
 def _leaning(forward: np.ndarray, down: np.ndarray, angle: float) -> np.ndarray:
-    """f64 [3, 3] of a hand that points along ``down``, leaning by ``angle`` rad to ``forward``."""
+    """Return f64 [3, 3] of a hand that points along ``down``, leaning by ``angle`` rad to ``forward``."""
     approach = np.cos(angle) * down + np.sin(angle) * forward
     palm = np.cos(angle) * forward - np.sin(angle) * down
     return np.stack([np.cross(palm, approach), palm, approach], axis=1)
@@ -232,12 +232,12 @@ _TOOL_GRASP = _leaning(-_X, -_Z, 0.0)
 def _carried(
     hand: Hand, point: np.ndarray, goal: np.ndarray, turn: Rotation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position and rotation of a hand that turns what it holds by ``turn`` and brings its ``point`` to ``goal``."""
+    """Return the position and rotation of a hand that turns what it holds by ``turn`` and brings its ``point`` to ``goal``."""
     return goal + turn.apply(hand.position - point), turn.as_matrix() @ hand.rotation
 
 
 def _sideways(hand: Hand, position: np.ndarray, share: float) -> np.ndarray:
-    """f64 [3] ``position`` with this share, 0 to 1, of the horizontal way there: what is held rises first."""
+    """Return f64 [3] ``position`` with this share, 0 to 1, of the horizontal way there: what is held rises first."""
     travelled = position.copy()
     travelled[:2] = hand.position[:2] + np.clip(share, 0.0, 1.0) * (position - hand.position)[:2]
     return travelled

@@ -77,16 +77,16 @@ class Hammer:
         return float(np.arctan2(self.along[1], self.along[0]))
 
     def point(self, ahead: float) -> np.ndarray:
-        """f64 [3] point ``ahead`` m from the handle's middle towards the taker."""
+        """Return f64 [3] point ``ahead`` m from the handle's middle towards the taker."""
         return self.middle + ahead * self.along
 
     def across(self, hand: Hand, lean: float = 0.0) -> np.ndarray:
-        """f64 [3, 3] of a hand that grasps across the handle, turned the nearer way, its palm ``lean`` rad back."""
+        """Return f64 [3, 3] of a hand that grasps across the handle, turned the nearer way, its palm ``lean`` rad back."""
         level = downward(nearest(self.yaw, hand.yaw, np.pi))
         return level @ Rotation.from_euler("x", -lean).as_matrix()
 
     def distance(self, hand: Hand) -> float:
-        """From the hand to the nearest point of the handle's axis, m."""
+        """Return the distance of the hand to the nearest point of the handle's axis, m."""
         ahead = np.clip((hand.position - self.middle) @ self.along, -_HANDLE_HALF, _HANDLE_HALF)
         return float(np.linalg.norm(hand.position - self.point(ahead)))
 
@@ -186,13 +186,13 @@ class TwoArmTransportExpert(Expert):
         return self._reach(hand, _HOMES[arm], downward(_azimuth(hand.position, arm)))
 
     def _reach(self, hand: Hand, goal: np.ndarray, aligned: np.ndarray, slack: float = 0.01) -> Waypoint:
-        """The empty hand on its way; it turns only where it may travel."""
+        """Return the empty hand on its way; it turns only where it may travel."""
         turn = Rotation.from_matrix(aligned @ hand.rotation.T).magnitude()
         point, travels = self._over(hand, hand.position, goal, turn, slack)
         return Waypoint(point, aligned if travels == 1.0 else downward(hand.yaw), OPEN)
 
     def _carry(self, hand: Hand, held: np.ndarray, place: np.ndarray, turn: float, slack: float) -> Waypoint:
-        """Something held on its way, turned about the vertical by ``turn`` rad as it travels."""
+        """Return something held on its way, turned about the vertical by ``turn`` rad as it travels."""
         point, travels = self._over(hand, held, place, turn, slack)
         turned = travels * float(np.clip(turn, -1.0, 1.0))
         grip = Rotation.from_euler("z", turned).apply(hand.position - held)
@@ -201,7 +201,7 @@ class TwoArmTransportExpert(Expert):
     def _over(
         self, hand: Hand, moved: np.ndarray, goal: np.ndarray, turn: float, slack: float
     ) -> tuple[np.ndarray, float]:
-        """A step of the hand or what it holds: up, then sideways over the walls and round the arm's base, then down.
+        """Return a step of the hand or what it holds: up, then sideways over the walls and round the arm's base, then down.
 
         Returns:
             f64 [3] where to move it next, m; and how freely it travels sideways, from 0 to 1.
@@ -220,7 +220,7 @@ class TwoArmTransportExpert(Expert):
         return moved + step, travels
 
     def _middle(self, moved: np.ndarray) -> np.ndarray:
-        """f64 [2] m where to rise: the middle of the bin around, if any, or right here."""
+        """Return f64 [2] m where to rise: the middle of the bin around, if any, or right here."""
         transport = self.sim_env.transport
         for bin_ in (transport.start_bin, transport.target_bin, transport.trash_bin):
             middle, _ = self.body(bin_.root_body)
@@ -230,13 +230,13 @@ class TwoArmTransportExpert(Expert):
 
 
 def _off_base(place: np.ndarray, distance: float) -> np.ndarray:
-    """f64 [2] the place, moved away from the nearer arm's base where it is within ``distance`` m of it."""
+    """Return f64 [2] the place, moved away from the nearer arm's base where it is within ``distance`` m of it."""
     base = _BASES[int(place[1] > 0)]
     return base + (place - base) * max(1.0, distance / np.linalg.norm(place - base))
 
 
 def _azimuth(place: np.ndarray, arm: int) -> float:
-    """The yaw of a hand there that leaves the wrist straight, rad: near the base, others drive it to its limits."""
+    """Return the yaw of a hand there that leaves the wrist straight, rad: near the base, others drive it to its limits."""
     away = place[:2] - _BASES[arm]
     return float(np.arctan2(away[1], away[0]))
 
@@ -250,7 +250,7 @@ def _stay(hand: Hand, gripper: float) -> Waypoint:
 
 
 def _around(hand: Hand, thing: np.ndarray, width: float) -> bool:
-    """Are the fingers around a thing, closed on it or not yet free of it?"""
+    """Tell whether the fingers are around a thing, closed on it or not yet free of it."""
     return bool(np.linalg.norm(hand.position - thing) < 0.025 and hand.opening < width + _FREE)
 
 
@@ -259,5 +259,5 @@ def _holds(hand: Hand, thing: np.ndarray, width: float) -> bool:
 
 
 def _within(thing: np.ndarray, floor: np.ndarray) -> bool:
-    """Is a thing between the walls of the bin with this floor?"""
+    """Tell whether a thing is between the walls of the bin with this floor."""
     return bool((np.abs(thing[:2] - floor[:2]) < _ROOM - 0.01).all() and thing[2] < _WALL_TOP)

@@ -127,12 +127,12 @@ def draw_methods(
 
 
 def _adaptive(methods: Mapping[str, DiffusionPolicy]) -> dict[str, DiffusionPolicy]:
-    """Those whose masks depend on the observation."""
+    """Return those whose masks depend on the observation."""
     return {name: method for name, method in methods.items() if not method.plan.is_static}
 
 
 def _draw_masks(name: str, method: DiffusionPolicy, queries: TensorDictBase, out: Path) -> None:
-    """How the masks change along an episode, and over all queries."""
+    """Draw the masks along an episode, and their statistics over all queries."""
     masks = answer(method, queries)[keys.PRUNE_MASK].numpy()
     plot_mask_statistics(masks, out / f"masks_{name}.png", name=name)
     step = queries[keys.EPISODE_STEP].flatten()

@@ -1,4 +1,4 @@
-"""Where a vision-language-action model spends its time and what pruning saves, measured; see `results.vla_report`."""
+"""Times of a vision-language-action model's parts, and savings of pruning, measured; see `results.vla_report`."""
 
 from __future__ import annotations
 

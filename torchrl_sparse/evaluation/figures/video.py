@@ -21,7 +21,7 @@ _SUCCESS = (76, 187, 122)
 
 @dataclass(frozen=True)
 class Caption:
-    """What the bar under a frame says.
+    """Text of the bar under a frame.
 
     Attributes:
         method: name of the method.

@@ -203,7 +203,7 @@ class EngineCase:
         return Sampler("ddim", num_steps, self._ddpm.num_train_timesteps)
 
     def _random_mask(self, steps: int, rate: float, generator: torch.Generator) -> Tensor:
-        """Each row a mask of its own that prunes ``rate`` of all blocks, of which the first step prunes none."""
+        """Draw for each row a mask of its own that prunes ``rate`` of all blocks, none in the first step."""
         blocks = self.network.num_blocks
         order = torch.rand(self.batch, (steps - 1) * blocks, generator=generator).argsort(dim=1)
         later = order < min(round(rate * steps * blocks), order.shape[1])

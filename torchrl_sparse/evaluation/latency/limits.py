@@ -1,4 +1,4 @@
-"""What a machine can do at best: how fast it reads weights, and how fast it multiplies with them."""
+"""Limits of a machine: the rates at which it reads weights and multiplies with them."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ __all__ = ["Published", "PublishedFigure", "side_by_side"]
 
 @dataclass(frozen=True)
 class PublishedFigure:
-    """What a paper reports of one method on one task: success in percent, and how many times as fast as dense it is."""
+    """A paper's figures of one method on one task: success in percent, and how many times as fast as dense it is."""
 
     success: float
     speedup: float | None = None

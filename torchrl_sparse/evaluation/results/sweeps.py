@@ -74,7 +74,7 @@ class LocalSweep:
 
     Args:
         config: the sweep.
-        out: the folder; an earlier one of the same sweep is gone on with.
+        out: the folder; an earlier one of the same sweep is resumed.
         count: trials in all; None runs until the engine has no more, as a grid does.
 
     Raises:

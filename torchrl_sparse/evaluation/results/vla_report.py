@@ -52,7 +52,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Helper:
-    """What a pruner does beside the network: seconds, and the share of its method's query."""
+    """Work of a pruner beside the network: seconds, and the share of its method's query."""
 
     p50_s: float
     share: float

@@ -28,6 +28,9 @@ class EpisodeResult:
             :func:`measure_latency`.
         kept: visual tokens in a decoder layer, mean over the layers, of each query; empty for a policy without them.
         fine: whether each query was made in the controller's fine mode; empty without a controller.
+        score: highest reward of a step. Published results on Push-T are means of it.
+        completed: parts of the task that were done, None for a task that counts none.
+        way: which of its ways the task was done, None for a task that does not tell; -1 if none showed.
     """
 
     seed: int
@@ -39,6 +42,9 @@ class EpisodeResult:
     latency: tuple[float, ...] = ()
     kept: tuple[float, ...] = ()
     fine: tuple[bool, ...] = ()
+    score: float | None = None
+    completed: int | None = None
+    way: int | None = None
 
 
 @dataclass(frozen=True)

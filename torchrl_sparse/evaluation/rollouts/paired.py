@@ -4,6 +4,7 @@ An episode is fixed by its seed, and the noise of a query by (episode seed, epis
 paired by running each on the same seeds, in whatever order, number of environments or number of restarts.
 """
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
@@ -26,7 +27,14 @@ from torchrl_sparse.runtime.threads import num_threads
 __all__ = ["rollout_episodes"]
 
 _FAILURES = 3  # crashes of workers in a row, without an episode finished between them, that end an evaluation
-_REQUIRED = (keys.EPISODE_SEED, keys.QUERIED, keys.FLOPS, ("next", keys.SUCCESS), ("next", "done"))
+_REQUIRED = (
+    keys.EPISODE_SEED,
+    keys.QUERIED,
+    keys.FLOPS,
+    ("next", keys.SUCCESS),
+    ("next", "reward"),
+    ("next", "done"),
+)
 
 
 def rollout_episodes(
@@ -183,11 +191,16 @@ class _OpenEpisode:
         self.kept: list[float] = []
         self.fine: list[bool] = []
         self.queries = 0
+        self.score = -math.inf
+        self.completed: int | None = None
+        self.way: int | None = None
 
     def add(self, row: TensorDictBase) -> None:
         """Count one step; its cost counts only if it called the policy."""
         self.length += 1
         self.success |= bool(row["next", keys.SUCCESS])
+        self.score = max(self.score, float(row["next", "reward"]))
+        self.completed, self.way = _count(row, keys.EPISODE_COMPLETED), _count(row, keys.EPISODE_WAY)
         if not row[keys.QUERIED].item():
             return
         self.queries += 1
@@ -209,11 +222,20 @@ class _OpenEpisode:
             latency=tuple(self.latency),
             kept=tuple(self.kept),
             fine=tuple(self.fine),
+            score=self.score,
+            completed=self.completed,
+            way=self.way,
         )
 
 
+def _count(row: TensorDictBase, key: NestedKey) -> int | None:
+    """Return a count of the environment at the end of a step, None where it keeps none."""
+    value = row["next"].get(key, None)
+    return None if value is None else int(value)
+
+
 def _prune_rate(row: TensorDictBase) -> float:
-    """Of a query: the share of its blocks that were pruned or, where there are visual tokens, of those; else 0."""
+    """Return the pruned share of a query's blocks or, where there are visual tokens, of those; else 0."""
     if (mask := row.get(keys.PRUNE_MASK, None)) is not None:
         return float(mask.float().mean())
     if (kept := row.get(keys.KEPT, None)) is not None:

@@ -90,7 +90,7 @@ class CameraEncoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Encodes images u8 [N, 3, h, w]."""
+        """Encode images u8 [N, 3, h, w]."""
         crop = crop_random if self.training else crop_centre
         pixels = crop(images, self.crop_size).to(self.linear.weight.dtype) / 255 * 2 - 1
         points = spatial_softmax(self.keypoints(self.trunk(pixels)))
@@ -140,7 +140,7 @@ class VisionEncoder(nn.Module):
         self.feature_dim = _FEATURES * len(self.cameras)
 
     def forward(self, images: Mapping[str, Tensor]) -> Tensor:
-        """Features [*B, feature_dim] of images u8 [*B, 3, h, w] by camera.
+        """Return the features [*B, feature_dim] of images u8 [*B, 3, h, w] by camera.
 
         Raises:
             ValueError: if images have another type or size.

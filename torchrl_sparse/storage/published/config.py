@@ -58,7 +58,7 @@ class PublishedConfig:
             raise ValueError(f"cfg: expected a configuration, got {type(tree).__name__}")
 
     def get(self, path: str, kind: type, default: Any = _REQUIRED) -> Any:
-        """The entry at ``path``, references followed.
+        """Return the entry at ``path``, references followed.
 
         Args:
             path: keys joined by dots.
@@ -98,7 +98,7 @@ class PublishedConfig:
 
 
 def _plain(node: Any, done: dict[int, Any], depth: int) -> Any:
-    """Dicts, lists and values; ``done`` keeps a node that is mentioned many times from being unfolded each time."""
+    """Unfold dicts, lists and values; ``done`` keeps a node that is mentioned many times from being unfolded each time."""
     if depth == 0:
         raise ValueError(f"cfg: expected a configuration of at most {_MAX_DEPTH} levels")
     if id(node) not in done:

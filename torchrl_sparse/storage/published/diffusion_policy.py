@@ -31,7 +31,7 @@ class CheckpointError(ValueError):
 
 
 def read_diffusion_policy(path: str | Path) -> StoredPolicy:
-    """Reads a checkpoint of ``DiffusionTransformerLowdimPolicy`` or ``DiffusionTransformerHybridImagePolicy``.
+    """Read a checkpoint of ``DiffusionTransformerLowdimPolicy`` or ``DiffusionTransformerHybridImagePolicy``.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -119,7 +119,7 @@ _READERS = {
 
 
 def _weights(config: PublishedConfig, payload: Mapping) -> tuple[str, dict[str, StoredTensor]]:
-    """The state dict to use, by preference the averaged one, and what it is called."""
+    """Return the state dict to use, by preference the averaged one, and what it is called."""
     states = _mapping("state_dicts", payload.get("state_dicts"))
     averaged = "ema_model" in states
     if not averaged and config.get("training.use_ema", bool, False):

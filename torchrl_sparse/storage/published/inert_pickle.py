@@ -52,7 +52,7 @@ def read_pickle(
     known: Mapping[str, Callable[..., Any] | None] = PLAIN,
     persistent: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """The object that a pickle describes, made of plain containers and what ``known`` makes.
+    """Read the object that a pickle describes, made of plain containers and what ``known`` makes.
 
     Args:
         data: the pickle, of any protocol.

@@ -31,7 +31,7 @@ _DDIM_SETTINGS = {"set_alpha_to_one": (True, True), "steps_offset": (0, 0)}
 def read_network(
     archive: TorchArchive, config: PublishedConfig, section: str, stored: dict[str, StoredTensor]
 ) -> TransformerForDiffusion:
-    """The denoiser, in evaluation mode.
+    """Make the denoiser, in evaluation mode.
 
     Args:
         archive: the checkpoint.
@@ -94,7 +94,7 @@ def _describe(stored: Mapping[str, StoredTensor], name: str) -> str:
 
 
 def _check_options(archive, config, section: str, network: TransformerForDiffusion, masks: Mapping) -> None:
-    """Compares what the tensors tell with what the configuration says."""
+    """Compare what the tensors tell with what the configuration says."""
     said = {
         f"{section}.causal_attn": (
             config.get(f"{section}.causal_attn", bool, section == "policy"),
@@ -114,7 +114,7 @@ def _check_options(archive, config, section: str, network: TransformerForDiffusi
 
 
 def read_sampler(config: PublishedConfig) -> Sampler:
-    """The sampler.
+    """Make the sampler.
 
     Raises:
         ValueError: if it has settings that `Sampler` has not.
@@ -156,7 +156,7 @@ def read_affine(
 
 
 def read_tensors(archive: TorchArchive, where: str, stored: Mapping[str, StoredTensor]) -> dict[str, Tensor]:
-    """Reads tensors as f32, checked to be finite."""
+    """Read tensors as f32, checked to be finite."""
     tensors = {}
     for name, value in stored.items():
         if not value.storage.dtype.is_floating_point:

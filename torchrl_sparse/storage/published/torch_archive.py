@@ -114,7 +114,7 @@ class TorchArchive:
         return read_pickle(self._read("data.pkl"), {**known, **names}, _storage)
 
     def tensor(self, stored: StoredTensor) -> Tensor:
-        """Reads one tensor.
+        """Read one tensor.
 
         Raises:
             ValueError: if its bytes are missing or damaged.

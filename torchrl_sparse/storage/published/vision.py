@@ -42,7 +42,7 @@ class ImageLayout:
 
     @classmethod
     def of(cls, config: PublishedConfig) -> ImageLayout:
-        """The layout that ``policy.shape_meta`` describes.
+        """Parse the layout that ``policy.shape_meta`` describes.
 
         Raises:
             ValueError: if there is no camera or no state, or images of several sizes.
@@ -68,7 +68,7 @@ class ImageLayout:
         return cls(order, cameras, states, size[1:])
 
     def columns(self) -> list[int]:
-        """Indices, in the published condition, of each number of the condition here, cameras first."""
+        """Return the indices, in the published condition, of each number of the condition here, cameras first."""
         first, places = 0, {}
         for key, size in self.order.items():
             places[key] = range(first, first + size)
@@ -79,7 +79,7 @@ class ImageLayout:
 def read_vision(
     archive: TorchArchive, config: PublishedConfig, layout: ImageLayout, stored: dict[str, StoredTensor]
 ) -> VisionEncoder:
-    """The encoder of all cameras, in evaluation mode.
+    """Make the encoder of all cameras, in evaluation mode.
 
     Args:
         archive: the checkpoint.
@@ -130,7 +130,7 @@ def _camera_name(key: str, taken: Mapping[str, str]) -> str:
 
 
 def _camera_tensors(archive: TorchArchive, key: str, stored: dict[str, StoredTensor]) -> dict[str, Tensor]:
-    """Weights of one camera under the names of `CameraEncoder`."""
+    """Return the weights of one camera under the names of `CameraEncoder`."""
     for twin in (
         "backbone.",
         "pool.",
@@ -149,7 +149,7 @@ def _rename(name: str) -> str:
 
 
 def _check_pool(key: str, pool: Mapping[str, Tensor | None]) -> None:
-    """The keypoints' coordinates have to be those of `spatial_softmax`, at temperature 1."""
+    """Refuse coordinates of keypoints other than those of `spatial_softmax`, and temperatures other than 1."""
     temperature, x, y = (pool[name] for name in ("temperature", "pos_x", "pos_y"))
     if temperature is None or x is None or y is None:
         raise ValueError(f"obs_encoder: {key}: expected a spatial softmax, got none")

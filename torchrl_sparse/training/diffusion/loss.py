@@ -25,7 +25,7 @@ def noise_prediction_loss(
     noise: Tensor,
     timestep: Tensor,
 ) -> Tensor:
-    """Mean squared error between ``noise`` and the network's prediction of it, a scalar.
+    """Return the mean squared error between ``noise`` and the network's prediction of it, a scalar.
 
     Args:
         network: noise predictor.
@@ -79,7 +79,7 @@ class DiffusionLoss(LossModule):
         self.sampler = Sampler() if sampler is None else sampler
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """``{"loss": scalar}`` of a batch.
+        """Return ``{"loss": scalar}`` of a batch.
 
         Raises:
             ValueError: if the chunk does not have the network's horizon and action size.

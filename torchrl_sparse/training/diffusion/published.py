@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["PublishedShape", "published_network", "published_shape"]
+__all__ = ["PublishedShape", "published_network", "published_shape", "with_published"]
 
 
 @dataclass(frozen=True)
 class PublishedShape:
-    """What differs between tasks; all have 8 layers and 4 heads.
+    """The choices that differ between tasks; all networks have 8 layers and 4 heads.
 
     Attributes:
         horizon: actions of a chunk (Tp).
@@ -40,7 +41,7 @@ _SHAPES = {
 
 
 def published_shape(task: str) -> PublishedShape:
-    """The shape for a task; the robosuite tasks share one, which those without a published policy get too.
+    """Return the shape for a task; the robosuite tasks share one, which those without a published policy get too.
 
     Raises:
         ValueError: if there is no such task.
@@ -51,8 +52,21 @@ def published_shape(task: str) -> PublishedShape:
     return _SHAPES.get(find_task(task).alias, PublishedShape())
 
 
+def with_published(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``options`` with the published choice for the task where they are None and `PublishedShape` has one.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    >>> with_published("kitchen", {"n_emb": None, "horizon": 8, "seed": None})
+    {'n_emb': 768, 'horizon': 8, 'seed': None}
+    """
+    shape = asdict(published_shape(task))
+    return {name: shape.get(name) if value is None else value for name, value in options.items()}
+
+
 def published_network(task: str, **changes: Any) -> TransformerForDiffusion:
-    """An untrained network of the published shape for a task.
+    """Return an untrained network of the published shape for a task.
 
     Args:
         task: a name or alias.

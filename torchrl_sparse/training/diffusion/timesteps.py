@@ -1,4 +1,4 @@
-"""Where few denoising steps do best.
+"""A search for the timesteps at which a chain of few denoising steps does best.
 
 DDIM (arXiv:2010.02502) may stop at any timesteps. diffusers spaces them evenly, which in a few steps begins too low for
 a sample of pure noise and spends the last step at timestep 0, where hardly any noise is left. Which timesteps suit a
@@ -17,7 +17,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler, timesteps_fall
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.pruner.reference import dense_answers
+from torchrl_sparse.training.diffusion.targets import dense_answers
 
 __all__ = ["demonstration_error", "search_timesteps"]
 
@@ -29,10 +29,10 @@ def search_timesteps(
     num_train_timesteps: int = 100,
     strides: Sequence[int] = (10, 5, 2),
 ) -> tuple[tuple[int, ...], dict[tuple[int, ...], float]]:
-    """Moves one timestep at a time, always where it helps most, until no move of any stride helps.
+    """Move one timestep at a time, always where it helps most, until no move of any stride helps.
 
     Args:
-        error: of a chain with these timesteps, falling; asked once for each.
+        error: of a chain with these timesteps, falling; called once for each.
         start: timesteps to begin with, e.g. diffusers' own.
         num_train_timesteps: timesteps lie below it.
         strides: by how much a timestep moves; the first until it does not help any more, then the next.
@@ -66,13 +66,13 @@ def search_timesteps(
 
 
 def demonstration_error(
-    policy: DiffusionPolicy, reference: TensorDict, timesteps: Sequence[int], *, n_action_steps: int = 8
+    policy: DiffusionPolicy, targets: TensorDict, timesteps: Sequence[int], *, n_action_steps: int = 8
 ) -> float:
-    """Mean absolute error, normalised, of the executed actions of a DDIM chain against demonstrated ones.
+    """Return the mean absolute error, normalised, of the executed actions of a DDIM chain against demonstrated ones.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
-        reference: [N] with targets from data, see :func:`torchrl_sparse.training.pruner.reference.make_reference`.
+        targets: [N], from data, see `torchrl_sparse.training.diffusion.targets.make_targets`.
         timesteps: of the chain.
         n_action_steps: actions executed of a chunk.
     """
@@ -85,7 +85,7 @@ def demonstration_error(
     )
     first = policy.n_obs_steps - 1
     executed = slice(first, first + n_action_steps)
-    return (dense_answers(chain, reference) - reference["target"])[:, executed].abs().mean().item()
+    return (dense_answers(chain, targets) - targets["target"])[:, executed].abs().mean().item()
 
 
 def _moves(timesteps: tuple[int, ...], stride: int) -> list[tuple[int, ...]]:

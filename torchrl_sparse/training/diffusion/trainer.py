@@ -1,11 +1,13 @@
-"""Training a diffusion policy on demonstrations, see `torchrl_sparse.training.trainer`."""
+"""Training a diffusion policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -13,15 +15,16 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
 from torchrl_sparse.training.diffusion.loss import DiffusionLoss
-from torchrl_sparse.training.trainer import TrainConfig, Trainer, checksum, split_windows
+from torchrl_sparse.training.trainer import checksum
 
 __all__ = ["PolicyTrainer"]
 
 _VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as published
 
 
-class PolicyTrainer(Trainer):
+class PolicyTrainer(DemonstrationTrainer):
     """Trains a denoiser on demonstrations.
 
     Args:
@@ -30,10 +33,6 @@ class PolicyTrainer(Trainer):
         demos: demonstrations.
         config: how to train.
         vision: encoder of the cameras that the demonstrations have images of, trained in place.
-
-    Attributes:
-        step: optimiser steps taken.
-        lr: the learning rate of the next step.
 
     Raises:
         ValueError: if ``val_ratio`` leaves no episode to train on.
@@ -51,24 +50,25 @@ class PolicyTrainer(Trainer):
         self.loss = DiffusionLoss(network, normalizer, Sampler(), vision)
         self._data_checksum = sum(_checksum(value) for value in demos.data.values(True, True))
         sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
-        groups, trained = optimizer_groups(network, config.weight_decay), network
+        groups, module = optimizer_groups(network, config.weight_decay), network
         if vision is not None:
             groups.append({"params": [*vision.parameters()], "weight_decay": _VISION_WEIGHT_DECAY})
-            trained = nn.ModuleDict({"network": network, "vision": vision})
-        super().__init__(trained, config, groups, *split_windows(demos, sizes, config.val_ratio))
+            module = nn.ModuleDict({"network": network, "vision": vision})
+        super().__init__(module, config, groups, *split_windows(demos, sizes, config.val_ratio))
 
     def ema_policy(self, sampler: Sampler | None = None) -> DiffusionPolicy:
-        """The policy with copies of the networks and the averaged weights in them; ``sampler`` is its sampler."""
+        """Return a policy with copies of the networks, the averaged weights in them, and ``sampler``."""
         averaged = self.averaged()
         network, vision = (
             (averaged, None) if self.vision is None else (averaged["network"], averaged["vision"])
         )
         return DiffusionPolicy(network, self.normalizer, vision=vision, sampler=sampler)
 
-    def batch_loss(self, rows: Tensor) -> Tensor:
+    def window_loss(self, rows: Tensor) -> Tensor:
         batch = self.demos.windows(rows, self.network.n_obs_steps)
         device = next(self.network.parameters()).device
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
+        precision = torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
+        with precision, _attention(device):
             return self.loss(batch.to(device)).get("loss")
 
     def header(self) -> dict[str, dict]:
@@ -80,6 +80,11 @@ class PolicyTrainer(Trainer):
         return header if self.vision is None else header | {"vision_config": dict(self.vision.config)}
 
 
+def _attention(device: torch.device) -> AbstractContextManager:
+    """On a CPU the plain kernel: PyTorch's choice without dropout, the fused one, is slow on chunks as short as these."""
+    return sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" else nullcontext()
+
+
 def _checksum(value: Tensor) -> float:
-    """Sum of all entries; images are summed without a copy of them in another type."""
+    """Return the sum of all entries; images are summed without a copy of them in another type."""
     return checksum(value) if value.is_floating_point() else float(value.sum(dtype=torch.int64))

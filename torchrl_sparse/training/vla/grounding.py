@@ -1,11 +1,11 @@
-"""Lessons for towers and a decoder that start from nothing: where things are, and which of them words name.
+"""Auxiliary stages for towers and a decoder that start from random weights: locating objects, and those that words refer to.
 
-Published models begin with towers and a language model that were trained on the internet's pictures and texts. A small
-network without such a past is tempted not to look: the arm's own pose tells most of what comes next. Two lessons before the
-actions make up for it, of which nothing remains but the weights:
+Published models begin with towers and a language model that were trained on pictures and texts of the internet. A small
+network without them tends to ignore its images: the arm's own pose predicts most of the next actions. Two stages before the
+actions prevent that; only the weights that they leave remain:
 
-1. `Grounding.look`: the visual tokens tell where all objects are.
-2. `Grounding.answer`: told to handle one of them, whichever, the network tells where that one is.
+1. `Grounding.locate`: regress the positions of all objects from the visual tokens.
+2. `Grounding.refer`: regress, from the decoder's readout, the position of the object that the instruction refers to.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 __all__ = ["Grounding", "GroundingConfig", "ObjectPositions"]
 
-_REMEMBERED = 0.3  # weight of the first lesson's loss in the second
+_LOCATE_WEIGHT = 0.3  # of the first stage's loss in the second
 
 
 @dataclass(frozen=True)
 class GroundingConfig:
-    """How long each lesson takes.
+    """Optimiser steps of each stage.
 
     Attributes:
-        look_steps: first steps of a training, in which visual tokens tell where things are; without the decoder.
-        answer_steps: steps after those, in which the whole network tells where the thing is that words name.
+        locate_steps: first steps of a training, in which objects are located from visual tokens, without the decoder.
+        refer_steps: steps after those, in which the whole network locates the object that the instruction refers to.
 
     Raises:
         ValueError: if one is negative.
     """
 
-    look_steps: int = 0
-    answer_steps: int = 0
+    locate_steps: int = 0
+    refer_steps: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.look_steps, self.answer_steps) < 0:
+        if min(self.locate_steps, self.refer_steps) < 0:
             raise ValueError(
-                f"expected look_steps >= 0 and answer_steps >= 0, got {self.look_steps} and {self.answer_steps}"
+                f"expected locate_steps >= 0 and refer_steps >= 0, got {self.locate_steps} and {self.refer_steps}"
             )
 
 
 @dataclass(frozen=True)
 class ObjectPositions:
-    """Where the n objects of a scene are, step by step, and the instruction that names each.
+    """Positions of the n objects of a scene, step by step, and the instruction that refers to each.
 
     Attributes:
         positions: f32 [N, n, 3].
@@ -75,17 +75,17 @@ class ObjectPositions:
             )
 
     def standardised(self) -> ObjectPositions:
-        """About zero, and of unit size along the axis on which they vary most."""
+        """Return positions about zero, and of unit size along the axis on which they vary most."""
         positions = self.positions.double()  # or the last bit would depend on the number of threads
         centred = positions - positions.mean((0, 1))
         return ObjectPositions((centred / centred.std((0, 1)).max()).float(), self.instructions)
 
 
 class Grounding(nn.Module):
-    """What a policy is asked in both lessons, and the linear layers that read its answers. They are no part of the policy.
+    """The losses of both stages, and the linear layers that regress positions. They are no part of the policy.
 
     Args:
-        policy: whose network is to learn; its parameters are not this module's.
+        policy: whose network is trained; its parameters are not this module's.
         objects: number of objects n.
     """
 
@@ -93,27 +93,27 @@ class Grounding(nn.Module):
         super().__init__()
         config = policy.network.config
         self.cameras = len(config.cameras)
-        self.seen = nn.Linear(self.cameras * config.llm.dim, objects * 3)
-        self.told = nn.Linear(config.llm.dim, 3)
+        self.from_vision = nn.Linear(self.cameras * config.llm.dim, objects * 3)
+        self.from_readout = nn.Linear(config.llm.dim, 3)
 
-    def look(self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor) -> Tensor:
-        """L1 loss, a scalar: ``positions`` f32 [B, n, 3] from the mean of each camera's visual tokens."""
-        return self._seen_loss(policy.network.visual_tokens(policy.crop_images(batch)), positions)
+    def locate(self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor) -> Tensor:
+        """Return the L1 loss, a scalar, of ``positions`` f32 [B, n, 3] from the mean of each camera's visual tokens."""
+        return self._locate_loss(policy.network.visual_tokens(policy.crop_images(batch)), positions)
 
-    def answer(
+    def refer(
         self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor, instructions: Sequence[str]
     ) -> Tensor:
-        """L1 loss, a scalar: from what actions are read from, the position of an object drawn for each sample.
+        """Return the L1 loss, a scalar, of the position of an object drawn for each sample, from the actions' readout.
 
-        A part of `look`'s is added, so that vision does not forget it before the decoder has learnt to use it.
+        A part of `locate`'s is added, so that vision does not forget it before the decoder has learnt to use it.
         """
         asked = torch.randint(len(instructions), (len(positions),))
         words = NonTensorStack(*[instructions[index] for index in asked.tolist()])
         _, decoded = policy.predict(batch.copy().set(keys.INSTRUCTION, words))
-        told = self.told(policy.network.readout(decoded).mean(1)).float()
-        told_loss = (told - positions[torch.arange(len(positions)), asked]).abs().mean()
-        return told_loss + _REMEMBERED * self._seen_loss(decoded.visual, positions)
+        referred = self.from_readout(policy.network.readout(decoded).mean(1)).float()
+        loss = (referred - positions[torch.arange(len(positions)), asked]).abs().mean()
+        return loss + _LOCATE_WEIGHT * self._locate_loss(decoded.visual, positions)
 
-    def _seen_loss(self, visual: Tensor, positions: Tensor) -> Tensor:
+    def _locate_loss(self, visual: Tensor, positions: Tensor) -> Tensor:
         views = visual.unflatten(1, (self.cameras, -1)).mean(2)
-        return (self.seen(views.flatten(1)).float() - positions.flatten(1)).abs().mean()
+        return (self.from_vision(views.flatten(1)).float() - positions.flatten(1)).abs().mean()

@@ -13,7 +13,7 @@ __all__ = ["VLALoss", "chunk_l1"]
 
 
 def chunk_l1(predicted: Tensor, target: Tensor, is_pad: Tensor | None = None) -> Tensor:
-    """Mean absolute difference of action chunks [B, H, A], a scalar; actions with ``is_pad``, bool [B, H], do not count.
+    """Return the mean absolute difference of action chunks [B, H, A]; actions with ``is_pad``, bool [B, H], do not count.
 
     >>> import torch
     >>> target = torch.tensor([[[1.0], [9.0]]])
@@ -53,7 +53,7 @@ class VLALoss(LossModule):
         self.in_keys = [*policy.in_keys, keys.CHUNK, keys.IS_PAD]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """``{"loss": scalar}`` of a batch [B].
+        """Return ``{"loss": scalar}`` of a batch [B].
 
         Raises:
             ValueError: if the chunk does not have the policy's length and action size.

@@ -1,4 +1,4 @@
-"""Training a vision-language-action policy on demonstrations, see `torchrl_sparse.training.trainer`."""
+"""Training a vision-language-action policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.training.trainer import TrainConfig, Trainer, checksum, split_windows
+from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
+from torchrl_sparse.training.trainer import checksum
 from torchrl_sparse.training.vla.grounding import Grounding, GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.loss import VLALoss
 
@@ -50,7 +51,7 @@ class InstructedDemonstrations:
             )
 
     def windows(self, rows: Tensor, observed: Sequence) -> TensorDict:
-        """Training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
+        """Return training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
 
         Args:
             rows: as from `Demonstrations.window_rows`; a row that repeats the one before is beyond the end.
@@ -70,17 +71,17 @@ class InstructedDemonstrations:
         return sample
 
 
-class VLATrainer(Trainer):
+class VLATrainer(DemonstrationTrainer):
     """Trains a vision-language-action policy with the L1 loss on normalised action chunks.
 
     Args:
         policy: the policy, trained in place; its normaliser and tokenizer stay as they are.
         demos: demonstrations with images and instructions.
         config: how to train; ``n_action_steps`` is not read: windows may begin at every step of an episode.
-        grounding: lessons that come before the actions; none by default.
+        grounding: stages that come before the actions; none by default.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on, or there are lessons but no ``demos.objects``.
+        ValueError: if ``val_ratio`` leaves no episode to train on, or there are stages but no ``demos.objects``.
     """
 
     def __init__(
@@ -91,56 +92,54 @@ class VLATrainer(Trainer):
         grounding: GroundingConfig | None = None,
     ):
         self.policy, self.demos = policy, demos
-        self.lessons = GroundingConfig() if grounding is None else grounding
+        self.stages = GroundingConfig() if grounding is None else grounding
         self.loss = VLALoss(policy)
         parts = {"network": policy.network}
-        if self.lessons != GroundingConfig():
+        if self.stages != GroundingConfig():
             if demos.objects is None:
                 raise ValueError("grounding: expected the objects' positions in the demonstrations, got none")
             device = next(policy.network.parameters()).device
             parts["grounding"] = Grounding(policy, len(demos.objects.instructions)).to(device)
-        trained = nn.ModuleDict(parts)
+        module = nn.ModuleDict(parts)
         sizes = (policy.chunk_size, 1, policy.chunk_size)
         rows = split_windows(demos.episodes, sizes, config.val_ratio)
-        super().__init__(trained, config, decay_groups(trained, config.weight_decay), *rows)
+        super().__init__(module, config, decay_groups(module, config.weight_decay), *rows)
 
-    def batch_loss(self, rows: Tensor) -> Tensor:
+    def window_loss(self, rows: Tensor) -> Tensor:
         observed = [*self.policy.network.config.cameras, keys.STATE]
-        device = next(self.trained.parameters()).device
+        device = next(self.module.parameters()).device
         batch = self.demos.windows(rows, observed).to(device)
         with _precision(device, self.config.precision == "bf16"):
-            if self.step >= self.lessons.look_steps + self.lessons.answer_steps:
+            if self.step >= self.stages.locate_steps + self.stages.refer_steps:
                 return self.loss(batch).get("loss")
-            return self._lesson(batch, rows[:, 0])
+            return self._stage_loss(batch, rows[:, 0])
 
-    def _lesson(self, batch: TensorDict, present: Tensor) -> Tensor:
-        objects, grounding = self.demos.objects, self.trained["grounding"]
+    def _stage_loss(self, batch: TensorDict, present: Tensor) -> Tensor:
+        objects, grounding = self.demos.objects, self.module["grounding"]
         positions = objects.positions[present].to(batch[keys.STATE].device)
-        if self.step < self.lessons.look_steps:
-            return grounding.look(self.policy, batch, positions)
-        return grounding.answer(self.policy, batch, positions, objects.instructions)
+        if self.step < self.stages.locate_steps:
+            return grounding.locate(self.policy, batch, positions)
+        return grounding.refer(self.policy, batch, positions, objects.instructions)
 
-    def _set_schedule(self) -> None:
-        """A cosine, with a warm-up wherever parts begin to learn that did not before."""
-        config, lessons = self.config, self.lessons
-        begins = (0, lessons.look_steps, lessons.look_steps + lessons.answer_steps)
+    def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LambdaLR:
+        """Return a cosine, with a warm-up wherever parts begin to learn that did not before."""
+        stages = self.stages
+        begins = (0, stages.locate_steps, stages.locate_steps + stages.refer_steps)
 
         def factor(step: int) -> float:
             since = step - max(begin for begin in begins if begin <= step)
-            warm = since / config.lr_warmup_steps if since < config.lr_warmup_steps else 1.0
-            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.max_steps)))
+            warm = since / self.warmup_steps if since < self.warmup_steps else 1.0
+            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.total)))
 
-        for group in self._optimizer.param_groups:
-            group["initial_lr"] = config.lr
-        self._schedule = LambdaLR(self._optimizer, factor, last_epoch=self.step - 1)
+        return LambdaLR(optimizer, factor, last_epoch=self.step - 1)
 
     def averaged(self) -> VLANetwork:
-        """A copy of the network with the averaged weights, in evaluation mode."""
+        """Return a copy of the network with the averaged weights, in evaluation mode."""
         return super().averaged()["network"]
 
     def header(self) -> dict[str, dict]:
         return {
-            "config": asdict(self.config) | asdict(self.lessons),
+            "config": asdict(self.config) | asdict(self.stages),
             "network_config": self.policy.network.config.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
@@ -151,27 +150,27 @@ class VLATrainer(Trainer):
 
     @cached_property
     def _data_sums(self) -> dict[str, float]:
-        """Tell one set of demonstrations from another. All pictures are read once, not at every checkpoint."""
+        """Return sums that tell one set of demonstrations from another. Pictures are read once, not at every checkpoint."""
         data, objects = self.demos.episodes.data, self.demos.objects
         sums = {
             "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.policy.network.config.cameras
         }
         sums[keys.ACTION] = checksum(data[keys.ACTION])
-        if self.lessons != GroundingConfig():
+        if self.stages != GroundingConfig():
             sums["objects"] = checksum(objects.positions.abs())
         return sums
 
 
 @contextmanager
 def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
-    """Autocast to bf16 if asked for. There the gradient of the fused attention is slower than plain products on a CPU."""
+    """Enter autocast to bf16 if asked for, where the gradient of fused attention is slower than plain products on a CPU."""
     plain = sdpa_kernel(SDPBackend.MATH) if bf16 and device.type == "cpu" else nullcontext()
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16), plain:
         yield
 
 
 def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
+    """Return parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
     parameters = [*network.parameters()]
     matrices = [parameter for parameter in parameters if parameter.ndim > 1]
     vectors = [parameter for parameter in parameters if parameter.ndim <= 1]

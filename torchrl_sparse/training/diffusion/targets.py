@@ -1,0 +1,153 @@
+"""Calibration sets: observations that gates are trained on, and the actions that a pruned policy should give there.
+
+The calibration set of SAG (arXiv:2601.12894, Section 3.3), also with the queries of the closed loop.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import parse_json
+
+__all__ = ["ANSWER_BATCH", "add_queries", "dense_answers", "load_targets", "make_targets", "save_targets"]
+
+ANSWER_BATCH = 16  # queries that the policy answers at a time
+
+
+def make_targets(
+    policy: DiffusionPolicy,
+    demos: Demonstrations,
+    *,
+    share: float = 0.05,
+    source: Literal["teacher", "data"] = "teacher",
+    n_action_steps: int = 8,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TensorDict:
+    """Return a uniform sample of demonstration windows with the actions that a pruned policy should give there.
+
+    Args:
+        policy: the dense policy with the sampler that will be pruned.
+        demos: demonstrations.
+        share: of all windows, in (0, 1]; 5 % as published.
+        source: of the actions: ``"teacher"``, the answer of the dense policy on the same noise; ``"data"``, the demonstrated
+            ones, as published. A regression to data averages over modes; the teacher's answer does not.
+        n_action_steps: actions executed of a chunk; decides how far windows reach over an episode's end.
+        seed: fixes the sample and its noise.
+        on_progress: called with (windows answered, all).
+
+    Returns:
+        [N]: ``("diffusion", "cond")`` f32 [N, To, D], ``("diffusion", "seed")`` i64 [N, 1], ``"target"``
+        f32 [N, H, A], normalised.
+
+    Raises:
+        ValueError: if the share leaves no window.
+    """
+    network, normalizer = policy.network, policy.normalizer
+    if source not in ("teacher", "data"):
+        raise ValueError(f"source: expected 'teacher' or 'data', got {source!r}")
+    rows = demos.window_rows(network.horizon, network.n_obs_steps, n_action_steps)
+    size = round(share * len(rows))
+    if not 0 < size <= len(rows):
+        raise ValueError(
+            f"share: expected at least one of {len(rows)} windows and not more than all, got {share}"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    windows = demos.windows(rows[torch.randperm(len(rows), generator=generator)[:size]], network.n_obs_steps)
+    targets = TensorDict(
+        {
+            keys.COND: normalizer.normalize_state(windows[keys.HISTORY_STATE]),
+            keys.SEED: torch.randint(2**62, (size, 1), generator=generator),
+            "target": normalizer.normalize_action(windows[keys.ACTION]),
+        },
+        [size],
+    )
+    if source == "teacher":
+        targets["target"] = dense_answers(policy, targets, on_progress)
+    return targets
+
+
+def add_queries(
+    policy: DiffusionPolicy,
+    targets: TensorDict,
+    queries: TensorDictBase,
+    *,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TensorDict:
+    """Return targets together with those of queries made in closed loop, in random order.
+
+    A pruned policy comes to states that demonstrations do not hold; as in DAgger (arXiv:1011.0686), the dense policy
+    gives the targets there.
+
+    Args:
+        policy: the dense policy with the sampler that will be pruned.
+        targets: see `make_targets`.
+        queries: [n], with ``("diffusion", "cond")`` f32 [n, To, D] and ``("diffusion", "seed")`` i64 [n, 1].
+        seed: of the order.
+        on_progress: called with (queries answered, all).
+
+    Returns:
+        [N + n], with the keys of ``targets``.
+    """
+    asked = queries.select(keys.COND, keys.SEED)
+    asked["target"] = dense_answers(policy, asked, on_progress)
+    together = torch.cat([targets, asked])
+    return together[torch.randperm(len(together), generator=torch.Generator().manual_seed(seed))]
+
+
+def dense_answers(
+    policy: DiffusionPolicy,
+    queries: TensorDictBase,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Tensor:
+    """Return the dense policy's actions, normalised, f32 [N, H, A], whatever its planner.
+
+    Args:
+        policy: the policy with its sampler.
+        queries: [N], with ``("diffusion", "cond")`` f32 [N, To, D] and ``("diffusion", "seed")`` i64 [N, 1].
+        on_progress: called with (queries answered, all).
+    """
+    answers: list[Tensor] = []
+    for part in queries.split(ANSWER_BATCH):
+        answers.append(policy.denoise(policy.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND]))
+        on_progress(sum(map(len, answers)), len(queries))
+    return torch.cat(answers)
+
+
+def save_targets(path: str | Path, targets: TensorDict, made_for: Mapping[str, Any]) -> None:
+    """Write targets and what they were ``made_for``, JSON values, in one piece or not at all."""
+    tensors = dict(targets.flatten_keys("/").items())
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, {"made_for": json.dumps(made_for)})
+
+
+def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
+    """Read what `save_targets` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no file.
+        ValueError: naming the file, if it is damaged or was made for something else.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            found = parse_json((file.metadata() or {}).get("made_for", "null"), Any, f"{path}: made_for")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
+    except (SafetensorError, ValueError) as error:
+        raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
+    if found != made_for:
+        raise ValueError(f"{path}: expected targets for {dict(made_for)}, got some for {found}; move it away")
+    return TensorDict(tensors, batch_size=[len(tensors["target"])]).unflatten_keys("/")

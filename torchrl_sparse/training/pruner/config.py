@@ -1,0 +1,87 @@
+"""Options of the training of gates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from torchrl_sparse.blocks.mask import Reuse, check_reuse
+from torchrl_sparse.blocks.sag.planner import check_rates
+
+__all__ = ["Cost", "PrunerConfig"]
+
+Cost = Literal["blocks", "flops", "seconds"]
+
+
+@dataclass(frozen=True)
+class PrunerConfig:
+    """Options of a training; defaults as published.
+
+    Attributes:
+        rate: target prune rate rho, in (0, 1), of what ``cost`` counts.
+        rate_range: lowest and highest target; with it every sample of a batch gets a target of its own, uniform
+            in that range, and the gates must take it as an input. They then keep it exactly, and the sparsity loss
+            is 0; ``cost`` has to be ``"blocks"``.
+        epochs: passes over the calibration set.
+        max_updates: optimiser steps, if they shall be fewer than the epochs make; with 0, gates stay as
+            `fit_to_masks` left them.
+        batch_size: observations in an update.
+        lr: peak learning rate, reached after 5 % of the updates; a cosine leads down to zero.
+        beta: weight of the sparsity loss.
+        norm: of the fidelity loss, ``"l1"`` or ``"l2"``.
+        estimator: ``"ste"`` (straight-through) or ``"gumbel"`` (straight-through Gumbel-softmax).
+        temperature: of ``"gumbel"``.
+        sparsity: ``"global"``, or ``"block"``: every block has to reach the rate by itself (the paper's ablation).
+        cost: what the rate counts: ``"blocks"`` (published), or each weighed by the ``"flops"`` or the measured
+            ``"seconds"`` of its type.
+        reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
+        gradient: ``"chain"`` differentiates the whole chain of denoising steps; ``"step"`` cuts it between them
+            (:func:`~torchrl_sparse.blocks.sag.relaxed.step_errors` says what is lost).
+        explore: share of the pruned blocks that an update evaluates to learn what they are worth; the smaller,
+            the cheaper an update and the noisier its gradient.
+        checkpointed: recompute denoising steps in the backward pass, for the memory of one step.
+        max_grad_norm: gradient norm clip.
+        seed: fixes everything random.
+
+    Raises:
+        ValueError: if a value is out of its range.
+    """
+
+    rate: float = 0.91
+    rate_range: tuple[float, float] | None = None
+    epochs: int = 30
+    max_updates: int | None = None
+    batch_size: int = 32
+    lr: float = 1e-4
+    beta: float = 1.0
+    norm: Literal["l1", "l2"] = "l1"
+    estimator: Literal["ste", "gumbel"] = "ste"
+    temperature: float = 1.0
+    sparsity: Literal["global", "block"] = "global"
+    cost: Cost = "blocks"
+    reuse: Reuse = "type"
+    gradient: Literal["chain", "step"] = "chain"
+    explore: float = 1.0
+    checkpointed: bool = True
+    max_grad_norm: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("norm", ("l1", "l2")),
+            ("estimator", ("ste", "gumbel")),
+            ("sparsity", ("global", "block")),
+            ("cost", get_args(Cost)),
+            ("gradient", ("chain", "step")),
+        ):
+            if (value := getattr(self, name)) not in allowed:
+                raise ValueError(f"{name}: expected one of {list(allowed)}, got {value!r}")
+        check_reuse(self.reuse)
+        check_rates(self.rate, self.rate_range)
+        if self.rate_range is not None:  # YAML brings a list
+            object.__setattr__(self, "rate_range", tuple(self.rate_range))
+            if self.cost != "blocks":
+                raise ValueError(f"cost: expected 'blocks' with a rate_range, got {self.cost!r}")
+        for name in ("epochs", "batch_size", "lr", "temperature"):
+            if not (value := getattr(self, name)) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {value}")

@@ -1,0 +1,52 @@
+"""The planners that trained gates become."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
+from torchrl_sparse.blocks.schedule import CacheSchedule
+from torchrl_sparse.training.pruner.trainer import PrunerTrainer
+
+__all__ = ["export_planner"]
+
+
+def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping[str, Any]) -> Path:
+    """Write the planner that was trained so far; return where.
+
+    That is a cache schedule, ``l2c.json``, for static gates. For those that read the observation it is a folder ``pruner``
+    for `SAGPruner.from_pretrained`, with the schedule of their mean mask, the ablation, beside it: ``fixed.json``.
+
+    Args:
+        trainer: the gates, and what they were trained for.
+        folder: where to write.
+        settings: how they were trained, beside the trainer's configuration; for people and reports.
+    """
+    folder, config, policy = Path(folder), trainer.config, trainer.policy
+    settings = {**asdict(config), **settings, "updates": trainer.step}
+    is_static = trainer.gates.is_static
+    schedule = CacheSchedule.from_mask(
+        trainer.fixed_mask(),
+        method="l2c" if is_static else "sag_fixed",
+        policy=policy.fingerprint,
+        sampler=policy.sampler.name,
+        reuse=config.reuse,
+        settings=settings,
+    )
+    if is_static:
+        schedule.save_pretrained(folder / "l2c.json")
+        return folder / "l2c.json"
+    schedule.save_pretrained(folder / "fixed.json")
+    info = PrunerInfo(
+        policy=policy.fingerprint,
+        sampler=policy.sampler.name,
+        rate=config.rate,
+        rate_range=config.rate_range,
+        reuse=config.reuse,
+        settings=settings,
+    )
+    SAGPruner(trainer.gates, info).save_pretrained(folder / "pruner")
+    return folder / "pruner"

@@ -1,0 +1,70 @@
+"""A vision-language-action policy with random weights that fits demonstrations, to be trained on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
+from torchrl_sparse.networks.vla.text import WordTokenizer
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.rotations import ABSOLUTE_DIM
+from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
+
+__all__ = ["untrained_policy"]
+
+_SIZES = {"tiny": VLAConfig.tiny, "small": VLAConfig.small, "published": VLAConfig}
+
+
+def untrained_policy(
+    demos: InstructedDemonstrations,
+    size: str,
+    *,
+    cameras: Sequence[str],
+    changes: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> VLAPolicy:
+    """Return a policy whose inputs, outputs, words and normaliser are those of demonstrations.
+
+    Args:
+        demos: decide the sizes of state, action and images, the words and the normaliser.
+        size: ``"tiny"``, ``"small"`` or ``"published"``, see `VLAConfig`.
+        cameras: names of the images that the policy observes.
+        changes: fields of `VLAConfig`, nested as there, that shall differ from those of ``size``.
+        seed: of the weights.
+
+    Raises:
+        ValueError: for another size.
+    """
+    data = demos.episodes.data
+    action = data[keys.ACTION]
+    grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
+    words = sorted({word for text in demos.instructions for word in text.lower().split()})
+    torch.manual_seed(seed)
+    return VLAPolicy(
+        VLANetwork(_fitting_config(demos, size, cameras, changes or {})),
+        QuantileNormalizer.fit(data[keys.STATE], action, gripper=grippers),
+        WordTokenizer(words),
+    )
+
+
+def _fitting_config(
+    demos: InstructedDemonstrations, size: str, cameras: Sequence[str], changes: Mapping[str, Any]
+) -> VLAConfig:
+    if size not in _SIZES:
+        raise ValueError(f"size: expected one of {', '.join(_SIZES)}, got {size!r}")
+    data, camera_keys = demos.episodes.data, [["observation", name] for name in cameras]
+    decided = {
+        "cameras": camera_keys,
+        "image_size": data[tuple(camera_keys[0])].shape[-1],
+        "state_dim": data[keys.STATE].shape[-1],
+        "action_dim": data[keys.ACTION].shape[-1],
+    }
+    fields = OmegaConf.merge(_SIZES[size]().to_dict(), changes, decided)
+    return VLAConfig.from_dict(OmegaConf.to_container(fields, resolve=True))
