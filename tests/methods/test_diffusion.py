@@ -102,7 +102,19 @@ def test_samplers_are_taken_from_the_name(make, name, timesteps):
 
 @pytest.mark.parametrize(
     "name",
-    ["ddim0", "ddim_", "ddpm", "ddim10_eta", "Dense", "bac@0.5-", "dense@1", "uniform@0.5@0.5", "uniform0", "uniform7_", ""],
+    [
+        "ddim0",
+        "ddim_",
+        "ddpm",
+        "ddim10_eta",
+        "Dense",
+        "bac@0.5-",
+        "dense@1",
+        "uniform@0.5@0.5",
+        "uniform0",
+        "uniform7_",
+        "",
+    ],
 )
 def test_other_names_are_refused(make, name):
     with pytest.raises(ValueError, match="methods: expected"):

@@ -128,7 +128,10 @@ def test_every_spacing_is_that_of_diffusers(spacing):
         for scheduler in (DDPMScheduler, DDIMScheduler):
             reference = scheduler(timestep_spacing=spacing, **PUBLISHED)
             reference.set_timesteps(steps)
-            assert Sampler("ddim", steps, spacing=spacing).timesteps.tolist() == reference.timesteps[:steps].tolist()
+            assert (
+                Sampler("ddim", steps, spacing=spacing).timesteps.tolist()
+                == reference.timesteps[:steps].tolist()
+            )
 
 
 def test_in_two_steps_the_solvers_are_samplers_that_exist_already():
@@ -299,7 +302,7 @@ def test_other_names_are_refused(name):
 def test_a_name_and_a_number_of_steps_must_agree():
     with pytest.raises(ValueError, match="num_inference_steps: expected those of sampler 'ddpm10', got 5"):
         Sampler.from_name("ddpm10", 5)
-    with pytest.raises(ValueError, match="timesteps: expected 3 .*"):
+    with pytest.raises(ValueError, match="timesteps: expected 3"):
         Sampler.from_name("ddim_9_5", 3)
 
 

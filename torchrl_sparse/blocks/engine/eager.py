@@ -53,7 +53,8 @@ class EagerBaseline:
         compiled: put :func:`published_forward` through ``torch.compile``.
 
     Raises:
-        ValueError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down by T // K.
+        ValueError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down
+            by T // K.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler

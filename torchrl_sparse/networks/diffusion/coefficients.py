@@ -4,11 +4,12 @@ With ``clip`` to [-1, 1] and the clean predictions of the two steps before, ever
 
     clean = clip((sample - noise_scale * eps) / signal_scale)
     next  = clean_weight * clean + sample_weight * sample + eps_weight * eps
-          + previous_weight * clean of the last step + earlier_weight * clean of the step before it + spread * gaussian
+          + previous_weight * clean of the last step + earlier_weight * clean of the step before it
+          + spread * gaussian
 
 in diffusers' order of operations for DDPM (arXiv:2006.11239, Eq. 7: ``eps_weight = 0``) and DDIM (arXiv:2010.02502,
-Eq. 12: ``sample_weight = 0``), which remember no step. :mod:`~torchrl_sparse.networks.diffusion.multistep` has the weights of those
-that do.
+Eq. 12: ``sample_weight = 0``), which remember no step. `torchrl_sparse.networks.diffusion.multistep` has the weights of
+those that do.
 """
 
 from __future__ import annotations

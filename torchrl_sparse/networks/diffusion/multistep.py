@@ -1,23 +1,24 @@
 """Weights of the solvers that remember clean predictions, as diffusers defines them, in float64.
 
-With ``alpha = sqrt(abar)``, ``sigma = sqrt(1 - abar)``, ``lambda = log(alpha / sigma)``, s the timestep of a step, t the one that
-it leads to, ``h = lambda_t - lambda_s`` and ``q = h / h of the step before``, a step of second order goes along
-``D = clean + (clean - previous clean) * q / 2``, one of first order along ``D = clean``::
+With ``alpha = sqrt(abar)``, ``sigma = sqrt(1 - abar)``, ``lambda = log(alpha / sigma)``, s the timestep of a step, t the
+one that it leads to, ``h = lambda_t - lambda_s`` and ``q = h / h of the step before``, a step of second order goes along
+``D = clean + (clean - previous clean) q / 2``, one of first order along ``D = clean``::
 
-    dpmpp2m  next = sigma_t / sigma_s * sample + alpha_t (1 - e^-h) D          DPM-Solver++ (2M), arXiv:2211.01095
-    sde2m    next = sigma_t / sigma_s e^-h * sample + alpha_t (1 - e^-2h) D
-                    + sigma_t sqrt(1 - e^-2h) * gaussian                       its SDE form, "sde-dpmsolver++"
-    unipc    dpmpp2m of the corrected sample                                   UniPC (B(h) = e^h - 1), arXiv:2302.04867
+    dpmpp2m  next = sigma_t / sigma_s sample + alpha_t (1 - e^-h) D        DPM-Solver++ (2M), arXiv:2211.01095
+    sde2m    next = sigma_t / sigma_s e^-h sample + alpha_t (1 - e^-2h) D
+                    + sigma_t sqrt(1 - e^-2h) gaussian                     its SDE form, "sde-dpmsolver++"
+    unipc    dpmpp2m of the corrected sample                               UniPC, B2(h), arXiv:2302.04867
 
-First and last step are of first order. UniPC first corrects the sample with the prediction made from it::
+First and last step are of first order. UniPC first corrects the sample with the prediction that was made from it::
 
-    corrected = sample + g (rho (clean - previous clean) + rho' (previous clean - earlier clean)),   g = alpha_s (1 - e^-h of the step before)
+    corrected = sample + g (rho (clean - previous clean) + rho' (previous clean - earlier clean))
+    g = alpha_s (1 - e^-h of the step before)
 
 with ``rho = 1/2, rho' = 0`` in the second step; later they solve UniC's two order conditions.
 
-What follows from the equations: the first-order step of ``sde2m`` is DDPM's, and that of the others DDIM's wherever nothing is
-clipped (where it is, DDIM keeps the predicted noise and they take it from the clipped prediction). So in two steps ``sde2m`` is
-DDPM and ``unipc`` is ``dpmpp2m``.
+What follows from the equations: the first-order step of ``sde2m`` is DDPM's, and that of the others DDIM's wherever
+nothing is clipped (where it is, DDIM keeps the predicted noise and they take it from the clipped prediction). So in
+two steps ``sde2m`` is DDPM, and ``unipc`` is ``dpmpp2m``.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ def _sde2m(abar: Tensor, abar_next: Tensor) -> Weights:
 def _unipc(abar: Tensor, abar_next: Tensor) -> Weights:
     at, weights = _Levels(abar, abar_next), _dpmpp2m(abar, abar_next)
     rho, rho_earlier = _corrector(_before(at.log_ratio), _before(at.growth))
-    gain = -at.alpha * torch.expm1(-_before(at.log_ratio)) * at.sigma_ratio  # of a corrected sample, in the next one
+    gain = (
+        -at.alpha * torch.expm1(-_before(at.log_ratio)) * at.sigma_ratio
+    )  # of a corrected sample, in the next one
     return {
         "sample_weight": weights["sample_weight"],
         "clean_weight": weights["clean_weight"] + gain * rho,

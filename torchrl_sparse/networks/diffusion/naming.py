@@ -2,12 +2,12 @@
 
 ::
 
-    KIND [STEPS] [_SPACING] [_etaETA]     ddpm10   ddpm10_trailing   ddpm2_logsnr   ddim10_eta0.5   dpmpp2m10   sde2m10   unipc10
+    KIND [STEPS] [_SPACING] [_etaETA]     ddpm10   ddpm10_trailing   ddpm2_logsnr   ddim10_eta0.5   unipc10
     KIND _T _T ...          [_etaETA]     ddpm_82_14   ddim_90_50_10   ddim_82_14_eta1
 
-KIND is one of :data:`KINDS`, SPACING one of :data:`~torchrl_sparse.networks.diffusion.spacing.SPACINGS`, ``leading`` where none is
-written. The timesteps T fall. ETA in [0, 1] is DDIM's. Files that keep the number of steps beside the name leave STEPS
-out (``ddim``, ``ddpm_logsnr``).
+KIND is one of :data:`KINDS`, SPACING one of `torchrl_sparse.networks.diffusion.spacing.SPACINGS`, ``leading`` where
+none is written. The timesteps T fall. ETA in [0, 1] is DDIM's. Files that keep the number of steps beside the name
+leave STEPS out (``ddim``, ``ddpm_logsnr``).
 """
 
 from __future__ import annotations

@@ -3,25 +3,25 @@
 Diffusion Policy (arXiv:2303.04137) trains with 100 steps, the squared-cosine beta schedule (arXiv:2102.09672), noise prediction
 and samples clipped to [-1, 1]. The same network is sampled by
 
-======== ============ =========================================================================================
+======== ============ =====================================================================================
 kind     noise        method
-======== ============ =========================================================================================
-ddpm     every step   ancestral (arXiv:2006.11239) with the posterior variance between any two timesteps, "fixed small"
+======== ============ =====================================================================================
+ddpm     every step   ancestral (arXiv:2006.11239); posterior variance of any two timesteps ("fixed small")
 ddim     none, or eta arXiv:2010.02502; ``eta`` times DDPM's standard deviation, fresh in every step
 dpmpp2m  none         DPM-Solver++ (2M), arXiv:2211.01095
 sde2m    every step   its SDE form, "sde-dpmsolver++"
 unipc    none         UniPC of order 2, B2(h), arXiv:2302.04867
-======== ============ =========================================================================================
+======== ============ =====================================================================================
 
-in any number of steps, at the timesteps of a spacing (:mod:`~torchrl_sparse.networks.diffusion.spacing`) or at any that fall. DDPM and DDIM equal
-diffusers' classes to the last bit; the solvers equal theirs where nothing is clipped, which diffusers' solvers never do. What each
-computes is in :mod:`~torchrl_sparse.networks.diffusion.coefficients` and :mod:`~torchrl_sparse.networks.diffusion.multistep`, how it is written in
-:mod:`~torchrl_sparse.networks.diffusion.naming`.
+in any number of steps, at the timesteps of a spacing (`torchrl_sparse.networks.diffusion.spacing`) or at any that
+fall. DDPM and DDIM equal diffusers' classes to the last bit; the solvers equal theirs where nothing is clipped, since
+diffusers' solvers never clip. The equations are in `torchrl_sparse.networks.diffusion.coefficients` and
+`torchrl_sparse.networks.diffusion.multistep`, the names in `torchrl_sparse.networks.diffusion.naming`.
 
-Two steps are not new: GDP (arXiv:2510.21991) gets by with two network calls for trained diffusion policies, choosing among a
-population of stochastic chains; MIP (arXiv:2512.01809) trains a policy as two steps of regression and finds that steps and
-stochasticity, not the fit of a distribution, are what helps; Hydra-DP3 (arXiv:2605.01581) shows why the denoising error of smooth
-actions saturates after very few steps, and takes two of DDIM.
+Two steps are not new: GDP (arXiv:2510.21991) gets by with two network calls for diffusion policies, choosing among a
+population of chains; MIP (arXiv:2512.01809) trains a policy as two steps of regression and finds that supervised steps
+and stochasticity, not the fit of a distribution, are what helps; Hydra-DP3 (arXiv:2605.01581) argues that the denoising
+error of smooth actions saturates after very few steps, and takes two of DDIM.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class Sampler:
         coefficients: the update of each denoising step in numbers, for loops without a sampler.
 
     Raises:
-        ValueError: in one line that names the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range, ``timesteps``
-            that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM.
+        ValueError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
+            ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM.
 
     Examples:
         >>> sampler = Sampler("ddim", num_inference_steps=10)
@@ -100,7 +100,9 @@ class Sampler:
                 f"got {num_inference_steps}"
             )
         if not 0 <= eta <= 1 or (eta and kind != "ddim"):
-            raise ValueError(f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta} of kind "{kind}"')
+            raise ValueError(
+                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta} of kind "{kind}"'
+            )
         self.kind, self.eta, self.spacing = kind, float(eta), spacing
         self.num_inference_steps = num_inference_steps
         self.num_train_timesteps = num_train_timesteps
@@ -179,9 +181,13 @@ class Sampler:
         if not 0 <= k < self.num_inference_steps:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
         if noise_k is None and self.coefficients.reads_noise(k):
-            raise ValueError(f"{self.name} step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None")
+            raise ValueError(
+                f"{self.name} step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None"
+            )
         if len(cleans) < (needed := min(k, self.coefficients.history)):
-            raise ValueError(f"cleans: expected {needed} predictions before step k={k} of {self.name}, got {len(cleans)}")
+            raise ValueError(
+                f"cleans: expected {needed} predictions before step k={k} of {self.name}, got {len(cleans)}"
+            )
         return self.coefficients.update(k, sample, eps, noise_k, cleans)
 
     def remember(self, cleans: Sequence[Tensor], eps: Tensor, k: int, sample: Tensor) -> tuple[Tensor, ...]:

@@ -1,20 +1,22 @@
 """Which timesteps a sampler takes when it is only told how many.
 
-``"leading"``, ``"trailing"`` and ``"linspace"`` are diffusers' (arXiv:2305.08891, Table 2), whose solvers leave out timestep 0 where
-DDPM and DDIM end on it. ``"logsnr"`` is the rule that needs no search::
+``"leading"``, ``"trailing"`` and ``"linspace"`` are diffusers' (arXiv:2305.08891, Table 2), whose solvers leave out
+timestep 0 where DDPM and DDIM end on it. ``"logsnr"`` is the rule that needs no search::
 
-    first    = the number of timesteps whose lambda = log(sqrt(abar) / sqrt(1 - abar)), half the log-SNR, is at least -2.1
+    first    = how many timesteps have lambda = log(sqrt(abar) / sqrt(1 - abar)), half the log-SNR, >= -2.1
     timestep = round(first - k T / K) - 1        k = 0 .. K-1
 
 so diffusers' ``"trailing"`` with ``lambda_min_clipped=-2.1``. Of a hundred: 91, 41; 91, 58, 24; 91, 66, 41, 16.
 
-It follows from where few steps lose. *The first step* is asked about pure noise. Its clean prediction ``(sample - sigma eps) / alpha``
-amplifies whatever is wrong with the predicted noise by ``sigma / alpha = e^-lambda``: by 8 at -2.1, by 14 at timestep 95, by 20,000
-at 99, where ``"trailing"`` begins and clipping leaves little but signs. Further down, a sample of pure noise lacks the signal that
-the network was trained to find at that timestep, of amplitude ``alpha``: 0.12 at -2.1, 0.52 at 66, where ``"leading"`` begins with
-three steps. -2.1 keeps the second small before the first grows large; it is a choice, made where searches for single policies
-ended (82 to 91, see :mod:`torchrl_sparse.training.diffusion.timesteps`), and was not derived from a policy. *The last step* jumps to the clean
-sample from wherever it is; at timestep 0, where ``"leading"`` ends, nothing is left to do, so the spacing counts from above.
+It follows from where few steps lose. *The first step* is asked about pure noise. Its clean prediction
+``(sample - sigma eps) / alpha`` amplifies whatever is wrong with the predicted noise by ``sigma / alpha = e^-lambda``:
+by 8 at timestep 91, by 16 at 95, by 2,000 at 99, where ``"trailing"`` begins and clipping leaves little but signs.
+Further down, pure noise lacks the signal, of amplitude ``alpha``, that the network was trained to find: 0.12 at
+timestep 91, 0.49 at 66, where ``"leading"`` begins with three steps. The rule begins where the second is still small
+and the first not yet large. That it begins at -2.1 is a choice, at the noisy end of where searches for single policies
+end (80 to 91 of 100, see `torchrl_sparse.training.diffusion.timesteps`); no theory gives the number. *The last step*
+jumps to the clean sample from wherever it is, and at timestep 0, where ``"leading"`` ends, there is hardly anything
+left to do: the spacing therefore counts from above.
 """
 
 from __future__ import annotations

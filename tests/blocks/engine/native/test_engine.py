@@ -81,9 +81,9 @@ def test_property_any_rate_and_rule(seed):
 
 @pytest.mark.parametrize(
     "name",
-    ["ddim_90_50_49_10", "ddim_7", "ddim_99_0", "ddpm_82_14", "ddpm10_trailing", "ddim_90_50_10_eta0.5"]
-    + ["dpmpp2m5", "dpmpp2m2", "sde2m6_logsnr", "unipc_90_50_49_10"],
-)
+    ["ddim_90_50_49_10", "ddim_7", "ddim_99_0", "ddpm_82_14", "ddpm10_trailing", "ddim_90_50_10_eta0.5",
+     "dpmpp2m5", "dpmpp2m2", "sde2m6_logsnr", "unipc_90_50_49_10"],
+)  # fmt: skip
 def test_every_sampler(name):
     network, sampler = make_network(), Sampler.from_name(name)
     engine = NativeEngine(network, sampler)
