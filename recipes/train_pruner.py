@@ -1,10 +1,11 @@
-"""Train SAG's pruner, or L2C's static gates, for a trained policy.
+"""Train SAG's pruner, or static gates, for a trained policy.
 
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
-Stop it at any moment; the same command resumes it, equal to the last bit. ``out/pruner`` is for
-`SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the ablation; ``out/l2c.json`` is for
-`SchedulePlanner`; ``out/curves.png`` shows how it went.
+``method=l2c reuse=block`` learns with SAG's objective what needs no observation, and with ``objective=noise rate=0.45
+train.norm=l2 targets.source=data`` as Learning-to-Cache does. Stop it at any moment; the same command resumes it, equal
+to the last bit. ``out/pruner`` is for `SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the
+ablation; ``out/l2c.json`` and ``out/l2c_noise.json`` are for `SchedulePlanner`; ``out/curves.png`` shows how it went.
 """
 
 from __future__ import annotations

@@ -43,7 +43,8 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
-from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS, split_sampler
+from torchrl_sparse.networks.diffusion.naming import SamplerName
+from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
 from torchrl_sparse.networks.diffusion.transformer import MAX_LAYERS
 from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.storage.atomic import atomic_path
@@ -125,7 +126,7 @@ class CacheSchedule:
                 raise ValueError(f"{name}: expected a non-empty string, got {getattr(self, name)!r}")
         check_size("num_inference_steps", self.num_inference_steps, MAX_TRAIN_TIMESTEPS)
         check_size("num_layers", self.num_layers, MAX_LAYERS)
-        split_sampler(self.sampler)
+        SamplerName.parse(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:
