@@ -8,13 +8,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.html_report import write_report
 
 
-@hydra.main(version_base=None, config_path=".", config_name="report")
+@recipe("report", out="file")
 def main(config: DictConfig) -> None:
     faults = write_report(config.runs, config.out, title=config.title)
     for fault in faults.values():

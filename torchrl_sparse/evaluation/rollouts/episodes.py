@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.storage.json import parse_json
+from torchrl_sparse.storage.json import describe_differences, parse_json
 
 __all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
 
@@ -189,5 +189,7 @@ class EpisodeLog:
 
     def _check_identity(self, header: _Header) -> None:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
-        if header.identity != json.loads(json.dumps(self.identity)):
-            raise ValueError(f"{self.path}: holds episodes of {header.identity}, expected {self.identity}")
+        if differing := describe_differences(header.identity, json.loads(json.dumps(self.identity))):
+            raise ValueError(
+                f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
+            )
