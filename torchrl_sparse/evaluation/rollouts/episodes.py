@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.storage.json import describe_differences, parse_json
 
 __all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
@@ -182,7 +183,7 @@ class EpisodeLog:
         return [seed for seed in seeds if seed not in self.episodes]
 
     def _write(self, data: Mapping[str, Any]) -> None:
-        with open(self.path, "a", encoding="utf-8") as file:
+        with naming_full_disk(self.path), open(self.path, "a", encoding="utf-8") as file:
             file.write(json.dumps(data, allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
