@@ -11,9 +11,10 @@ from __future__ import annotations
 from functools import cache, partial
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_sparse.cli.options import check_names
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
@@ -41,13 +42,12 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import published_shape
 
 
-@hydra.main(version_base=None, config_path=".", config_name="benchmark")
+@recipe("benchmark")
 def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_task(config.task), Path(config.planners)
     if config.n_action_steps is None:
         config.n_action_steps = published_shape(task.name).n_action_steps
-    for name in config.methods:
-        check_method(name, planners)
+    check_names(config, partial(check_method, planners=planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     make_env = diffusion_env(task.name, policy, config.horizon)
     first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrl_sparse.blocks.bac import BAC
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.latency import plot_engine_times
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
@@ -33,7 +33,7 @@ from torchrl_sparse.runtime.threads import num_threads
 QUICK_STEPS = 20
 
 
-@hydra.main(version_base=None, config_path=".", config_name="benchmark_engine")
+@recipe("benchmark_engine")
 def main(config: DictConfig) -> None:
     out = Path(config.out)
     results = EngineResults(SCHEMA, describe_machine(threads=config.threads), {})

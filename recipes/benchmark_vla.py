@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.options import check_names
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
@@ -38,16 +39,17 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
-from torchrl_sparse.methods.vla import check_matches, make_controller, make_pruner
+from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.vla.token_budget import recorded_queries
 
 
-@hydra.main(version_base=None, config_path=".", config_name="benchmark_vla")
+@recipe("benchmark_vla")
 def main(config: DictConfig) -> None:
     out, options = Path(config.out), {"specprune": OmegaConf.to_container(config.specprune)}
     methods = [*dict.fromkeys(["dense", *config.methods])]
+    check_names(config, TokenMethodName.parse)
     check_matches(methods)
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
     cameras = chosen_cameras(config.cameras)

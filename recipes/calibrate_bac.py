@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -22,7 +22,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 
-@hydra.main(version_base=None, config_path=".", config_name="calibrate_bac")
+@recipe("calibrate_bac")
 def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy)
     if config.sampler is not None:

@@ -11,11 +11,11 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -26,7 +26,7 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import demonstration_error, search_timesteps
 
 
-@hydra.main(version_base=None, config_path=".", config_name="calibrate_timesteps")
+@recipe("calibrate_timesteps")
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

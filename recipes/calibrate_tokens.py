@@ -14,11 +14,11 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
@@ -39,7 +39,7 @@ from torchrl_sparse.training.vla.token_budget import (
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 
-@hydra.main(version_base=None, config_path=".", config_name="calibrate_tokens")
+@recipe("calibrate_tokens", out="file")
 def main(config: DictConfig) -> None:
     measures = {"action_error": errors, "success": lost_episodes}
     if config.measure not in measures:

@@ -9,15 +9,15 @@ The last line tells how many of the attempted episodes succeeded. To measure an 
 
 from __future__ import annotations
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.demos import Collection, Summary, collect
 
 
-@hydra.main(version_base=None, config_path=".", config_name="collect_demos")
+@recipe("collect_demos", out="file")
 def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
     collection = Collection(

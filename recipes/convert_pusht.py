@@ -8,13 +8,13 @@ Observations are made anew from the recorded states; what the npz holds is in `t
 
 from __future__ import annotations
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.pusht_human import convert_pusht
 
 
-@hydra.main(version_base=None, config_path=".", config_name="convert_pusht")
+@recipe("convert_pusht", out="file")
 def main(config: DictConfig) -> None:
     number = convert_pusht(config.demos, config.out)
     print(f"{config.out}: {number} demonstrations")

@@ -8,13 +8,13 @@ Deltas become absolute actions, observations are made anew from the recorded sta
 
 from __future__ import annotations
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.absolute import convert_demos
 
 
-@hydra.main(version_base=None, config_path=".", config_name="convert_robomimic")
+@recipe("convert_robomimic", out="file")
 def main(config: DictConfig) -> None:
     number = convert_demos(config.demos, config.out)
     print(f"{config.out}: {number} demonstrations with absolute actions")

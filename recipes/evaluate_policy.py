@@ -10,11 +10,11 @@ episodes that did so many of its parts and the entropy of the ways that they too
 
 from __future__ import annotations
 
-import hydra
 import torch
 from omegaconf import DictConfig
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.block_push import way_of
@@ -31,7 +31,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import published_shape
 
 
-@hydra.main(version_base=None, config_path=".", config_name="evaluate_policy")
+@recipe("evaluate_policy")
 def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
     demonstrated = demonstrated_ways(config)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
@@ -19,6 +18,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.libero import SUITES, make_libero_env
@@ -31,7 +31,7 @@ from torchrl_sparse.tokens.specprune import SpecPrune
 _SHOWN = 6
 
 
-@hydra.main(version_base=None, config_path=".", config_name="libero_smoke")
+@recipe("libero_smoke")
 def main(config: DictConfig) -> None:
     policy = make_policy(config)
     for suite in config.suites or SUITES:

@@ -5,13 +5,13 @@ python recipes/pages.py
 
 from __future__ import annotations
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.results.pages import write_pages
 
 
-@hydra.main(version_base=None, config_path=".", config_name="pages")
+@recipe("pages", out=None)
 def main(config: DictConfig) -> None:
     changed = write_pages(config.root)
     print("\n".join(map(str, changed)) or "every table is as its JSON says")

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.figures.latency import plot_vla_times
 from torchrl_sparse.evaluation.latency.measure import describe_machine
@@ -26,7 +26,7 @@ from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
 from torchrl_sparse.tokens.base import TokenPruner
 
 
-@hydra.main(version_base=None, config_path=".", config_name="profile_vla")
+@recipe("profile_vla")
 def main(config: DictConfig) -> None:
     with num_threads(config.threads), torch.no_grad():
         policy = make_policy(config.shape, dtype=getattr(torch, config.dtype), device=config.device)

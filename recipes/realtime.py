@@ -10,10 +10,10 @@ from __future__ import annotations
 from functools import cache, partial
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
@@ -38,7 +38,7 @@ from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 
-@hydra.main(version_base=None, config_path=".", config_name="realtime")
+@recipe("realtime")
 def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:

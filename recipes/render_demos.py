@@ -5,13 +5,13 @@ python recipes/render_demos.py demos=data/lift_proficient.h5 out=data/lift_image
 
 from __future__ import annotations
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.rendering import render_demos
 
 
-@hydra.main(version_base=None, config_path=".", config_name="render_demos")
+@recipe("render_demos", out="file")
 def main(config: DictConfig) -> None:
     render_demos(config.demos, config.out, list(config.cameras), image_size=config.image_size)
     print(f"{config.out}: images of {', '.join(config.cameras)}")

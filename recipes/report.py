@@ -13,9 +13,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
@@ -24,7 +24,7 @@ from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 
 
-@hydra.main(version_base=None, config_path=".", config_name="report")
+@recipe("report", out="file")
 def main(config: DictConfig) -> None:
     if config.upgrade:
         for path in map(Path, config.upgrade):

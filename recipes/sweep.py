@@ -13,44 +13,51 @@ import os
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
-    lock_folder,
     merge_trials,
     read_sweep,
     run_trial,
     write_trials,
 )
+from torchrl_sparse.runtime.lock import lock_output
 from torchrl_sparse.storage.atomic import atomic_path
 
 RECIPES = Path(__file__).parent
 
 
-@hydra.main(version_base=None, config_path=".", config_name="sweep")
+@recipe("sweep", out=None)
 def main(config: DictConfig) -> None:
-    path = (
-        Path(config.sweep) if config.sweep.endswith(".yaml") else RECIPES / "sweeps" / f"{config.sweep}.yaml"
-    )
+    settings = read_sweep(find_sweep(config.sweep))
     out = Path(config.out).resolve()
     os.environ["SWEEP_OUT"] = str(out)
     os.environ["PATH"] = (
         f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # `python` is this one
     )
     if config.mode == "online":
-        run_online(read_sweep(path), out, config)
+        run_online(settings, out, config)
         return
-    with lock_folder(out) as lock:
-        sweep = LocalSweep(read_sweep(path), out, config.count)
+    with lock_output(out) as lock:
+        sweep = LocalSweep(settings, out, config.count)
         while trial := sweep.next_trial():
             print(f"trial {sweep.trials.index(trial) + 1}: {trial.label}", flush=True)
             run_trial(sweep, trial, lock)
         summarise(sweep)
+
+
+def find_sweep(name: str) -> Path:
+    """Return the path of a sweep: one of ours by its name, or any by its path."""
+    known = {path.stem: path for path in sorted((RECIPES / "sweeps").glob("*.yaml"))}
+    path = Path(name) if name.endswith(".yaml") else known.get(name)
+    if path is None or not path.is_file():
+        raise FileNotFoundError(f"sweep: expected one of {', '.join(known)} or a yaml file, got {name!r}")
+    return path
 
 
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:

@@ -11,10 +11,10 @@ import importlib.util
 from functools import partial
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
@@ -28,7 +28,7 @@ from torchrl_sparse.training.diffusion.untrained import untrained_policy
 from torchrl_sparse.training.loop import train
 
 
-@hydra.main(version_base=None, config_path=".", config_name="train_policy")
+@recipe("train_policy")
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

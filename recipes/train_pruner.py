@@ -13,12 +13,12 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
@@ -35,7 +35,7 @@ from torchrl_sparse.training.pruner.gates import make_gates
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
 
-@hydra.main(version_base=None, config_path=".", config_name="train_pruner")
+@recipe("train_pruner")
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

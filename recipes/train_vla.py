@@ -13,11 +13,11 @@ import importlib.util
 from functools import partial
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
@@ -31,7 +31,7 @@ from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATra
 from torchrl_sparse.training.vla.untrained import untrained_policy
 
 
-@hydra.main(version_base=None, config_path=".", config_name="train_vla")
+@recipe("train_vla")
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

@@ -63,7 +63,7 @@ def test_a_policy_is_evaluated(work, policy):
     played = log.read_bytes()
     assert line in run("evaluate_policy", f"policy={policy}", *options)
     assert log.read_bytes() == played
-    refused = run("evaluate_policy", f"policy={policy}", "demos=demos.h5", *options, expect=1)
+    refused = run("evaluate_policy", f"policy={policy}", "demos=demos.h5", *options, expect=2)
     assert "demos: expected none for lift, which does not tell its ways" in refused
 
 
@@ -241,11 +241,11 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
-    output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=1)
+    output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=2)
     assert "methods: expected dense, ddim10, ddim<N>, ddim_<t>_<t>..., uniform" in output
     assert "got 'magic'" in output
     assert not (work / "none").exists()
-    assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=1)
+    assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=2)
 
 
 def test_a_schedule_of_another_policy_is_refused(work, policy, schedules):
@@ -260,4 +260,4 @@ def test_a_schedule_of_another_policy_is_refused(work, policy, schedules):
         "methods=[bac]",
         f"out={work}/none",
     )
-    assert "made for policy fingerprint '0123456789abcdef'" in run("benchmark", *options, expect=1)
+    assert "made for policy fingerprint '0123456789abcdef'" in run("benchmark", *options, expect=2)

@@ -91,3 +91,35 @@ def test_a_checkpoint_of_another_training_is_refused(run):
         ValueError, match=r"checkpoint.pt: made with another config: total is 7 here and 6 there"
     ):
         run(Regression(total=7))
+
+
+def test_a_csv_log_has_each_step_once_after_a_kill(run, tmp_path):
+    def die(step):
+        if step == 5:
+            raise KeyboardInterrupt  # as a kill, nothing is saved
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Regression(at_step=die))
+    logs = tmp_path / "log" / "scalars"
+    with open(logs / "train" / "loss.csv", "ab") as file:
+        file.write(b"4,0.5")  # the kill cut a line off
+    assert run(Regression())
+    rows = {
+        path.stem: [int(line.split(",")[0]) for line in path.read_text().splitlines()]
+        for path in logs.rglob("*.csv")
+    }
+    assert rows == {
+        "loss": [2, 4, 6],
+        "bias": [2, 4, 6],
+        "lr": [2, 4, 6],
+        "seconds_per_step": [2, 4, 6],
+        "error": [3, 6],
+    }
+
+
+@pytest.mark.parametrize("line", [b"two,3\n", b"\xff\xfe,1\n"])
+def test_a_log_that_is_none_is_named(run, tmp_path, line):
+    (tmp_path / "log" / "scalars").mkdir(parents=True)
+    (tmp_path / "log" / "scalars" / "loss.csv").write_bytes(line)
+    with pytest.raises(ValueError, match=r"loss.csv: expected lines of step and value, got b'"):
+        run(Regression())

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import describe_differences, read_json, write_json
 
 __all__ = ["check_same", "claim_parts", "parts_of"]
 
@@ -37,10 +37,8 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
 
 def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
     """Raise ValueError unless ``where`` was made with the settings asked for."""
-    different = [
-        f"{key} is {found.get(key)!r}, not {asked[key]!r}" for key in asked if found.get(key) != asked[key]
-    ]
-    if different:
+    asked_of_it = {key: found[key] for key in asked if key in found}
+    if differing := describe_differences(asked_of_it, asked):
         raise ValueError(
-            f"{where} was made with other settings ({'; '.join(different)}): move it or choose another file"
+            f"{where}: made with other settings: {differing}; choose another out or move it away"
         )

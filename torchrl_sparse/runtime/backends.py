@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
-__all__ = ["WorkerDied", "backend_runtime", "check_backend", "ray_death", "wait_for_actors"]
+__all__ = ["WorkerDied", "backend_runtime", "check_backend", "ray_death"]
 
 _BACKENDS = ("process", "ray")
 
@@ -71,21 +71,11 @@ def ray_death(error: BaseException) -> str:
         errors.WorkerCrashedError,
         errors.NodeDiedError,
         errors.OutOfMemoryError,
-        errors.GetTimeoutError,
     )
     # An exception in an actor's constructor would come again with the next actor.
     if not isinstance(error, deaths) or getattr(error, "actor_init_failed", False):
         return ""
     return f"a Ray worker died: {' '.join(str(error).split())}"
-
-
-def wait_for_actors(actors: Sequence[Any], seconds: float) -> None:
-    """Wait until Ray has made all of them.
-
-    Raises:
-        ray.exceptions.RayError: if one could not be made, or not in time; see `ray_death`.
-    """
-    _import_ray().get([actor.__ray_ready__.remote() for actor in actors], timeout=seconds)
 
 
 def _import_ray() -> Any:

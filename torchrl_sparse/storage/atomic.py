@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from torchrl_sparse.runtime.disk import naming_full_disk
+
 __all__ = ["atomic_path"]
 
 
@@ -13,8 +15,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Lend a temporary path beside ``path``, moved onto it when the block ends well and removed when it raises; what a kill
     leaves of it is overwritten by the next try.
 
-    The folder is made if it is missing. The temporary file keeps the suffix, since writers choose a format
-    by it.
+    The folder is made if it is missing. A full disk raises an OSError that names the file and its volume. The temporary file
+    keeps the suffix, since writers choose a format by it.
 
     >>> import tempfile
     >>> folder = tempfile.mkdtemp()
@@ -24,12 +26,13 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     ['note.txt']
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
-        yield temporary
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
+        with naming_full_disk(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
         os.chmod(temporary, 0o644)  # some writers make files that only their owner can read
         os.replace(temporary, path)
     except BaseException:

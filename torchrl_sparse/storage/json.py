@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["parse_json", "read_json", "to_plain", "write_json"]
+__all__ = ["check_plain", "describe_differences", "parse_json", "read_json", "to_plain", "write_json"]
 
 T = TypeVar("T")
 # The largest file of ours, the words of a Llama tokenizer, has a few million bytes and sixty thousand lists.
@@ -87,6 +87,25 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
 
 
+def check_plain(value: Any, kind: type[T], where: str) -> T:
+    """Check plain values, as strictly as `read_json` does those of a file, and return what they make.
+
+    Raises:
+        ValueError: ``WHERE: key: expected …, got …``.
+
+    >>> check_plain("few", int, "episodes")
+    Traceback (most recent call last):
+    ...
+    ValueError: episodes: expected a valid integer, got 'few'
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(kind).validate_python((value,))[0]
+    except ValidationError as error:
+        raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+
+
 def write_json(path: str | os.PathLike, value: Any) -> Path:
     """Write a dataclass, or plain JSON values, in one piece or not at all; return the path.
 
@@ -103,6 +122,21 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
+
+
+def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """Name the keys in which plain values differ, with both; empty if they are equal.
+
+    >>> describe_differences({"seed": 1, "task": "lift"}, {"seed": 2, "task": "lift"})
+    'seed is 2 here and 1 there'
+    """
+    nothing = object()
+
+    def say(values: Mapping[str, Any], key: str) -> str:
+        return repr(values[key]) if key in values else "missing"
+
+    keys = [key for key in {**found, **asked} if found.get(key, nothing) != asked.get(key, nothing)]
+    return ", ".join(f"{key} is {say(asked, key)} here and {say(found, key)} there" for key in keys)
 
 
 def to_plain(value: Any) -> Any:

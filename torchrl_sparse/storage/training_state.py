@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import describe_differences
 
 __all__ = ["read_checkpoint", "write_checkpoint"]
 
@@ -50,10 +51,8 @@ def read_checkpoint(
         )
     for name, expected in header.items():
         if state[name] != expected:
-            raise ValueError(f"{path}: made with another {name}: {_difference(expected, state[name])}")
+            differing = describe_differences(state[name], expected)
+            raise ValueError(
+                f"{path}: made with another {name}: {differing}; choose another out or move it away"
+            )
     return state
-
-
-def _difference(expected: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    names = [name for name in {**expected, **found} if expected.get(name) != found.get(name)]
-    return ", ".join(f"{name} is {expected.get(name)!r} here and {found.get(name)!r} there" for name in names)

@@ -10,12 +10,15 @@ from typing import Any
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
+from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.runtime.interrupt import StopSignal
+from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.training.trainer import Trainer
 
 __all__ = ["CHECKPOINT", "train"]
 
 CHECKPOINT = "checkpoint.pt"
+LOG = "log"
 
 
 def train(
@@ -36,7 +39,8 @@ def train(
         evaluate: return the success rate so far, in [0, 1], or None where it cannot be measured.
 
     Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and
-    ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of `Trainer.validate` and ``eval/success``.
+    ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of `Trainer.validate` and ``eval/success``. A CSV
+    log has each step once: what it tells of steps after the checkpoint, which are taken again, is removed first.
 
     Raises:
         ValueError: if the checkpoint belongs to another training, see `Trainer.load`.
@@ -46,10 +50,15 @@ def train(
         trainer.load(checkpoint)
         print(f"{checkpoint}: resumed from step {trainer.step}")
     eval_every = settings["eval_every"] if evaluate else 0
+    folder = Path(settings["out"]).resolve() / LOG
+    _forget_after(trainer.step, folder)
     logger, losses, since = _make_logger(settings), [], time.perf_counter()
 
     def log(metrics: Mapping[str, float], group: str) -> None:
-        logger.log_metrics({f"{group}/{name}": value for name, value in metrics.items()}, step=trainer.step)
+        with naming_full_disk(folder):
+            logger.log_metrics(
+                {f"{group}/{name}": value for name, value in metrics.items()}, step=trainer.step
+            )
 
     with (
         StopSignal() as stop,
@@ -64,13 +73,15 @@ def train(
                 bar.set_postfix(loss=f"{means['loss']:.4f}")
                 log(means, "train")
                 losses, since = [], now
-            if trainer.step % settings["checkpoint_every"] == 0:
-                trainer.save(checkpoint)
-                export()
+            due = trainer.step % settings["checkpoint_every"] == 0
+            if due:
                 log(trainer.validate(), "held_out")
             if eval_every and trainer.step % eval_every == 0 and (rate := evaluate()) is not None:
                 tqdm.write(f"step {trainer.step}: success rate {rate:.2f}")
                 log({"success": rate}, "eval")
+            if due:  # last, so that a checkpoint's own step is in the log
+                trainer.save(checkpoint)
+                export()
         trainer.save(checkpoint)
         path = export()
     how = f"stopped by {stop.name}, run again to resume" if stop.name else "finished"
@@ -83,4 +94,21 @@ def _means(losses: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _make_logger(settings: Mapping[str, Any]) -> Logger:
     wandb = {"project": "torchrl_sparse", "mode": settings["wandb_mode"], "config": dict(settings)}
-    return get_logger(settings["logger"], str(Path(settings["out"]).resolve()), "log", wandb_kwargs=wandb)
+    return get_logger(settings["logger"], str(Path(settings["out"]).resolve()), LOG, wandb_kwargs=wandb)
+
+
+def _forget_after(step: int, folder: Path) -> None:
+    """Remove from a CSV log what was logged after ``step``, and what a kill left of a line."""
+    for path in folder.glob("scalars/**/*.csv"):
+        lines = path.read_bytes().splitlines(keepends=True)
+        kept = [line for line in lines if line.endswith(b"\n") and _step_of(line, path) <= step]
+        if kept != lines:
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(b"".join(kept))
+
+
+def _step_of(line: bytes, path: Path) -> int:
+    try:
+        return int(line.split(b",")[0])
+    except ValueError as error:
+        raise ValueError(f"{path}: expected lines of step and value, got {line!r}") from error

@@ -64,7 +64,7 @@ def test_a_sweep_of_eight_survives_a_kill_and_an_interrupt(tmp_path):
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT, preexec_fn=heed
     ) as again:
-        assert again.stdout.readline().startswith("waiting for a trial that still runs")
+        assert again.stdout.readline().startswith("waiting for what process")
         (tmp_path / "sweep" / "go").touch()
         again.stdout.read()
     assert again.returncode != 0

@@ -21,15 +21,21 @@ class Killer(threading.Thread):
         self.delays, self.done = delays, done
 
     def run(self):
-        seen = set()
+        doomed = set()  # the others go with the one that is killed
         for number, delay in enumerate(self.delays):
-            while not (new := workers() - seen):
-                time.sleep(0.005)
+            _wait_for_workers(doomed)
             time.sleep(delay)
-            seen |= new | workers()
+            alive = _wait_for_workers(doomed)
             with suppress(ProcessLookupError):
-                os.kill(min(new), SIGNALS[number % len(SIGNALS)])
+                os.kill(min(alive), SIGNALS[number % len(SIGNALS)])
+            doomed |= alive
         self.done.touch()
+
+
+def _wait_for_workers(doomed):
+    while not (alive := workers() - doomed):
+        time.sleep(0.005)
+    return alive
 
 
 def workers():

@@ -135,7 +135,7 @@ def test_a_file_of_another_method_is_refused(tmp_path):
     path = tmp_path / "dense.jsonl"
     rollout_episodes(FakeActor(), FakeEnv, [1], results_file=path, identity={"method": "dense"})
     for kwargs in ({"identity": {"method": "bac"}}, {"identity": {"method": "dense"}, "max_steps": 9}):
-        with pytest.raises(ValueError, match=r"dense.jsonl: holds episodes of"):
+        with pytest.raises(ValueError, match=r"dense.jsonl: holds other episodes"):
             rollout_episodes(FakeActor(), FakeEnv, [1], results_file=path, **kwargs)
 
 

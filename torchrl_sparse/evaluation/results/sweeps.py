@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import os
 import secrets
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +16,11 @@ import yaml
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, load_results
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.storage.atomic import atomic_path
-from torchrl_sparse.storage.json import read_json, to_plain, write_json
+from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
 
 __all__ = [
     "LocalSweep",
     "Trial",
-    "lock_folder",
     "merge_trials",
     "read_sweep",
     "run_trial",
@@ -62,7 +59,12 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
         ImportError: without the ``sweeps`` package.
         ValueError: if wandb would refuse it, or its trials would see test seeds; the message names the file and says why.
     """
-    config = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    try:
+        config = yaml.safe_load(Path(path).read_bytes())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of bytes that are no text, and of depth
+        raise ValueError(f"{path}: expected a wandb sweep, got {error or 'one that is too deep'}") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
     violations = _engine().config.cfg.schema_violations_from_proposed_config(config)
     if violations:
         raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
@@ -92,9 +94,8 @@ class LocalSweep:
         if self._file.exists():
             found = read_json(self._file, SavedSweep)
             if found.config != to_plain(self.config):
-                raise ValueError(
-                    f"{self._file}: holds another sweep than the one asked for; choose another out"
-                )
+                differing = describe_differences(found.config, to_plain(self.config))
+                raise ValueError(f"{self._file}: holds another sweep: {differing}; choose another out")
             self.trials = list(found.trials)
 
     @property
@@ -160,23 +161,6 @@ def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
         for chunk in create_sweep_command(list(config["command"]))
         for word in macros.get(chunk[2:-1] if chunk.startswith("${") else "", [chunk])
     ]
-
-
-@contextmanager
-def lock_folder(out: Path) -> Iterator[int]:
-    """Wait until nothing else works in the folder, and keep others out.
-
-    Yields:
-        The lock's file descriptor; a trial inherits it, since it outlives a sweep that is killed.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    with open(out / ".lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print(f"waiting for a trial that still runs in {out}", flush=True)
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield file.fileno()
 
 
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:

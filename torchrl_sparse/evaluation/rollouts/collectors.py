@@ -14,8 +14,8 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_sparse.evaluation.rollouts.process_collector import START_LIMIT, in_processes
-from torchrl_sparse.runtime.backends import WorkerDied, ray_death, wait_for_actors
+from torchrl_sparse.evaluation.rollouts.process_collector import START_LIMIT, in_processes, time_limit
+from torchrl_sparse.runtime.backends import WorkerDied, ray_death
 
 __all__ = ["running_collector"]
 
@@ -84,19 +84,19 @@ def _on_ray(
 ) -> Iterator[BaseCollector]:
     from torchrl.collectors.distributed import RayCollector
 
-    collector = RayCollector(
-        list(make),
-        actor,
-        total_frames=sys.maxsize,  # -1, endless for other collectors, ends this one before its first batch
-        sync=False,
-        remote_configs={"num_cpus": 1},
-        collector_class=_RayWorker,
-        # No weights are sent after the start, and so nothing waits for a worker before the first batch.
-        weight_sync_schemes={},
-        **options,
-    )
+    collector = RayCollector.__new__(RayCollector)  # to be at hand while it waits for its workers
     try:
-        wait_for_actors(collector.remote_collectors, START_LIMIT)
+        with time_limit(START_LIMIT, collector.stop_remote_collectors):
+            collector.__init__(
+                list(make),
+                actor,
+                total_frames=sys.maxsize,  # -1, endless for other collectors, ends this one before its first batch
+                sync=False,
+                remote_configs={"num_cpus": 1},
+                collector_class=_RayWorker,
+                weight_sync_schemes={},  # no weights are sent after the start
+                **options,
+            )
         yield collector
     except Exception as error:
         if lost := ray_death(error):

@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.storage.json import parse_json
+from torchrl_sparse.runtime.disk import naming_full_disk
+from torchrl_sparse.storage.json import describe_differences, parse_json
 
 __all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "read_episodes", "token_totals", "totals"]
 
@@ -182,15 +183,17 @@ class EpisodeLog:
         return [seed for seed in seeds if seed not in self.episodes]
 
     def _write(self, data: Mapping[str, Any]) -> None:
-        with open(self.path, "a", encoding="utf-8") as file:
+        with naming_full_disk(self.path), open(self.path, "a", encoding="utf-8") as file:
             file.write(json.dumps(data, allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
 
     def _check_identity(self, header: _Header) -> None:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
-        if header.identity != json.loads(json.dumps(self.identity)):
-            raise ValueError(f"{self.path}: holds episodes of {header.identity}, expected {self.identity}")
+        if differing := describe_differences(header.identity, json.loads(json.dumps(self.identity))):
+            raise ValueError(
+                f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
+            )
 
 
 def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:

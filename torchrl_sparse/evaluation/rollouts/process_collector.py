@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse.runtime.backends import WorkerDied
 
-__all__ = ["START_LIMIT", "in_processes"]
+__all__ = ["START_LIMIT", "in_processes", "time_limit"]
 
 START_LIMIT = 600.0  # seconds after which workers that have not started are given up
 _REAPING = 2.0  # seconds until a process whose pipe is broken has an exit code
@@ -96,19 +96,15 @@ class _ProcessCollector(MultiSyncCollector):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._starting, self._lost = True, ""
-        # TorchRL waits for a worker until it reports or its pipe closes.
-        limit = threading.Timer(START_LIMIT, self._give_up)
-        limit.daemon = True
-        limit.start()
         try:
-            super().__init__(*args, **kwargs)
+            # TorchRL waits for a worker until it reports or its pipe closes.
+            with time_limit(START_LIMIT, self._give_up):
+                super().__init__(*args, **kwargs)
         except BaseException as error:
             self.shutdown(raise_on_error=False)
             if self._lost and isinstance(error, Exception):
                 raise WorkerDied(self._lost) from error
             raise
-        finally:
-            limit.cancel()
         self._starting = False
 
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
@@ -128,6 +124,18 @@ class _ProcessCollector(MultiSyncCollector):
         for process in getattr(self, "procs", ()):
             if not process._closed:
                 process.kill()
+
+
+@contextmanager
+def time_limit(seconds: float, give_up: Callable[[], None]) -> Iterator[None]:
+    """Call ``give_up`` in a thread if the block, which then should end, has not ended after so many seconds."""
+    timer = threading.Timer(seconds, give_up)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _exit_codes(processes: Sequence[BaseProcess]) -> dict[int, int]:

@@ -1,0 +1,241 @@
+"""What the options of all recipes may be. A word has one meaning in all of them, so this is one table.
+
+A recipe's yaml has the defaults and says what each option does. Checks that need more than the option alone, such as whether
+there is a task of that name, are made where the option is used, before anything is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from torchrl_sparse.storage.json import check_plain
+
+__all__ = ["OPEN_SECTIONS", "OPTIONS", "check_names", "check_options"]
+
+
+def _path_or_paths(value: Any) -> Any:
+    if not isinstance(value, str) and not (
+        isinstance(value, list) and all(isinstance(v, str) for v in value)
+    ):
+        raise ValueError(f"expected a path or a list of them, got {value!r}")
+    return value
+
+
+Count = Annotated[int, Field(ge=1)]
+Whole = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(gt=0, le=1)]
+BelowOne = Annotated[float, Field(ge=0, lt=1)]
+Between = Annotated[float, Field(gt=0, lt=1)]
+Word = Annotated[str, Field(min_length=1)]
+Words = Annotated[list[Word], Field(min_length=1)]
+Pair = Annotated[list[Word], Field(min_length=2, max_length=2)]
+Section = dict[str, Any]
+
+OPTIONS: dict[str, Any] = {
+    # what is done, on what, where to
+    "task": Word,
+    "policy": Word,
+    "benchmark_engine.policy": Word | None,
+    "libero_smoke.policy": Word | None,
+    "planners": Word,
+    "demos": Word | None,
+    "out": Word,
+    "dense_log": Word | None,
+    "runs": Word,
+    "root": Word,
+    "title": str,
+    "sweep": Word,
+    "project": Word,
+    "mode": Literal["offline", "online"],
+    "count": Count | None,
+    "wandb": bool,
+    # methods
+    "method": Word,
+    "methods": Words,
+    "pairs": list[Pair],
+    "videos": list[Word],
+    "num_updates": Count,
+    "calibration_samples": Count,
+    "samples": Count,
+    "objective": Literal["anchor", "consecutive"],
+    "top_k": Count,
+    "strides": Annotated[list[Count], Field(min_length=1)],
+    "num_inference_steps": Count,
+    "timesteps": Annotated[list[Whole], Field(min_length=1)],
+    "kind": Word,
+    "sampler": Section | None,
+    "specprune": Section,
+    "options": Section,
+    "preset": Word,
+    "alpha": Positive,
+    "alphas": Annotated[list[Positive], Field(min_length=1)],
+    "shares": list[Share],
+    "measure": Word,
+    "tolerance": NotNegative,
+    "controller": bool,
+    # episodes
+    "episodes": Count,
+    "eval_episodes": Count,
+    "probe_episodes": Count,
+    "seed": Whole,
+    "evaluate_policy.seed": Whole | None,
+    "horizon": Count | None,
+    "steps": Count,
+    "n_action_steps": Count | None,
+    "control_freq": Positive,
+    "latencies": Annotated[list[NotNegative], Field(min_length=1)],
+    "num_envs": Count,
+    "workers": Count,
+    "backend": Literal["process", "ray"],
+    "suites": Words | None,
+    "task_id": Whole,
+    "quality": Word,
+    "keep_failures": bool,
+    # what is measured, and how
+    "margin": Between,
+    "latency_repeats": Count,
+    "repeats": Count,
+    "warmup": Whole,
+    "quick": bool,
+    "compile": bool,
+    "batch": Count,
+    "cases": Annotated[list[Section], Field(min_length=1)],
+    "shape": Word,
+    "threads": Count | None,
+    "engine": Word,
+    "device": Word,
+    "dtype": Literal["float32", "float16", "bfloat16"],
+    # cameras
+    "cameras": Section,
+    "render_demos.cameras": Words,
+    "image": Word | None,
+    "wrist_image": Word | None,
+    "image_size": Count,
+    # training
+    "train": Section,
+    "filter_key": Word | None,
+    "init": Word | None,
+    "train_pruner.init": Annotated[Any, AfterValidator(_path_or_paths)] | None,
+    "state_normalization": Literal["global", "range"] | None,
+    "targets": Section,
+    "share": Share,
+    "source": Word,
+    "rollouts": Whole,
+    "grounding": Section,
+    "locate_steps": Whole,
+    "refer_steps": Whole,
+    "max_steps": Count,
+    "max_updates": Whole | None,
+    "epochs": Count,
+    "batch_size": Count,
+    "lr": Positive,
+    "lr_warmup_steps": Whole,
+    "weight_decay": NotNegative | None,
+    "max_grad_norm": NotNegative,
+    "ema_power": Positive,
+    "ema_max_decay": BelowOne,
+    "precision": Literal["fp32", "bf16"],
+    "val_ratio": BelowOne,
+    "rate": Between,
+    "rate_range": Annotated[list[Between], Field(min_length=2, max_length=2)] | None,
+    "beta": NotNegative,
+    "norm": Word,
+    "estimator": Word,
+    "temperature": Positive,
+    "sparsity": Word,
+    "cost": Word,
+    "reuse": Word,
+    "gradient": Word,
+    "explore": Share,
+    "checkpointed": bool,
+    "log_every": Count,
+    "checkpoint_every": Count,
+    "eval_every": Whole,
+    "eval_ddim_steps": Count | None,
+    "logger": Literal["csv", "wandb"],
+    "wandb_mode": Literal["offline", "online", "disabled"],
+    # sizes of networks
+    "size": Word,
+    "network": Section,
+    "vision": Section,
+    "crop": Share,
+    "width": Count,
+    "obs_width": Count,
+    "hidden": Count,
+    "n_layer": Count,
+    "n_head": Count,
+    "n_emb": Count | None,
+    "n_obs_steps": Count | None,
+    "n_cond_layers": Whole,
+    "p_drop_emb": BelowOne,
+    "p_drop_attn": BelowOne | None,
+    "causal_attn": bool,
+    "chunk_size": Count,
+}
+"""Option, of one recipe alone after its name and a dot -> type. Of nested options the last word counts."""
+
+OPEN_SECTIONS = ("specprune", "options", "train_vla.network")
+"""Sections whose entries are those of a dataclass of the library, which checks them."""
+
+
+def check_options(recipe: str, options: Mapping[str, Any]) -> None:
+    """Raise ValueError, ``key: expected …, got …``, for the first option that is not as `OPTIONS` says.
+
+    Args:
+        recipe: name of the recipe.
+        options: its options, nested as in its yaml.
+
+    >>> check_options("benchmark", {"task": "lift", "episodes": 0})
+    Traceback (most recent call last):
+    ...
+    ValueError: episodes: expected greater than or equal to 1, got 0
+    """
+    for key, value in _leaves(recipe, options):
+        kind = _lookup(recipe, key)
+        if kind is None:
+            raise ValueError(f"{key}: expected no such option, got {value!r}")
+        check_plain(value, kind, key)
+
+
+def _leaves(recipe: str, options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in options.items():
+        key = prefix + name
+        yield key, value
+        if isinstance(value, dict) and not {name, f"{recipe}.{name}"} & set(OPEN_SECTIONS):
+            yield from _leaves(recipe, value, f"{key}.")
+
+
+def _lookup(recipe: str, key: str) -> Any:
+    word = key.rpartition(".")[2]
+    return OPTIONS.get(f"{recipe}.{key}", OPTIONS.get(word))
+
+
+def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> None:
+    """Raise ValueError if a benchmark's ``methods`` or ``videos`` name what is none, or its ``pairs`` what it does not measure.
+
+    Args:
+        options: of the benchmark.
+        check: raises ValueError, ``methods: …``, for a name that is no method.
+
+    >>> options = {"methods": ["bac"], "videos": [], "pairs": [["dense", "sag"]]}
+    >>> check_names(options, lambda name: None)
+    Traceback (most recent call last):
+    ...
+    ValueError: pairs: expected two of dense, bac, got ['dense', 'sag']
+    """
+    for name in options["methods"]:
+        check(name)
+    for name in options["videos"]:
+        try:
+            check(name)
+        except ValueError as error:
+            raise ValueError(f"videos{str(error).removeprefix('methods')}") from error
+    methods = list(dict.fromkeys(["dense", *options["methods"]]))
+    for pair in options["pairs"]:
+        if not set(pair) <= set(methods):
+            raise ValueError(f"pairs: expected two of {', '.join(methods)}, got {list(pair)}")

@@ -1,0 +1,96 @@
+"""The entry of every recipe: Hydra reads its options, which are checked; its output is locked; its errors are one line."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from difflib import get_close_matches
+from functools import wraps
+from pathlib import Path
+from typing import Literal
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.runtime.lock import lock_output
+
+__all__ = ["recipe"]
+
+_FULL = "HYDRA_FULL_ERROR"
+_MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
+
+
+def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Callable:
+    """Make a function of its options a recipe: a program whose options are those in ``name.yaml`` beside its file.
+
+    A mistake (`ValueError`, `OSError`, `ImportError`, or one that Hydra finds) ends it with exit code 2 and one line on stderr;
+    the environment variable ``HYDRA_FULL_ERROR=1`` shows the whole traceback instead. All options are checked before the
+    function is called, see `check_options`, and no other recipe works on the same ``out`` while it runs.
+
+    Args:
+        name: of the recipe.
+        out: what the option ``out`` names; None if the recipe has none, or locks it itself.
+    """
+
+    def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+        folder = Path(inspect.getfile(main)).resolve().parent
+
+        @wraps(main)
+        def run() -> None:
+            with _one_line_errors():
+                for config in _read_options(folder, name):
+                    check_options(name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+                    with lock_output(config.out, is_file=out == "file") if out else nullcontext():
+                        main(config)
+
+        return run
+
+    return decorate
+
+
+def _read_options(folder: Path, name: str) -> list[DictConfig]:
+    """Return the options of this command line: one set, several of ``--multirun``, none of ``--help``."""
+    read: list[DictConfig] = []
+
+    def note(config: DictConfig) -> None:
+        read.append(config)
+
+    note.__module__ = name  # by which Hydra's help calls the program
+    hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
+    return read
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    if os.environ.get(_FULL, "0") != "0":
+        yield
+        return
+    os.environ[_FULL] = "1"  # so that Hydra raises its errors instead of printing them
+    try:
+        yield
+    except _MISTAKES as error:
+        print(_one_line(error), file=sys.stderr)
+        sys.exit(2)
+    finally:
+        del os.environ[_FULL]
+
+
+def _one_line(error: Exception) -> str:
+    """Say what is wrong in one line; what follows an empty one, such as the traceback of a worker, is left out."""
+    unknown = getattr(error.__cause__, "full_key", None)
+    if isinstance(error, HydraException) and unknown:
+        words = error.__cause__.parent_node
+        close = get_close_matches(unknown.rpartition(".")[2], map(str, words or ()), n=1)
+        return f"{unknown}: expected an option of this recipe{f', such as {close[0]}' if close else ''}, got another"
+    missing = getattr(error, "full_key", None)
+    if isinstance(error, OmegaConfBaseException) and missing:
+        return f"{missing}: expected a value, got {str(error).splitlines()[0]}"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).partition("\n\n")[0].split()) or type(error).__name__
