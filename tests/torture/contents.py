@@ -49,6 +49,8 @@ def _plain_name(path: Path, folder: Path) -> str:
 def _content(path: Path) -> str:
     if path.suffix in _PICTURES:
         return "a picture"
+    if path.name.startswith("."):  # a temporary file, perhaps torn
+        return _digest(path)
     return _READERS.get(path.suffix, _digest)(path)
 
 
