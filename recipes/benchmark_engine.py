@@ -1,4 +1,4 @@
-"""Benchmarks the engines: what a query costs in the published implementation, and in ours, dense and pruned.
+"""Benchmark the engines: what a query costs in the published implementation, and in ours, dense and pruned.
 
     python recipes/benchmark_engine.py out=outputs/engine threads=1
 

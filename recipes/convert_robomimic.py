@@ -1,4 +1,4 @@
-"""Makes demonstrations to train on of a file as robomimic publishes it; kill it at any moment and run it again to go on.
+"""Make demonstrations to train on of a file as robomimic publishes it; kill it at any moment and run it again to go on.
 
     python recipes/convert_robomimic.py demos=low_dim_v15.hdf5 out=data/lift_human.h5
     python recipes/train_policy.py task=lift demos=data/lift_human.h5 filter_key=train

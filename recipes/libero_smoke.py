@@ -1,4 +1,4 @@
-"""Steps one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
+"""Step one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
 
     python recipes/libero_smoke.py                         # random weights: does everything fit together?
     python recipes/libero_smoke.py policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`

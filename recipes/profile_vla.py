@@ -1,4 +1,4 @@
-"""Benchmarks a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
+"""Benchmark a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
 
     python recipes/profile_vla.py                                                      # reduced shape, one CPU thread
     python recipes/profile_vla.py shape=published device=cuda dtype=bfloat16           # the published 7B shape

@@ -1,4 +1,4 @@
-"""Adds camera images to demonstrations, for image policies.
+"""Add camera images to demonstrations, for image policies.
 
 python recipes/render_demos.py demos=data/lift_proficient.h5 out=data/lift_images.h5
 """

@@ -1,12 +1,7 @@
 """Every recipe, at toy size, in the order in which a user runs them."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -14,25 +9,16 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.evaluation.synthetic import make_results
+from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, SAGPruner
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.evaluation import load_results, save_results
+from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
-RECIPES = Path(__file__).parents[1] / "recipes"
-ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}
-METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
-
-
-def run(recipe, *options, expect=0):
-    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
-    assert expect is None or done.returncode == expect, done.stderr[-3000:]
-    return done.stdout + done.stderr
+METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +45,23 @@ def schedules(work, policy):
     output = run("calibrate_bac", f"policy={policy}", f"out={work}/schedules", "num_updates=7")
     assert "bac.json: prune rate 0." in output
     return work / "schedules"
+
+
+def test_a_policy_is_evaluated(work, policy):
+    options = (
+        "episodes=2",
+        "horizon=9",
+        "sampler={kind: ddpm, num_inference_steps: 4}",
+        f"out={work}/played",
+    )
+    line = f"{policy}: success 0/2 [0.00, 0.66], score 0.000 (standard error 0.000), steps 9.0"
+    assert line in run("evaluate_policy", f"policy={policy}", *options)
+    log = work / "played" / "episodes" / "dense.jsonl"
+    played = log.read_bytes()
+    assert line in run("evaluate_policy", f"policy={policy}", *options)
+    assert log.read_bytes() == played
+    refused = run("evaluate_policy", f"policy={policy}", "demos=demos.h5", *options, expect=1)
+    assert "demos: expected none for lift, which does not tell its ways" in refused
 
 
 def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
@@ -164,74 +167,6 @@ def test_realtime_leaves_a_curve_per_method(work, policy):
         assert {0, 2} <= {point.delay_steps for point in method.points}
         assert sum(point.own for point in method.points) == 1
     assert iio.imread(out / "realtime.png").std() > 5
-
-
-FAKE_TRIAL = """
-import os, shutil, signal, sys, time
-from pathlib import Path
-
-number = dict(word.split("=", 1) for word in sys.argv[1:])["num_updates"]
-sweep = Path(os.environ["SWEEP_OUT"])
-out = sweep / os.environ["WANDB_RUN_ID"]
-out.mkdir(exist_ok=True)
-first = not (out / "tried").exists()
-(out / "tried").touch()
-if number == "3" and first:  # kills the sweep and lives on
-    os.kill(os.getppid(), signal.SIGKILL)
-    os.close(1), os.close(2)
-    deadline = time.monotonic() + 600
-    while not (sweep / "go").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    (out / "ended").touch()
-    sys.exit()
-if number == "3" and not (out / "ended").exists():
-    sys.exit("the same trial runs twice at a time")
-if number == "6" and first:
-    os.kill(os.getppid(), signal.SIGINT)
-    time.sleep(100)
-shutil.copy(Path(__file__).with_name("template.json"), out / "results.json")
-"""
-
-
-def test_a_sweep_of_eight_survives_a_kill_and_an_interrupt(work):
-    (work / "trial.py").write_text(FAKE_TRIAL)
-    save_results(make_results(20, names=("dense", "bac")), work / "template.json")
-    sweep = {
-        "program": str(work / "trial.py"),
-        "method": "grid",
-        "metric": {"name": "tested/success", "goal": "maximize"},
-        "parameters": {"num_updates": {"values": list(range(1, 9))}},
-        "command": ["${env}", "python", "${program}", "${args_no_hyphens}"],
-    }
-    (work / "toy.yaml").write_text(json.dumps(sweep))
-    options = ("sweep", f"sweep={work}/toy.yaml", f"out={work}/sweep")
-
-    def trials():
-        return json.loads((work / "sweep" / "sweep.json").read_text())["trials"]
-
-    run(*options, expect=-signal.SIGKILL)
-    assert [trial["finished"] for trial in trials()] == [True, True, False]
-
-    command = [sys.executable, str(RECIPES / "sweep.py"), *options[1:]]
-    # A shell's background job ignores interrupts, and what it starts inherits that.
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT, preexec_fn=heed
-    ) as again:
-        assert again.stdout.readline().startswith("waiting for a trial that still runs")
-        (work / "sweep" / "go").touch()
-        again.stdout.read()
-    assert again.returncode != 0
-    interrupted = trials()
-    assert [trial["finished"] for trial in interrupted] == [True] * 5 + [False]
-
-    assert "8 trials" in run(*options)
-    assert [trial["id"] for trial in trials()][:6] == [trial["id"] for trial in interrupted]
-    assert [trial["parameters"]["num_updates"] for trial in trials()] == list(range(1, 9))
-    labels = [f"num_updates={number}" for number in range(1, 9)]
-    assert list(load_results(work / "sweep" / "results.json").methods) == ["dense", *labels]
-    assert len((work / "sweep" / "trials.csv").read_text().splitlines()) == 1 + 8
-    assert iio.imread(work / "sweep" / "pareto.png").std() > 5
 
 
 def test_report_makes_one_page_of_what_was_measured(work):

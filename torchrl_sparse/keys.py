@@ -15,6 +15,8 @@ constant                          shape, dtype           meaning
 ``EPISODE_SEED``                  i64 [*B, 1]            the seed that fixed this episode's initial state
 ``EPISODE_STEP``                  i64 [*B, 1]            environment steps since the reset
 ``EPISODE_COMPLETED``             i64 [*B, 1]            parts of the task done so far, where a benchmark counts them
+``EPISODE_WAY``                   i64 [*B, 1]            which of its ways the task is being done, where an environment tells;
+                                                         -1 until that shows
 ``HISTORY_STATE``                 f32 [*B, To, Ds]       the last To states, oldest first
 ``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
@@ -62,6 +64,7 @@ SUCCESS = "success"
 EPISODE_SEED = ("episode", "seed")
 EPISODE_STEP = ("episode", "step")
 EPISODE_COMPLETED = ("episode", "completed")
+EPISODE_WAY = ("episode", "way")
 HISTORY_STATE = ("history", "state")
 IS_INIT = "is_init"
 

@@ -7,7 +7,7 @@ from torchrl.envs import check_env_specs
 
 from tests.envs import published_benchmarks as published
 from torchrl_sparse import keys
-from torchrl_sparse.envs.block_push import BlockPushEnv
+from torchrl_sparse.envs.block_push import BlockPushEnv, way_of
 from torchrl_sparse.envs.block_push_scene import WORKSPACE, published_start
 
 STAY = torch.zeros(2)
@@ -116,6 +116,24 @@ class TestWithSimulator:
         assert all(steps[-1][key].item() for key in ("success", "terminated", "done"))
         assert not steps[-1]["truncated"]
         assert [int(s[keys.EPISODE_COMPLETED]) for s in steps] == [1, 1, 1, 2]
+
+    @pytest.mark.parametrize(("block", "square"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+    def test_the_way_is_which_block_first_entered_which_square(self, env, block, square):
+        steps = [env.reset()]
+
+        def step():
+            steps.append(env.step(steps[-1].clone().set(keys.ACTION, STAY))["next"])
+
+        step()
+        env.scene.place_block(block, env.targets[square])
+        step()
+        env.scene.place_block(1 - block, env.targets[1 - square])
+        step()
+        way = 2 * block + square
+        assert [int(s[keys.EPISODE_WAY]) for s in steps] == [-1, -1, way, way]
+        states = torch.stack([s[keys.STATE] for s in steps]).numpy()
+        assert [way_of(states[: i + 1]) for i in range(4)] == [-1, -1, way, way]
+        assert int(env.reset()[keys.EPISODE_WAY]) == -1
 
     def test_policy_of_the_published_shape_rolls_out_in_a_collector(self):
         steps = published.collected_by_published_policy("block_push", 6, [20.0] * 2, [0.0] * 2)

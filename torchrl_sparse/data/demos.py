@@ -7,7 +7,6 @@ made again, and continued after a kill, to the same bytes on the same machine.
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -29,6 +28,7 @@ from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
 from torchrl_sparse.envs.tasks import Task, find_task
 from torchrl_sparse.runtime.backends import check_backend
+from torchrl_sparse.storage.json import parse_json
 
 # Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
 _EXPERT_STREAM = 1
@@ -68,6 +68,13 @@ class Summary:
             f"successes/attempts {self.successes}/{self.attempts}, kept {self.kept}, "
             f"mean length {self.mean_length:.1f} steps"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Finished(Collection):
+    """The attribute ``collection`` of a file."""
+
+    summary: Summary
 
 
 def demonstrate(task: Task, env: EnvBase, seed: int, quality: str = "proficient") -> Episode:
@@ -227,15 +234,14 @@ def _check(collection: Collection) -> None:
 
 def _check_yield(tally: Summary) -> None:
     if tally.attempts >= 20 and tally.successes * 20 < tally.attempts:
-        raise RuntimeError(f"the expert fails: {tally}; keep_failures=true collects its episodes for a look")
+        raise RuntimeError(f"the expert fails: {tally}; keep_failures=true collects its episodes")
 
 
 def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:
     with h5py.File(path, "r") as file:
-        made = json.loads(file["data"].attrs.get("collection", "{}"))
-    summary = made.pop("summary", None)
-    check_same(path, made, settings)
-    return Summary(**summary)
+        made = parse_json(file["data"].attrs.get("collection", "{}"), _Finished, f"{path}: collection")
+    check_same(path, asdict(made), settings)
+    return made.summary
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["read_instruction", "read_instructions"]
 
@@ -20,7 +21,7 @@ def read_instruction(demo: h5py.Group) -> str | None:
     """
     text = demo.attrs.get("ep_meta", "{}")
     try:
-        words = dict(json.loads(text)).get("lang")
+        words = parse_json(text, dict[str, Any], "ep_meta").get("lang")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {text!r}") from error
     if words is None or isinstance(words, str):

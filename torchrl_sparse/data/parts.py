@@ -1,13 +1,12 @@
-"""A folder of finished parts beside a file in the making, so that long work goes on where a kill stopped it."""
+"""A folder of finished parts beside a file in the making, so that long work resumes where a kill stopped it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = ["check_same", "claim_parts", "parts_of"]
 
@@ -31,9 +30,8 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
     parts.mkdir(parents=True, exist_ok=True)
     note = parts / "settings.json"
     if not note.exists():
-        with atomic_path(note) as temporary:
-            temporary.write_text(json.dumps(settings, indent=1))
-    check_same(note, json.loads(note.read_text()), settings)
+        write_json(note, settings)
+    check_same(note, read_json(note, dict[str, Any]), settings)
     return parts
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import h5py
 import numpy as np
 
 from torchrl_sparse.rotations import POSE_DIM
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["RecordedControl", "read_control"]
 
@@ -58,7 +58,7 @@ def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
     if text is None:
         return None
     try:
-        env_args = json.loads(text)
+        env_args = parse_json(text, dict[str, Any], "env_args")
         kwargs = env_args["env_kwargs"]
         config, robots = kwargs["controller_configs"], kwargs["robots"]
         arm, is_old = _arm_settings(config)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,6 +14,7 @@ from torchrl_sparse.data.demos import read_initial_state
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["render_demos"]
 
@@ -45,16 +46,19 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     with open_demos(path) as source, atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
         for group in source:  # the demonstrations and their filter keys
             source.copy(group, file)
-        env = RobosuiteEnv(json.loads(file["data"].attrs["env_args"])["env_name"])
+        env_args = parse_json(file["data"].attrs["env_args"], dict[str, Any], f"{path}: env_args")
+        env = RobosuiteEnv(env_args["env_name"])
         for name in tqdm(demo_names(path, source), unit="demo"):
             env.reset(initial_state=read_initial_state(path, int(name[5:])))
             demo = file["data"][name]
-            for key, values in _look(env, demo["states"][:], cameras, image_size).items():
+            for key, values in _render(env, demo["states"][:], cameras, image_size).items():
                 demo.create_dataset(f"obs/{key}", data=values, compression="lzf")
         env.close()
 
 
-def _look(env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int) -> dict[str, np.ndarray]:
+def _render(
+    env: RobosuiteEnv, states: np.ndarray, cameras: Sequence[str], size: int
+) -> dict[str, np.ndarray]:
     """Render each state, by the names of observations."""
     seen = []
     for state in states:

@@ -18,7 +18,7 @@ from torchrl.data import Bounded
 from torchrl_sparse.envs.block_push_scene import WORKSPACE, BlockPushScene, published_start
 from torchrl_sparse.envs.seeded import SeededEnv
 
-__all__ = ["TOLERANCE", "BlockPushEnv"]
+__all__ = ["TOLERANCE", "BlockPushEnv", "way_of"]
 
 TOLERANCE = 0.05  # m between the centres of a block and a target, below which the block is in it
 HORIZON = 350
@@ -33,7 +33,8 @@ class BlockPushEnv(SeededEnv):
 
     The reward is 0.49 whenever a block enters a square for the first time and 0.51 when both blocks are in different squares,
     which is success. ``("episode", "completed")`` counts the published levels: 1 once a block was in a square (p1), 2 on
-    success (p2). The episode of seed s starts where the published one does.
+    success (p2). ``("episode", "way")`` tells which of the four orders this is: 2 b + s once block b, the first to enter any
+    square, has entered square s. The episode of seed s starts where the published one does.
 
     Args:
         horizon: steps until truncation; 350 by default, as published.
@@ -59,7 +60,7 @@ class BlockPushEnv(SeededEnv):
     ):
         self.scene = BlockPushScene()
         horizon = HORIZON if horizon is None else horizon
-        super().__init__(horizon=horizon, seeds=seeds, counts_parts=True, device=device)
+        super().__init__(horizon=horizon, seeds=seeds, counts_parts=True, tells_way=True, device=device)
         self._make_specs(16, Bounded(-0.1, 0.1, (2,)))
 
     def _start(self, seed: int) -> None:
@@ -68,6 +69,7 @@ class BlockPushEnv(SeededEnv):
         self.targets = start.targets
         self._tip_target = self.scene.tip_position()
         self._entered = np.zeros((2, 2), dtype=bool)
+        self._first_entry = -1
 
     def _advance(self, action: np.ndarray) -> float:
         self._tip_target = np.clip(self._tip_target + action, *WORKSPACE)
@@ -75,6 +77,8 @@ class BlockPushEnv(SeededEnv):
         inside = self._distances() < TOLERANCE
         entering = inside & ~self._entered
         self._entered |= inside
+        if self._first_entry < 0:
+            self._first_entry = _first(inside)
         return _BOTH if self._is_solved() else _FIRST * float(entering.sum())
 
     def _observe_state(self) -> np.ndarray:
@@ -92,10 +96,12 @@ class BlockPushEnv(SeededEnv):
     def _parts_done(self) -> int:
         return 2 if self._is_solved() else int(self._entered.any())
 
+    def _way(self) -> int:
+        return self._first_entry
+
     def _distances(self) -> np.ndarray:
-        """Return the distances between the centres of blocks (rows) and targets (columns), f64 [2, 2], m."""
         blocks = np.stack([self.scene.block_pose(i)[:2] for i in range(2)])
-        return np.linalg.norm(blocks[:, None] - self.targets[:, :2], axis=-1)
+        return _distances(blocks, self.targets[:, :2])
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
         """Return a u8 [height, width, 3] picture of the workspace; there is one view, whatever the ``camera``."""
@@ -104,3 +110,27 @@ class BlockPushEnv(SeededEnv):
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.scene.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def way_of(states: np.ndarray) -> int:
+    """Return the way of an episode with these states, [T, 16], as `BlockPushEnv` tells it; -1 if no block enters a square.
+
+    >>> states = np.zeros((2, 16))
+    >>> states[:, [0, 10, 13]] = [0.5, 0.1, 0.3]  # x of block 0 and of both squares; block 1 stays at 0
+    >>> states[1, 0] = 0.32
+    >>> way_of(states)
+    1
+    """
+    blocks, squares = states[:, [[0, 1], [3, 4]]], states[:, [[10, 11], [13, 14]]]
+    inside = _distances(blocks, squares) < TOLERANCE
+    return _first(inside[inside.any((1, 2)).argmax()])
+
+
+def _distances(blocks: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    """Return the distances, [..., 2, 2] in m, between centres of blocks (rows) and squares (columns), both [..., 2, 2]."""
+    return np.linalg.norm(blocks[..., :, None, :] - squares[..., None, :, :], axis=-1)
+
+
+def _first(inside: np.ndarray) -> int:
+    """Return the index of the first block and square that fit, in a flattened bool [2, 2]; -1 if none do."""
+    return int(inside.argmax()) if inside.any() else -1

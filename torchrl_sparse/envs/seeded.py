@@ -31,6 +31,7 @@ class SeededEnv(EnvBase):
         horizon: steps until truncation.
         seeds: seeds of successive episodes, repeated when used up. For paired evaluations.
         counts_parts: write ``("episode", "completed")``, how many parts of the task were done so far, from `_parts_done`.
+        tells_way: write ``("episode", "way")``, which of its ways the task is being done, from `_way`.
 
     Raises:
         ValueError: for an empty ``seeds``, or an action of a wrong size or that is not finite.
@@ -44,13 +45,14 @@ class SeededEnv(EnvBase):
         horizon: int,
         seeds: Sequence[int] | None = None,
         counts_parts: bool = False,
+        tells_way: bool = False,
         device: torch.device | str = "cpu",
     ):
         super().__init__(device=device, batch_size=[])
         if seeds is not None and not len(seeds):
             raise ValueError("seeds: expected at least one seed, got none")
         self.horizon = horizon
-        self._counts_parts = counts_parts
+        self._counts_parts, self._tells_way = counts_parts, tells_way
         self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
         self._next_seed = int(torch.randint(2**31, ()))
         self._episode_seed = self._next_seed
@@ -78,10 +80,15 @@ class SeededEnv(EnvBase):
         """Return parts of the task done so far in this episode."""
         raise NotImplementedError
 
+    def _way(self) -> int:
+        """Number, from 0, of the way in which the task is being done in this episode; -1 until that shows."""
+        raise NotImplementedError
+
     # -- specs ---------------------------------------------------------------------------------------------------------
 
     def _make_specs(self, state_dim: int, action: Bounded | Unbounded) -> None:
-        counts = ["seed", "step", *(["completed"] if self._counts_parts else [])]
+        counts = ["seed", "step"]
+        counts += ["completed"] * self._counts_parts + ["way"] * self._tells_way
         self.observation_spec = Composite(
             observation=Composite(state=Unbounded((state_dim,), device=self.device)),
             success=self._flag_spec(),
@@ -144,4 +151,6 @@ class SeededEnv(EnvBase):
         out[keys.EPISODE_STEP] = torch.tensor([self._elapsed])
         if self._counts_parts:
             out[keys.EPISODE_COMPLETED] = torch.tensor([self._parts_done()])
+        if self._tells_way:
+            out[keys.EPISODE_WAY] = torch.tensor([self._way()])
         return out

@@ -64,6 +64,25 @@ class FakeEnv(EnvBase):
         return seed
 
 
+class TellingEnv(FakeEnv):
+    """Rewards its second step most, does a part of its task every two steps and shows its way after the first."""
+
+    def __init__(self, seeds):
+        super().__init__(seeds)
+        count = Unbounded((1,), dtype=torch.int64)
+        self.observation_spec["episode"].update({"completed": count, "way": count.clone()})
+
+    def _observe(self):
+        out = super()._observe()
+        out[keys.EPISODE_COMPLETED] = torch.tensor([self.elapsed // 2])
+        out[keys.EPISODE_WAY] = torch.tensor([self.seed % 4 if self.elapsed else -1])
+        return out
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        return out.set("reward", torch.tensor([{1: 0.1, 2: 0.5}.get(self.elapsed, 0.2)]))
+
+
 class FakeActor(TensorDictModuleBase):
     """Queries every `CHUNK_LENGTH` steps; its cost keys hold nonsense on served steps, where nobody may look.
 

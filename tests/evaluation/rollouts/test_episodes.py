@@ -24,7 +24,7 @@ def path(tmp_path):
 
 def test_log_survives_reopening(path):
     first = EpisodeLog(path, {"method": "bac"})
-    first.append(episode(3, latency=(0.1, 0.2), kept=(9.0, 4.5), fine=(False, True)))
+    first.append(episode(3, latency=(0.1, 0.2), kept=(9.0, 4.5), fine=(False, True), score=0.7, way=-1))
     first.append(episode(1, success=False))
     again = EpisodeLog(path, {"method": "bac"})
     assert list(again.episodes.values()) == [*first.episodes.values()]

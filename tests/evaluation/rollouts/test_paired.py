@@ -3,7 +3,14 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import check_env_specs
 
-from tests.evaluation.rollouts.fakes import CHUNK_LENGTH, FLOPS_PER_QUERY, FakeActor, FakeEnv, expected_length
+from tests.evaluation.rollouts.fakes import (
+    CHUNK_LENGTH,
+    FLOPS_PER_QUERY,
+    FakeActor,
+    FakeEnv,
+    TellingEnv,
+    expected_length,
+)
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
 from torchrl_sparse.runtime.threads import num_threads
@@ -25,6 +32,15 @@ def test_one_episode_per_seed_in_order(num_envs):
     assert [episode.seed for episode in episodes] == SEEDS
     assert [episode.length for episode in episodes] == [expected_length(seed) for seed in SEEDS]
     assert [episode.success for episode in episodes] == [seed % 5 != 0 for seed in SEEDS]
+
+
+def test_what_tasks_tell_is_kept_where_they_tell_it():
+    for episode in rollout_episodes(FakeActor(), FakeEnv, SEEDS, num_envs=3):
+        assert (episode.score, episode.completed, episode.way) == (0.0, None, None)
+    for episode in rollout_episodes(FakeActor(), TellingEnv, SEEDS, num_envs=3):
+        assert episode.score == pytest.approx(0.5)  # the highest of 0.1, 0.5 and less
+        assert episode.completed == episode.length // 2
+        assert episode.way == episode.seed % 4
 
 
 def test_costs_count_only_where_the_policy_was_queried():

@@ -21,7 +21,7 @@ CONFIG = TrainConfig(max_steps=12, batch_size=8, n_action_steps=4, lr=1e-3, lr_w
 def make_trainer(make_network, demos):
     def make(network_changes=None, **changes) -> PolicyTrainer:
         normalizer = Normalizer.fit(demos.data[keys.STATE], demos.data[keys.ACTION])
-        network = make_network(p_drop_attn=0.2, **(network_changes or {}))
+        network = make_network(**({"p_drop_attn": 0.2} | (network_changes or {})))
         return PolicyTrainer(network, normalizer, demos, dataclasses.replace(CONFIG, **changes))
 
     return make
@@ -51,6 +51,15 @@ def test_resumed_training_equals_an_unbroken_one_to_the_last_bit(make_trainer, t
     assert begun + run(second, 12) == losses
     assert all(torch.equal(a, b) for a, b in zip(weights(second), weights(unbroken), strict=True))
     assert second.lr == unbroken.lr
+
+
+def test_on_a_cpu_no_fused_attention_slows_a_step_down(make_trainer):
+    trainer = make_trainer({"p_drop_attn": 0.0})
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        trainer.train_step()
+    called = {event.key for event in profile.key_averages()}
+    assert "aten::_scaled_dot_product_attention_math" in called
+    assert not any("flash" in name for name in called)
 
 
 def test_validating_and_saving_change_nothing(make_trainer, tmp_path):

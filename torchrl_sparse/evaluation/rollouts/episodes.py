@@ -2,14 +2,14 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_sparse.storage.json import parse_json
 
-__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
+__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "read_episodes", "token_totals", "totals"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,9 @@ class EpisodeResult:
             :func:`measure_latency`.
         kept: visual tokens in a decoder layer, mean over the layers, of each query; empty for a policy without them.
         fine: whether each query was made in the controller's fine mode; empty without a controller.
+        score: highest reward of a step. Published results on Push-T are means of it.
+        completed: parts of the task that were done, None for a task that counts none.
+        way: which of its ways the task was done, None for a task that does not tell; -1 if none showed.
     """
 
     seed: int
@@ -39,6 +42,9 @@ class EpisodeResult:
     latency: tuple[float, ...] = ()
     kept: tuple[float, ...] = ()
     fine: tuple[bool, ...] = ()
+    score: float | None = None
+    completed: int | None = None
+    way: int | None = None
 
 
 @dataclass(frozen=True)
@@ -185,3 +191,19 @@ class EpisodeLog:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
         if header.identity != json.loads(json.dumps(self.identity)):
             raise ValueError(f"{self.path}: holds episodes of {header.identity}, expected {self.identity}")
+
+
+def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
+    """Yield the episodes of a log, which stays as it is.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: naming file and line, if one is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a log of episodes {path}, got none")
+    with path.open(encoding="utf-8") as lines:
+        next(lines)
+        for number, line in enumerate(lines, start=2):
+            yield parse_json(line, EpisodeResult, f"{path}:{number}")

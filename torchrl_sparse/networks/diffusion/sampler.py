@@ -10,6 +10,7 @@ a hundred: 66, 33, 0); ``timesteps`` puts them elsewhere, and `torchrl_sparse.tr
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Sequence
 from itertools import pairwise
 from numbers import Integral
@@ -20,21 +21,25 @@ from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.coefficients import StepCoefficients, step_coefficients
+from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["Sampler", "split_sampler", "timesteps_fall"]
+__all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler", "split_sampler", "timesteps_fall"]
+
+MAX_TRAIN_TIMESTEPS = 10_000
+"""Far beyond any diffusion model: tables as long as this are made of what a file asks for."""
 
 
 class Sampler:
     """The denoising steps of one query, in execution order, and the noising of training.
 
     The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
-    noise of a query. Results equal theirs to the last bit.
+    noise of a query. Results equal theirs to the last bit. A sampler cannot be changed: engines keep tables of its steps.
 
     Args:
         kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
         num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
             ``timesteps``, or without those for all training steps.
-        num_train_timesteps: diffusion steps that the network was trained with.
+        num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
         timesteps: of DDIM's steps where they are not to be diffusers' own: K falling diffusion timesteps.
 
     Attributes:
@@ -44,6 +49,7 @@ class Sampler:
         scheduler: the diffusers scheduler.
 
     Raises:
+        AttributeError: if an attribute is assigned.
         ValueError: on an unknown ``kind``, a number of steps out of range, or ``timesteps`` that do not fall or are not DDIM's.
 
     Examples:
@@ -58,6 +64,14 @@ class Sampler:
         'ddim_90_50_10'
     """
 
+    kind: str
+    num_inference_steps: int
+    num_train_timesteps: int
+    scheduler: DDPMScheduler | DDIMScheduler
+    timesteps: Tensor
+    previous_timesteps: tuple[int, ...]
+    coefficients: StepCoefficients
+
     def __init__(
         self,
         kind: Literal["ddpm", "ddim"] = "ddpm",
@@ -70,37 +84,32 @@ class Sampler:
             raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
         if num_inference_steps is None:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
-        if not 1 <= num_inference_steps <= num_train_timesteps:
-            raise ValueError(
-                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
-                f"got {num_inference_steps}"
-            )
-        self.kind = kind
-        self.num_inference_steps = num_inference_steps
-        self.num_train_timesteps = num_train_timesteps
-        common = {
-            "num_train_timesteps": num_train_timesteps,
-            "beta_schedule": "squaredcos_cap_v2",
-            "clip_sample": True,
-            "prediction_type": "epsilon",
-        }
-        if kind == "ddpm":
-            self.scheduler = DDPMScheduler(variance_type="fixed_small", **common)
-        else:
-            self.scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
-        self.scheduler.set_timesteps(num_inference_steps)
-        self._chosen = None if timesteps is None else self._checked(timesteps)
-        self.timesteps: Tensor = (
-            self.scheduler.timesteps.clone() if timesteps is None else torch.tensor(self._chosen)
+        check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
+        check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
+        scheduler = _scheduler(kind, num_inference_steps, num_train_timesteps)
+        chosen = (
+            None if timesteps is None else _checked(kind, timesteps, num_inference_steps, num_train_timesteps)
         )
-        self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
-        self.coefficients: StepCoefficients = step_coefficients(
-            kind,
-            self.scheduler.alphas_cumprod,
-            self.timesteps.tolist(),
-            self.previous_timesteps,
-            clip=self.scheduler.config.clip_sample_range,
+        order = scheduler.timesteps.tolist() if chosen is None else chosen
+        previous = (*order[1:], -1)
+        vars(self).update(
+            kind=kind,
+            num_inference_steps=num_inference_steps,
+            num_train_timesteps=num_train_timesteps,
+            scheduler=scheduler,
+            timesteps=torch.tensor(order),
+            previous_timesteps=previous,
+            coefficients=step_coefficients(
+                kind, scheduler.alphas_cumprod, order, previous, clip=scheduler.config.clip_sample_range
+            ),
+            _chosen=chosen,
         )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{name}: expected a sampler to stay as it was made; make another Sampler")
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
 
     @classmethod
     def from_name(
@@ -127,7 +136,7 @@ class Sampler:
             "num_inference_steps": self.num_inference_steps,
             "num_train_timesteps": self.num_train_timesteps,
         }
-        return config if self._chosen is None else config | {"timesteps": self._chosen}
+        return config if self._chosen is None else config | {"timesteps": list(self._chosen)}
 
     def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
         """Return the sample after denoising step ``k``.
@@ -159,19 +168,37 @@ class Sampler:
         """
         return self.scheduler.add_noise(clean, noise, timestep)
 
-    def _checked(self, timesteps: Sequence[int]) -> list[int]:
-        chosen = list(timesteps)
-        whole = all(isinstance(timestep, Integral) for timestep in chosen)
-        falls = whole and timesteps_fall(chosen, self.num_train_timesteps)
-        if self.kind != "ddim" or not falls or len(chosen) != self.num_inference_steps:
-            raise ValueError(
-                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
-                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {chosen} of kind "{self.kind}"'
-            )
-        return [int(timestep) for timestep in chosen]
-
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def _scheduler(
+    kind: str, num_inference_steps: int, num_train_timesteps: int
+) -> DDPMScheduler | DDIMScheduler:
+    common = {
+        "num_train_timesteps": num_train_timesteps,
+        "beta_schedule": "squaredcos_cap_v2",
+        "clip_sample": True,
+        "prediction_type": "epsilon",
+    }
+    if kind == "ddpm":
+        scheduler = DDPMScheduler(variance_type="fixed_small", **common)
+    else:
+        scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
+    scheduler.set_timesteps(num_inference_steps)
+    return scheduler
+
+
+def _checked(kind: str, timesteps: Sequence[int], steps: int, num_train_timesteps: int) -> list[int]:
+    chosen = list(timesteps)
+    whole = all(isinstance(timestep, Integral) for timestep in chosen)
+    falls = whole and timesteps_fall(chosen, num_train_timesteps)
+    if kind != "ddim" or not falls or len(chosen) != steps:
+        raise ValueError(
+            f"timesteps: expected {steps} (num_inference_steps) whole numbers that fall from at most "
+            f'{num_train_timesteps - 1} to at least 0, of kind "ddim", got {reprlib.repr(chosen)} of kind "{kind}"'
+        )
+    return [int(timestep) for timestep in chosen]
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:

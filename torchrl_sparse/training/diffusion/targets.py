@@ -20,6 +20,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["ANSWER_BATCH", "add_queries", "dense_answers", "load_targets", "make_targets", "save_targets"]
 
@@ -143,7 +144,7 @@ def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
     """
     try:
         with safe_open(path, "pt") as file:
-            found = json.loads((file.metadata() or {}).get("made_for", "null"))
+            found = parse_json((file.metadata() or {}).get("made_for", "null"), Any, f"{path}: made_for")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
     except (SafetensorError, ValueError) as error:
         raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error

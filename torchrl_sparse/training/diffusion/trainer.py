@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -65,7 +67,8 @@ class PolicyTrainer(DemonstrationTrainer):
     def window_loss(self, rows: Tensor) -> Tensor:
         batch = self.demos.windows(rows, self.network.n_obs_steps)
         device = next(self.network.parameters()).device
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
+        precision = torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
+        with precision, _attention(device):
             return self.loss(batch.to(device)).get("loss")
 
     def header(self) -> dict[str, dict]:
@@ -75,6 +78,11 @@ class PolicyTrainer(DemonstrationTrainer):
             "data": {"windows": len(self.train_rows), "checksum": self._data_checksum},
         }
         return header if self.vision is None else header | {"vision_config": dict(self.vision.config)}
+
+
+def _attention(device: torch.device) -> AbstractContextManager:
+    """On a CPU the plain kernel: PyTorch's choice without dropout, the fused one, is slow on chunks as short as these."""
+    return sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" else nullcontext()
 
 
 def _checksum(value: Tensor) -> float:

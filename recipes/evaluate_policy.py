@@ -1,0 +1,98 @@
+"""Play episodes with one policy and sum them up; kill it at any moment and run it again to go on.
+
+    python recipes/evaluate_policy.py task=pusht policy=runs/pusht/policy episodes=20
+    python recipes/evaluate_policy.py task=block_push policy=runs/block_push/policy demos=data/block_push.h5 \
+        "sampler={kind: ddpm, num_inference_steps: 10}"
+
+One line: success, the mean of the highest rewards (on Push-T the published score) and, where the task tells, the shares of
+episodes that did so many of its parts and the entropy of the ways that they took. `benchmark` compares methods.
+"""
+
+from __future__ import annotations
+
+import hydra
+import torch
+from omegaconf import DictConfig
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.block_push import way_of
+from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
+from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
+from torchrl_sparse.evaluation.statistics.ways import way_entropy
+from torchrl_sparse.methods.diffusion import method_identity
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.published import published_shape
+
+
+@hydra.main(version_base=None, config_path=".", config_name="evaluate_policy")
+def main(config: DictConfig) -> None:
+    torch.set_num_threads(1)
+    demonstrated = demonstrated_ways(config)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    if config.sampler is not None:
+        policy.sampler = Sampler(**config.sampler)
+    episodes = play(policy, config)
+    print(f"{config.policy}: {summarize(episodes)}")
+    if demonstrated:
+        print(f"{config.demos}: {len(demonstrated)} demonstrations, {describe_ways(demonstrated)}")
+
+
+def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
+    """Play one episode per seed, read from the log as far as they are there."""
+    task = find_task(config.task)
+    n_action_steps = config.n_action_steps or published_shape(task.name).n_action_steps
+    played = {"task": task.name, "n_action_steps": n_action_steps, "horizon": config.horizon}
+    first = DEVELOPMENT_SEED if config.seed is None else config.seed
+    return evaluate(
+        "dense",
+        ChunkExecutor(policy, n_action_steps),
+        diffusion_env(task.name, policy, config.horizon),
+        range(first, first + config.episodes),
+        num_envs=config.num_envs,
+        log=episode_log(config.out, "dense"),
+        identity=played | method_identity("dense", policy),
+    )
+
+
+def summarize(episodes: list[EpisodeResult]) -> str:
+    """Sum episodes up in a line."""
+    n, k = len(episodes), sum(episode.success for episode in episodes)
+    low, high = wilson_interval(k, n)
+    scores = torch.tensor([episode.score for episode in episodes])
+    told = [
+        f"success {k}/{n} [{low:.2f}, {high:.2f}]",
+        f"score {scores.mean():.3f} (standard error {scores.std() / n**0.5:.3f})",
+        f"steps {sum(episode.length for episode in episodes) / n:.1f}",
+    ]
+    if parts := [episode.completed for episode in episodes if episode.completed is not None]:
+        told += [f"p{i} {sum(part >= i for part in parts) / n:.2f}" for i in range(1, max(1, *parts) + 1)]
+    if ways := [episode.way for episode in episodes if episode.way is not None]:
+        told.append(describe_ways(ways))
+    return ", ".join(told)
+
+
+def describe_ways(ways: list[int]) -> str:
+    shown = sorted({way for way in ways if way >= 0})
+    counts = ", ".join(f"{ways.count(way)} of way {way}" for way in shown) or "none showed a way"
+    return f"{counts}: {way_entropy(ways):.2f} bits" if shown else counts
+
+
+def demonstrated_ways(config: DictConfig) -> list[int]:
+    """Return the ways of demonstrations, to compare with the policy's."""
+    if config.demos is None:
+        return []
+    if find_task(config.task).name != "BlockPush":
+        raise ValueError(f"demos: expected none for {config.task}, which does not tell its ways")
+    demos = read_demos(config.demos, ("state",), poses=False)
+    return [way_of(demos.episode(index)[keys.STATE].numpy()) for index in range(len(demos))]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""Ways of doing a task that episodes take: a policy that knows one of several equally good ones has collapsed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from math import log2
+
+__all__ = ["way_entropy"]
+
+
+def way_entropy(ways: Iterable[int]) -> float:
+    """Return the entropy, in bits, of the ways that episodes took; 0 if all took the same one, 2 if four are as frequent.
+
+    It is that of the frequencies, so a few episodes have less than the policy that they come from: of four equal ways and 20
+    episodes it is 1.9 in the mean.
+
+    Args:
+        ways: one number an episode. Those that showed no way (-1) count as no episode.
+
+    Raises:
+        ValueError: if no episode showed a way.
+
+    >>> way_entropy([0, 3, 0, 3, -1])
+    1.0
+    """
+    counts = Counter(way for way in ways if way >= 0)
+    if not (total := counts.total()):
+        raise ValueError("ways: expected at least one episode that showed its way, got none")
+    return sum(count / total * log2(total / count) for count in counts.values())
