@@ -41,7 +41,7 @@ from torchrl_sparse.storage.json import read_json
 
 __all__ = ["find_pages", "write_pages", "write_tables"]
 
-_FOLDERS = ("assets", "recipes", "torchrl_sparse", "docs")
+_FOLDERS = ("assets", "recipes", "tests", "torchrl_sparse", "docs")
 _BEGIN, _END = re.compile(r"<!-- table: (.*) -->"), "<!-- end -->"
 _OPTIONS = ("methods", "columns", "rows", "pairs", "tasks", "cells", "published")
 
