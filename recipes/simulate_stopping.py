@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.stopping import plot_stopping
 from torchrl_sparse.evaluation.results.stopping import save_stopping, simulate_stopping
 
 
-@hydra.main(version_base=None, config_path=".", config_name="simulate_stopping")
+@recipe("simulate_stopping")
 def main(config: DictConfig) -> None:
     results = simulate_stopping(config.max_episodes, config.looks, config.trials, config.seed)
     out = Path(config.out)
