@@ -37,11 +37,14 @@ def measure(read: Callable, path: Path) -> Cost:
     process = _CONTEXT.Process(target=_call, args=(theirs, read, path))
     process.start()
     theirs.close()
-    process.join(40 * SECONDS)  # other processes may have the CPU
-    if process.is_alive():
+    try:
+        assert ours.poll(40 * SECONDS), "it waits for something"  # other processes may have the CPU
+        return ours.recv()
+    except EOFError:
+        process.join()
+        pytest.fail(f"it was ended, exit code {process.exitcode} (-24: it took more than {SECONDS} s)")
+    finally:
         process.kill()
-    assert ours.poll(), f"it was ended, exit code {process.exitcode} (-24: it took more than {SECONDS} s)"
-    return ours.recv()
 
 
 def check_limits(read: Callable, path: Path) -> str | None:
