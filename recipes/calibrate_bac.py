@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -28,7 +29,7 @@ def main(config: DictConfig) -> None:
         train_steps = policy.sampler.num_train_timesteps
         policy.sampler = Sampler.from_name(config.sampler, num_train_timesteps=train_steps)
     environment = diffusion_env(config.task, policy)
-    seeds = range(config.seed, config.seed + config.samples)
+    seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
     for name in config.methods:

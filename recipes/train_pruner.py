@@ -99,13 +99,13 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.control.queries import record_queries
     from torchrl_sparse.envs.for_policy import diffusion_env
-    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED
+    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
 
     schedules = initial_schedules(config)
     planner = SchedulePlanner.from_pretrained(schedules[0]) if schedules else None
     n_action_steps = published_shape(config.task).n_action_steps
     actor = ChunkExecutor(policy.with_plan(planner), n_action_steps=n_action_steps)
-    seeds = range(CLOSED_LOOP_SEED, CLOSED_LOOP_SEED + config.rollouts)
+    seeds = tuning_seeds(CLOSED_LOOP_SEED, config.rollouts)
     return record_queries(actor, diffusion_env(config.task, policy), seeds)
 
 

@@ -15,7 +15,14 @@ from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
-from torchrl_sparse.methods.diffusion import METHODS, Method, check_method, make_controller, make_method
+from torchrl_sparse.methods.diffusion import (
+    METHODS,
+    Method,
+    check_method,
+    make_controller,
+    make_method,
+    method_identity,
+)
 
 LAYERS = 2
 QUERY = TensorDict({"history": {"state": torch.zeros(1, 2, SIZES["cond_dim"])}}, [1])
@@ -77,6 +84,21 @@ def test_dense_shares_the_networks(policy, make):
     assert dense.network is policy.network
     assert dense.sampler is policy.sampler
     assert isinstance(dense.plan, Dense)
+
+
+def test_dense_with_other_noise_is_dense_but_for_its_noise(make):
+    query = (
+        QUERY.clone().set(keys.EPISODE_SEED, torch.tensor([[7]])).set(keys.EPISODE_STEP, torch.tensor([[8]]))
+    )
+    dense, other = make("dense"), make("dense_noise")
+    answers = [method(query.clone()) for method in (dense, other, other)]
+    assert answers[0][keys.SEED] != answers[1][keys.SEED]
+    assert (answers[0][keys.CHUNK] != answers[1][keys.CHUNK]).any()
+    assert (answers[1][keys.CHUNK] == answers[2][keys.CHUNK]).all()
+    assert (answers[0][keys.COND] == answers[1][keys.COND]).all()
+    identities = [method_identity("dense", method) for method in (dense, other)]
+    assert identities[1] == {**identities[0], "noise": 1}
+    assert other.with_plan(Dense()).noise_stream == 1
 
 
 @pytest.mark.parametrize(

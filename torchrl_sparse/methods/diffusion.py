@@ -115,12 +115,14 @@ class Method:
         controller: returns what a `ChunkExecutor` runs at every step beside the policy, given the rates that were
             written, or None.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
+        noise: stream of the noise that it draws; 0 is what all methods share, so that they can be paired.
     """
 
     make: Callable[[MethodInputs], tuple[Planner, Sampler]]
     pattern: str | None = None
     controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
     color: str | None = None
+    noise: int = 0
 
 
 def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -166,6 +168,7 @@ def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
 METHODS: dict[str, Method] = {
     "dense": Method(_dense, color="#333333"),
+    "dense_noise": Method(_dense, color="#9A9AA0", noise=1),
     "ddim10": Method(_sampler, color="#E69F00"),
     "<sampler><steps>, <sampler>_<t>_<t>...": Method(_sampler, pattern=CHAIN_PATTERN),
     "uniform": Method(_uniform, color="#56B4E9"),
@@ -218,7 +221,8 @@ def make_method(
     planner, sampler = method.make(inputs)
     if written.rates:
         _ask_for(planner, written)
-    return policy.with_plan(planner, sampler)
+    made = policy.with_plan(planner, sampler)
+    return made.with_noise(method.noise) if method.noise else made
 
 
 def make_controller(text: str) -> TensorDictModuleBase | None:
@@ -234,12 +238,14 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         text: the method.
         policy: as :func:`make_method` returned it.
     """
+    other_noise = {"noise": policy.noise_stream} if policy.noise_stream else {}
     return {
         "method": text,
         "policy": policy.fingerprint,
         "engine": policy.engine,
         "sampler": policy.sampler.config,
         "planner": policy.plan.fingerprint,
+        **other_noise,
     }
 
 

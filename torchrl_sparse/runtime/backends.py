@@ -5,13 +5,17 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
-__all__ = ["backend_runtime", "check_backend", "ray_death"]
+__all__ = ["WorkerDied", "backend_runtime", "check_backend", "ray_death", "wait_for_actors"]
 
 _BACKENDS = ("process", "ray")
+
+
+class WorkerDied(RuntimeError):
+    """A worker was ended from outside, or did not start: what it had under way can be done again."""
 
 
 def check_backend(backend: str, workers: int) -> None:
@@ -60,18 +64,28 @@ def _ray_runtime(workers: int) -> Iterator[None]:
 
 
 def ray_death(error: BaseException) -> str:
-    """Return which Ray worker died, in words; empty if ``error`` is another, such as one that a worker's own work raised."""
+    """Say which Ray worker died; empty if ``error`` says something else, such as what a worker's own work raised."""
     errors = _import_ray().exceptions
     deaths = (
         errors.RayActorError,
         errors.WorkerCrashedError,
         errors.NodeDiedError,
         errors.OutOfMemoryError,
+        errors.GetTimeoutError,
     )
     # An exception in an actor's constructor would come again with the next actor.
     if not isinstance(error, deaths) or getattr(error, "actor_init_failed", False):
         return ""
     return f"a Ray worker died: {' '.join(str(error).split())}"
+
+
+def wait_for_actors(actors: Sequence[Any], seconds: float) -> None:
+    """Wait until Ray has made all of them.
+
+    Raises:
+        ray.exceptions.RayError: if one could not be made, or not in time; see `ray_death`.
+    """
+    _import_ray().get([actor.__ray_ready__.remote() for actor in actors], timeout=seconds)
 
 
 def _import_ray() -> Any:

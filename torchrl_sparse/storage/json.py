@@ -22,7 +22,8 @@ from torchrl_sparse.storage.atomic import atomic_path
 __all__ = ["parse_json", "read_json", "to_plain", "write_json"]
 
 T = TypeVar("T")
-MAX_BYTES = 64 << 20  # the largest file of ours, the words of a Llama tokenizer, has a few million
+# The largest file of ours, the words of a Llama tokenizer, has a few million bytes and sixty thousand lists.
+MAX_BYTES, MAX_PARTS = 64 << 20, 1 << 18
 
 
 def read_json(path: str | os.PathLike, kind: type[T]) -> T:
@@ -32,7 +33,7 @@ def read_json(path: str | os.PathLike, kind: type[T]) -> T:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep.
+        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep or of too many parts.
 
     Examples:
         >>> import tempfile
@@ -73,6 +74,9 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
 
     data = text.encode() if isinstance(text, str) else text
     _check_size(len(data), where)
+    parts = data.count(b"[") + data.count(b"{")
+    if parts > MAX_PARTS:  # of an empty list, two bytes, Python makes sixty
+        raise ValueError(f"{where}: expected at most {MAX_PARTS} lists and objects, got {parts}")
     try:
         from_json(data, allow_inf_nan=False)  # also where a field may hold anything
     except ValueError as error:

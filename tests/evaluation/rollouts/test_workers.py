@@ -1,21 +1,26 @@
 """Episodes do not depend on how many workers ran them, nor where, nor on a worker that died on the way."""
 
+import multiprocessing
 import os
+import random
 import signal
 import sys
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 from torchrl.data import NonTensor
 
 from tests.evaluation.rollouts.fakes import FakeActor, FakeEnv
+from tests.evaluation.rollouts.killer import Killer
 from torchrl_sparse import keys
-from torchrl_sparse.evaluation.rollouts import paired
+from torchrl_sparse.evaluation.rollouts import paired, process_collector
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
+from torchrl_sparse.runtime.backends import WorkerDied
 
 SEEDS = range(7)
 
@@ -85,45 +90,99 @@ def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, back
     assert len(log.read_text().splitlines()) == 1 + len(SEEDS)
 
 
-class Doomed:
-    """A collector whose first worker has been killed."""
+class HeldEnv(FakeEnv):
+    """Takes no step before a file is there."""
 
-    def __init__(self, started):
-        started.append(self)
-        self.procs = [
-            SimpleNamespace(_closed=False, exitcode=-9),
-            SimpleNamespace(_closed=True, exitcode=None),
-        ]
-        self.shut = False
+    def __init__(self, seeds, go):
+        super().__init__(seeds)
+        self.go = go
 
-    def __iter__(self):
-        raise ValueError("Cannot close a process while it is still running.")
+    def _step(self, tensordict):
+        while not self.go.exists():
+            time.sleep(0.01)
+        return super()._step(tensordict)
 
-    def shutdown(self):
-        self.shut = True
+
+def kill_while_starting(monkeypatch, backend, go, delays):
+    """Runs all episodes while workers are killed before their first batch, each so many seconds after its fork."""
+    monkeypatch.setattr(paired, "_FAILURES", len(delays) + 1)
+    killer = Killer(delays, go)
+    killer.start()
+    with pytest.warns(RuntimeWarning, match="episodes are run anew") as warned:
+        episodes = run(partial(HeldEnv, go=go), workers=2, num_envs=2, backend=backend)
+    assert 1 <= len(warned) <= len(delays)
+    assert episodes == run(FakeEnv)
+    assert multiprocessing.active_children() == []
+
+
+def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path, monkeypatch, backend):
+    kill_while_starting(monkeypatch, backend, tmp_path / "go", [0.0, 1.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_workers_that_are_killed_at_ten_moments_are_replaced(tmp_path, monkeypatch, backend, seed):
+    drawn = random.Random(seed)
+    kill_while_starting(monkeypatch, backend, tmp_path / "go", [8 * drawn.random() for _ in range(10)])
+
+
+def test_workers_that_do_not_start_in_time_are_given_up(monkeypatch):
+    monkeypatch.setattr(process_collector, "START_LIMIT", 0.5)
+    monkeypatch.setattr(paired, "_FAILURES", 1)
+    with pytest.raises(RuntimeError, match=r"workers had not started after 0\.5 s, 1 times"):
+        run(FakeEnv, workers=2)
+    assert multiprocessing.active_children() == []
+
+
+class UnmakeableEnv(FakeEnv):
+    """Cannot be made."""
+
+    def __init__(self, seeds):
+        raise ArithmeticError("no environment")
+
+
+class BrokenEnv(FakeEnv):
+    """Cannot be stepped."""
+
+    def _step(self, tensordict):
+        raise ArithmeticError("no step")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_a_worker_raises_while_it_starts_is_raised_and_not_tried_again(backend):
+    with pytest.raises(ArithmeticError, match="no environment"):
+        run(UnmakeableEnv, workers=2, backend=backend)
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_a_ray_worker_raises_is_raised_and_not_tried_again(ray_cluster):
+    with pytest.raises(ArithmeticError, match="no step"):
+        run(BrokenEnv, backend="ray")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_a_worker_process_raises_ends_the_run(capfd):
+    with pytest.raises(RuntimeError, match=r"worker \d ended with exit code 1.*its traceback is above"):
+        run(BrokenEnv, workers=2)
+    assert "ArithmeticError: no step" in capfd.readouterr().err
 
 
 def test_workers_that_keep_dying_end_the_run():
     started = []
+
+    @contextmanager
+    def doomed(seeds):
+        started.append(seeds)
+        raise WorkerDied("worker 0 ended with exit code -9")
+        yield
+
     with (
         pytest.warns(RuntimeWarning),
         pytest.raises(RuntimeError, match="worker 0 ended with exit code -9, 3 times"),
     ):
-        list(paired._episodes(lambda seeds: Doomed(started), [3, 8]))
-    assert [collector.shut for collector in started] == [True] * 3
-
-
-def test_an_error_without_a_death_is_not_tried_again():
-    started = []
-
-    def start(seeds):
-        collector = Doomed(started)
-        collector.procs[0].exitcode = None
-        return collector
-
-    with pytest.raises(ValueError, match="Cannot close"):
-        list(paired._episodes(start, [3, 8]))
-    assert len(started) == 1
+        list(paired._episodes(doomed, [3, 8]))
+    assert started == [[3, 8]] * 3
 
 
 def test_robosuite_gives_the_same_in_two_workers(backend):
@@ -140,21 +199,6 @@ def test_robosuite_gives_the_same_in_two_workers(backend):
     one, two = ([replace(episode, latency=()) for episode in episodes] for episodes in runs)
     assert one == two
     assert all(episode.queries == 2 for episode in one)
-
-
-class BrokenEnv(FakeEnv):
-    """Cannot be stepped."""
-
-    def _step(self, tensordict):
-        raise ArithmeticError("no step")
-
-
-@pytest.mark.xfail(
-    reason="Ray 2.60 fails while it stores the error, and the worker dies instead", strict=True
-)
-def test_what_a_ray_worker_raises_is_raised_and_not_tried_again(ray_cluster):
-    with pytest.raises(ArithmeticError, match="no step"):
-        run(BrokenEnv, backend="ray")
 
 
 @pytest.mark.parametrize(

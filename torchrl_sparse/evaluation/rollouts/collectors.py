@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
-from torchrl_sparse.runtime.backends import ray_death
+from torchrl_sparse.evaluation.rollouts.process_collector import START_LIMIT, in_processes
+from torchrl_sparse.runtime.backends import WorkerDied, ray_death, wait_for_actors
 
-__all__ = ["lost_workers", "start_collector"]
+__all__ = ["running_collector"]
 
 _STEPS_PER_BATCH = 16  # that a worker makes between two reports
 
 
-def start_collector(
+@contextmanager
+def running_collector(
     actor: TensorDictModuleBase,
     make_env: Callable[..., EnvBase],
     seeds: Sequence[int],
@@ -30,11 +33,16 @@ def start_collector(
     backend: str,
     max_steps: int | None,
     policy_device: torch.device | str | None,
-) -> BaseCollector:
-    """Start a collector without end, and deal the seeds among its environments; see `rollout_episodes`.
+) -> Iterator[BaseCollector]:
+    """Run a collector without end while the block lasts, and deal the seeds among its environments; see `rollout_episodes`.
 
     Its batches are [workers, environments, steps] of several processes, else [environments, steps]: of this process or, on
     Ray, of the worker that was ready first.
+
+    Raises:
+        WorkerDied: if a worker dies, while it starts or in the block, or has not started after ten minutes.
+        Exception: what a worker raised while it started or, on Ray, at any time.
+        RuntimeError: if a worker process raised something later; its traceback is on stderr.
     """
     workers = min(workers, len(seeds))
     count = min(num_envs, len(seeds) // workers)  # as many in each worker, and none without a seed
@@ -50,33 +58,62 @@ def start_collector(
         "exploration_type": ExplorationType.RANDOM,
     }
     transforms = {"auto_register_policy_transforms": True}
+    frames = count * _STEPS_PER_BATCH
     if backend == "ray":
-        return _start_ray(make, actor, count * _STEPS_PER_BATCH, transforms, options)
-    options |= transforms | {"total_frames": -1}
-    if workers == 1:
-        return Collector(make[0](), actor, frames_per_batch=count, **options)
-    frames = workers * count * _STEPS_PER_BATCH
-    # Without buffers, since words cannot lie in shared memory (tensordict makes arrays of them that no queue takes).
-    return MultiSyncCollector(
-        make, actor, frames_per_batch=frames, cat_results="stack", use_buffers=False, num_threads=1, **options
-    )
+        running = _on_ray(make, actor, frames_per_batch=frames, collector_kwargs=transforms, **options)
+    elif workers == 1:
+        running = _here(make[0](), actor, frames_per_batch=count, **transforms, **options)
+    else:
+        running = in_processes(make, actor, frames_per_batch=workers * frames, **transforms, **options)
+    with running as collector:
+        yield collector
 
 
-def _start_ray(make, actor, frames_per_batch: int, transforms: dict, options: dict) -> BaseCollector:
+@contextmanager
+def _here(env: EnvBase, actor: TensorDictModuleBase, **options: Any) -> Iterator[BaseCollector]:
+    collector = Collector(env, actor, total_frames=-1, **options)
+    try:
+        yield collector
+    finally:
+        collector.shutdown()
+
+
+@contextmanager
+def _on_ray(
+    make: Sequence[Callable[[], EnvBase]], actor: TensorDictModuleBase, **options: Any
+) -> Iterator[BaseCollector]:
     from torchrl.collectors.distributed import RayCollector
 
-    return RayCollector(
-        make,
+    collector = RayCollector(
+        list(make),
         actor,
-        frames_per_batch=frames_per_batch,
         total_frames=sys.maxsize,  # -1, endless for other collectors, ends this one before its first batch
         sync=False,
         remote_configs={"num_cpus": 1},
-        collector_kwargs=transforms,
+        collector_class=_RayWorker,
         # No weights are sent after the start, and so nothing waits for a worker before the first batch.
         weight_sync_schemes={},
         **options,
     )
+    try:
+        wait_for_actors(collector.remote_collectors, START_LIMIT)
+        yield collector
+    except Exception as error:
+        if lost := ray_death(error):
+            raise WorkerDied(lost) from error
+        raise getattr(error, "cause", error) from error  # Ray wraps what a worker raised
+    finally:
+        collector.shutdown()
+
+
+class _RayWorker(Collector):
+    """A collector that Ray can ask whether it is true: it does so when the collector raises something.
+
+    Without end a collector's length is infinite, of which Python makes an error, and Ray a death of the worker.
+    """
+
+    def __bool__(self) -> bool:
+        return True
 
 
 def _batched(
@@ -87,17 +124,3 @@ def _batched(
     # specs from a single throw-away environment instead of one per worker.
     env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
     return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps))
-
-
-def lost_workers(collector: BaseCollector, error: Exception) -> str:
-    """Name the workers that died of themselves; empty if none did and ``error`` is of another kind."""
-    if hasattr(collector, "remote_collectors"):
-        return ray_death(error)
-    # TorchRL's exception depends on when it notices the death; that a process is dead counts.
-    dead = [
-        f"worker {index} ended with exit code {process.exitcode}"
-        for index, process in enumerate(getattr(collector, "procs", ()))
-        # TorchRL terminates and closes those that are alive when it finds a dead one.
-        if not process._closed and process.exitcode not in (None, -signal.SIGTERM)
-    ]
-    return ", ".join(dead)

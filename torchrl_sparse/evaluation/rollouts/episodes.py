@@ -2,14 +2,14 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_sparse.storage.json import parse_json
 
-__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
+__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "read_episodes", "token_totals", "totals"]
 
 
 @dataclass(frozen=True)
@@ -191,3 +191,19 @@ class EpisodeLog:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
         if header.identity != json.loads(json.dumps(self.identity)):
             raise ValueError(f"{self.path}: holds episodes of {header.identity}, expected {self.identity}")
+
+
+def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
+    """Yield the episodes of a log, which stays as it is.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: naming file and line, if one is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a log of episodes {path}, got none")
+    with path.open(encoding="utf-8") as lines:
+        next(lines)
+        for number, line in enumerate(lines, start=2):
+            yield parse_json(line, EpisodeResult, f"{path}:{number}")

@@ -8,7 +8,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
 from typing import Any
 
@@ -19,9 +19,9 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.evaluation.rollouts.collectors import lost_workers, start_collector
+from torchrl_sparse.evaluation.rollouts.collectors import running_collector
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.runtime.backends import WorkerDied, backend_runtime
 from torchrl_sparse.runtime.threads import num_threads
 
 __all__ = ["rollout_episodes"]
@@ -56,9 +56,9 @@ def rollout_episodes(
     Seeds are dealt to the environments in turn. An environment that has done its own keeps stepping until the last
     one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiSyncCollector`` runs as many
     processes, and with ``backend="ray"`` a ``RayCollector`` as many Ray actors of one CPU, each with a copy of the actor.
-    A worker that dies is reported as a warning, and the episodes that were under way run again: they come out the same,
-    since nothing but its seed fixes an episode. Nothing but rounding, that is: PyTorch sums in another order on several
-    threads. The native engine does not, so with it one process equals many whatever its number of threads.
+    A worker that dies, be it while it starts, is reported as a warning, and the episodes that were under way run again: they
+    come out the same, since nothing but its seed fixes an episode. Nothing but rounding, that is: PyTorch sums in another
+    order on several threads. The native engine does not, so with it one process equals many whatever its number of threads.
 
     Args:
         actor: writes ``"action"``, ``("control", "queried")`` and ``("cost", "flops")``; ``("cost",
@@ -85,7 +85,7 @@ def rollout_episodes(
         ValueError: if seeds repeat, an option is out of range or the file belongs to something else.
         ImportError: if Ray is asked for and not installed.
         KeyError: if the actor or the environment leaves out a key that is needed.
-        RuntimeError: if workers keep dying without finishing an episode.
+        RuntimeError: if workers keep dying without finishing an episode, or one raised an error.
 
     Examples:
         >>> from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, make_env
@@ -107,8 +107,8 @@ def rollout_episodes(
         log = EpisodeLog(results_file, {**(identity or {}), "max_steps": max_steps})
         finished.update(log.episodes)
     pending = [seed for seed in seeds if seed not in finished]
-    start = partial(
-        start_collector,
+    run = partial(
+        running_collector,
         actor,
         make_env,
         num_envs=num_envs,
@@ -121,7 +121,7 @@ def rollout_episodes(
     with (
         runtime if pending else nullcontext(),
         num_threads(None),
-        closing(_episodes(start, pending)) as episodes,
+        closing(_episodes(run, pending)) as episodes,
     ):
         for episode in episodes:
             finished[episode.seed] = episode
@@ -133,26 +133,24 @@ def rollout_episodes(
 
 
 def _episodes(
-    start: Callable[[Sequence[int]], BaseCollector], seeds: Sequence[int]
+    run: Callable[[Sequence[int]], AbstractContextManager[BaseCollector]], seeds: Sequence[int]
 ) -> Iterator[EpisodeResult]:
     """Yield the episode of each seed as it ends; a collector whose worker dies is replaced by a new one for what is left."""
     pending, failures = list(seeds), 0
     while pending:
-        collector = start(pending)
         try:
-            for episode in _finished(collector, set(pending)):
-                pending.remove(episode.seed)
-                failures = 0
-                yield episode
-        except Exception as error:
-            lost, failures = lost_workers(collector, error), failures + 1
-            if not lost:
-                raise
+            with run(pending) as collector:
+                for episode in _finished(collector, set(pending)):
+                    pending.remove(episode.seed)
+                    failures = 0
+                    yield episode
+        except WorkerDied as death:
+            failures += 1
             if failures == _FAILURES:
-                raise RuntimeError(f"{lost}, {failures} times without an episode finished between") from error
-            warnings.warn(f"{lost}; {len(pending)} episodes are run anew", RuntimeWarning, stacklevel=3)
-        finally:
-            collector.shutdown()
+                raise RuntimeError(
+                    f"{death}, {failures} times without an episode finished between"
+                ) from death
+            warnings.warn(f"{death}; {len(pending)} episodes are run anew", RuntimeWarning, stacklevel=3)
 
 
 def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeResult]:

@@ -26,9 +26,10 @@ error of smooth actions saturates after very few steps, and takes two of DDIM.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from itertools import pairwise
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -39,21 +40,25 @@ from torchrl_sparse.networks.diffusion.coefficients import StepCoefficients, ste
 from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 from torchrl_sparse.networks.diffusion.naming import KINDS, SamplerName
 from torchrl_sparse.networks.diffusion.spacing import spaced_timesteps
+from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["Sampler", "timesteps_fall"]
+__all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler", "timesteps_fall"]
+
+MAX_TRAIN_TIMESTEPS = 10_000
+"""Far beyond any diffusion model: tables as long as this are made of what a file asks for."""
 
 
 class Sampler:
     """The denoising steps of one query, in execution order, and the noising of training.
 
     The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
-    noise of a query.
+    noise of a query. A sampler cannot be changed: engines keep tables of its steps.
 
     Args:
         kind: ``"ddpm"``, ``"ddim"``, ``"dpmpp2m"``, ``"sde2m"`` or ``"unipc"``, see the module.
         num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
             ``timesteps``, or without those for all training steps.
-        num_train_timesteps: diffusion steps that the network was trained with.
+        num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
         timesteps: K falling diffusion timesteps, where no spacing shall decide.
         eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance.
         spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
@@ -66,6 +71,7 @@ class Sampler:
         coefficients: the update of each denoising step in numbers, for loops without a sampler.
 
     Raises:
+        AttributeError: if an attribute is assigned.
         ValueError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
             ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM.
 
@@ -79,6 +85,16 @@ class Sampler:
         >>> Sampler("ddpm", timesteps=[82, 14]).name, Sampler("ddpm", 2, spacing="logsnr").timesteps.tolist()
         ('ddpm_82_14', [91, 41])
     """
+
+    kind: str
+    num_inference_steps: int
+    num_train_timesteps: int
+    eta: float
+    spacing: str
+    timesteps: Tensor
+    previous_timesteps: tuple[int, ...]
+    alphas_cumprod: Tensor
+    coefficients: StepCoefficients
 
     def __init__(
         self,
@@ -94,27 +110,37 @@ class Sampler:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
         if num_inference_steps is None:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
-        if not 1 <= num_inference_steps <= num_train_timesteps:
+        check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
+        check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
+        if not isinstance(eta, Real) or not 0 <= eta <= 1 or (eta and kind != "ddim"):
             raise ValueError(
-                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
-                f"got {num_inference_steps}"
+                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
-        if not 0 <= eta <= 1 or (eta and kind != "ddim"):
-            raise ValueError(
-                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta} of kind "{kind}"'
-            )
-        self.kind, self.eta, self.spacing = kind, float(eta), spacing
-        self.num_inference_steps = num_inference_steps
-        self.num_train_timesteps = num_train_timesteps
-        self.alphas_cumprod: Tensor = DDPMScheduler(
-            num_train_timesteps, beta_schedule="squaredcos_cap_v2"
-        ).alphas_cumprod
-        self._chosen = None if timesteps is None else self._checked(timesteps)
-        self.timesteps: Tensor = torch.tensor(self._chosen or self._spaced())
-        self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
-        self.coefficients: StepCoefficients = step_coefficients(
-            kind, self.alphas_cumprod, self.timesteps.tolist(), self.previous_timesteps, eta=self.eta
+        scheduler = DDPMScheduler(num_train_timesteps, beta_schedule="squaredcos_cap_v2")
+        alphas_cumprod: Tensor = scheduler.alphas_cumprod
+        if timesteps is None:
+            order = _spaced(kind, spacing, num_inference_steps, alphas_cumprod)
+        else:
+            order = _chosen(timesteps, spacing, num_inference_steps, num_train_timesteps)
+        previous = (*order[1:], -1)
+        vars(self).update(
+            kind=kind,
+            num_inference_steps=num_inference_steps,
+            num_train_timesteps=num_train_timesteps,
+            eta=float(eta),
+            spacing=spacing,
+            timesteps=torch.tensor(order),
+            previous_timesteps=previous,
+            alphas_cumprod=alphas_cumprod,
+            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=float(eta)),
+            _chosen=None if timesteps is None else tuple(order),
         )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{name}: expected a sampler to stay as it was made; make another Sampler")
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
 
     @classmethod
     def from_name(
@@ -210,33 +236,31 @@ class Sampler:
         abar = self.alphas_cumprod.to(clean)[timestep][:, None, None]
         return abar**0.5 * clean + (1 - abar) ** 0.5 * noise
 
-    def _checked(self, timesteps: Sequence[int]) -> tuple[int, ...]:
-        chosen = list(timesteps)
-        whole = all(isinstance(timestep, Integral) for timestep in chosen)
-        falls = whole and timesteps_fall(chosen, self.num_train_timesteps)
-        if not falls or len(chosen) != self.num_inference_steps:
-            raise ValueError(
-                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
-                f"{self.num_train_timesteps - 1} to at least 0, got {chosen}"
-            )
-        if self.spacing != "leading":
-            raise ValueError(f"spacing: expected none beside timesteps, got {self.spacing!r}")
-        return tuple(int(timestep) for timestep in chosen)
-
-    def _spaced(self) -> list[int]:
-        steps = self.num_inference_steps
-        found = spaced_timesteps(
-            self.spacing, steps, self.alphas_cumprod, without_last=self.kind in MULTISTEP
-        )
-        if not timesteps_fall(found, self.num_train_timesteps):
-            raise ValueError(
-                f"num_inference_steps: expected fewer, {self.spacing!r} has no {steps} falling timesteps of "
-                f"{self.num_train_timesteps} for {self.kind!r}"
-            )
-        return found
-
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def _spaced(kind: str, spacing: str, steps: int, alphas_cumprod: Tensor) -> list[int]:
+    found = spaced_timesteps(spacing, steps, alphas_cumprod, without_last=kind in MULTISTEP)
+    num_train = len(alphas_cumprod)
+    if not timesteps_fall(found, num_train):
+        raise ValueError(
+            f"num_inference_steps: expected fewer, {spacing!r} has no {steps} falling timesteps of {num_train} for {kind!r}"
+        )
+    return found
+
+
+def _chosen(timesteps: Sequence[int], spacing: str, steps: int, num_train_timesteps: int) -> list[int]:
+    chosen = list(timesteps)
+    whole = all(isinstance(timestep, Integral) for timestep in chosen)
+    if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != steps:
+        raise ValueError(
+            f"timesteps: expected {steps} (num_inference_steps) whole numbers that fall from at most "
+            f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
+        )
+    if spacing != "leading":
+        raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
+    return [int(timestep) for timestep in chosen]
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
