@@ -93,8 +93,7 @@ def test_solvers_equal_diffusers_where_nothing_is_clipped(kind, steps, spacing):
     reference.set_timesteps(steps)
     sampler = Sampler(kind, steps, spacing=spacing)
     assert torch.equal(sampler.timesteps, reference.timesteps)
-    wide = replace(sampler.coefficients, clip=1e6)
-    vars(sampler)["coefficients"], abar = wide, sampler.alphas_cumprod  # a caller cannot change it
+    coefficients, abar = replace(sampler.coefficients, clip=1e6), sampler.alphas_cumprod
     generator = torch.Generator().manual_seed(0)
     sample, target = torch.randn(2, *SHAPE, generator=generator)
     cleans = ()
@@ -103,7 +102,7 @@ def test_solvers_equal_diffusers_where_nothing_is_clipped(kind, steps, spacing):
         eps = (sample - abar[timestep].sqrt() * clean) / (1 - abar[timestep]).sqrt()
         noise = torch.randn(SHAPE, generator=generator)
         extra = {"variance_noise": noise} if kind == "sde2m" else {}
-        ours = sampler.step(eps, k, sample, noise, cleans)
+        ours = coefficients.update(k, sample, eps, noise, cleans)
         theirs = reference.step(eps, timestep, sample, **extra).prev_sample
         # Where abar is 1e-9, f32 leaves a clean prediction no more digits.
         tolerance = 1e-6 if timestep < 98 else 1e-3
@@ -270,6 +269,7 @@ def test_names_and_configs_of_old_files_are_unchanged():
         ({"eta": 0.5}, 'eta: expected .* "ddim" alone, got 0.5 of kind "ddpm"'),
         ({"kind": "ddim", "eta": 1.5}, r"eta: expected a number in \[0, 1\].* got 1.5"),
         ({"kind": "ddim", "eta": float("nan")}, "eta: expected .* got nan"),
+        ({"kind": "ddim", "eta": "0.5"}, "eta: expected .* got '0.5'"),
         (
             {"kind": "ddim", "num_inference_steps": 101},
             "num_inference_steps: expected a whole number from 1 to 100, got 101",
@@ -296,7 +296,9 @@ def test_timesteps_that_do_not_fall_are_refused(kind, steps, timesteps):
 
 
 @pytest.mark.parametrize(
-    "name", ["ddim_", "ddim_-3", "flow", "ddim_9_x", "ddpm10_82_14", "ddim0", "ddim_eta", "ddim_eta0.5_trailing", None]
+    "name",
+    ["ddim_", "ddim_-3", "flow", "ddim_9_x", "ddpm10_82_14", "ddim0", "ddim_eta", "ddim_eta0.5_trailing",
+     "ddim_123456", None],
 )  # fmt: skip
 def test_other_names_are_refused(name):
     with pytest.raises(ValueError, match=f"sampler: expected KIND.*got {name!r}"):
@@ -308,6 +310,14 @@ def test_a_name_and_a_number_of_steps_must_agree():
         Sampler.from_name("ddpm10", 5)
     with pytest.raises(ValueError, match="timesteps: expected 3"):
         Sampler.from_name("ddim_9_5", 3)
+
+
+def test_a_sampler_cannot_be_changed():
+    sampler = Sampler("ddpm", 10)
+    with pytest.raises(AttributeError, match="timesteps: expected a sampler to stay as it was made"):
+        sampler.timesteps = torch.tensor([9])
+    with pytest.raises(AttributeError, match="coefficients: expected a sampler to stay"):
+        del sampler.coefficients
 
 
 def test_steps_say_what_they_need():
