@@ -57,7 +57,9 @@ def test_another_identity_is_refused_and_the_file_left_alone(path):
     EpisodeLog(path, {"method": "bac", "policy": "abc"}).append(episode(0))
     before = path.read_bytes() + b'{"seed": 1, "succ'
     path.write_bytes(before)
-    with pytest.raises(ValueError, match=r"bac.jsonl: holds other episodes: policy is 'xyz' here and 'abc' there; choose"):
+    with pytest.raises(
+        ValueError, match=r"bac.jsonl: holds other episodes: policy is 'xyz' here and 'abc' there; choose"
+    ):
         EpisodeLog(path, {"method": "bac", "policy": "xyz"})
     assert path.read_bytes() == before
 
