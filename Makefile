@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs install sanitize
+.PHONY: demo test lint docs install sanitize torture
 
 install: $(VENV)/.installed
 
@@ -31,10 +31,16 @@ docs: install
 
 # The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.
 SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined
-sanitize: install
-	mkdir -p build/sanitize
-	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -shared -fPIC \
-		-o build/sanitize/native.so torchrl_sparse/blocks/engine/native/native.cpp
+build/sanitize/native.so: torchrl_sparse/blocks/engine/native/native.cpp
+	mkdir -p $(@D)
+	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -shared -fPIC -o $@ $<
+
+sanitize: install build/sanitize/native.so
 	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
 		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
 		$(BIN)/python -m pytest tests/blocks/engine/native -k "not library"
+
+# Half an hour of faults, see tests/torture/README.md; MINUTES=5 for less. Linux with g++.
+MINUTES ?= 30
+torture: install build/sanitize/native.so
+	$(BIN)/python -m tests.torture minutes=$(MINUTES)

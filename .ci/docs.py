@@ -13,7 +13,7 @@ import mkdocs_gen_files
 
 ROOT = Path(__file__).parents[1]
 LIBRARY = ROOT / "torchrl_sparse"
-FOLDERS = ("assets", "recipes", "torchrl_sparse")
+FOLDERS = ("assets", "recipes", "tests", "torchrl_sparse")
 
 
 def linked_files(page: Path) -> Iterator[Path]:

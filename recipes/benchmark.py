@@ -1,6 +1,7 @@
 """Benchmark a policy: dense against accelerated, paired, with a table, plots and videos.
 
-    python recipes/benchmark.py task=lift methods=[dense,ddim10,bac] episodes=50 seed=0 out=outputs/lift
+    python recipes/benchmark.py task=lift methods=[dense,dense_noise,ddim10,bac] episodes=50 out=outputs/lift
+    python recipes/benchmark.py task=lift methods=[dense,ddim10] split=test until=decided max_episodes=1300
 
 Kill it and run it again to go on: finished episodes are read from OUT/episodes. Nothing else is kept between runs.
 """
@@ -17,7 +18,7 @@ from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import (
     draw_methods,
@@ -26,11 +27,13 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
     settle_rates,
 )
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
+from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.report import build_results
+from torchrl_sparse.evaluation.results.build import Terms, build_results
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, make_controller, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -47,7 +50,7 @@ def main(config: DictConfig) -> None:
     check_names(config, partial(check_method, planners=planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     make_env = diffusion_env(task.name, policy, config.horizon)
-    first_observations = range(CALIBRATION_SEED, CALIBRATION_SEED + config.calibration_samples)
+    first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
     calibration = cache(partial(calibrate_policy, policy, make_env, first_observations))
     methods = make_methods(
         config.methods, policy, num_updates=config.num_updates, planners=planners, calibration=calibration
@@ -56,34 +59,37 @@ def main(config: DictConfig) -> None:
         name: ChunkExecutor(method, config.n_action_steps, make_controller(name))
         for name, method in methods.items()
     }
-    seeds = evaluation_seeds(config.seed, config.episodes)
+    design = make_design(config.until, config.episodes, config.max_episodes)
+    seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
+    terms = Terms(design, episode_horizon(make_env), task.early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
 
+    def play(name: str, count: int) -> list[EpisodeResult]:
+        return evaluate(
+            name,
+            actors[name],
+            make_env,
+            seeds[:count],
+            log=episode_log(out, name, config.dense_log),
+            identity=method_identity(name, methods[name]) | settings,
+            num_envs=config.num_envs,
+            workers=config.workers,
+            backend=config.backend,
+        )
+
     with backend_runtime(config.backend, config.workers):  # one Ray for all methods
-        episodes = {
-            name: evaluate(
-                name,
-                actor,
-                make_env,
-                seeds,
-                log=episode_log(out, name, config.dense_log),
-                identity=method_identity(name, methods[name]) | settings,
-                num_envs=config.num_envs,
-                workers=config.workers,
-                backend=config.backend,
-            )
-            for name, actor in actors.items()
-        }
+        episodes = play_rounds(actors, play, terms)
     settle_rates(methods, episodes)
     queries = record_queries(actors["dense"], make_env, seeds[: config.probe_episodes])
     runs = measure_methods(methods, episodes, queries, repeats=config.latency_repeats, threads=config.threads)
     results = build_results(
         runs,
         task=task.name,
+        split=config.split,
         seed=config.seed,
+        terms=terms,
         machine=describe_machine(threads=config.threads),
         policy=describe_policy(policy, config.n_action_steps),
-        margin=config.margin,
     )
     save_results(results, out / "results.json")
     draw_methods(results, methods, queries, calibration(), out)
@@ -96,7 +102,7 @@ def main(config: DictConfig) -> None:
     if config.wandb:
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
-    print(f"\n{config.episodes} paired episodes per method; files are in {out}")
+    print(f"\nFiles are in {out}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.for_policy import instructed_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.film import film_tokens
+from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, error_to_dense, format_benchmark
 from torchrl_sparse.evaluation.benchmarks.vla import (
     matched_number,
@@ -27,12 +29,14 @@ from torchrl_sparse.evaluation.benchmarks.vla import (
     replay_all,
     time_methods,
 )
+from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.tokens import plot_tokens_per_layer
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.report import MethodRun, build_results
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
 from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
@@ -50,30 +54,38 @@ def main(config: DictConfig) -> None:
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
     cameras = chosen_cameras(config.cameras)
     make_env = instructed_env(config.task, dense.network.config, cameras, config.horizon)
-    seeds = evaluation_seeds(config.seed, config.episodes)
+    design = make_design(config.until, config.episodes, config.max_episodes)
+    seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
+    early_cut = find_task(config.task).early_cut
+    terms = Terms(design, episode_horizon(make_env), early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = seeds[: config.probe_episodes]
     recorded = recorded_queries(dense, ChunkExecutor(dense, config.n_action_steps), make_env, probed)
     recorded = [*tqdm(recorded, total=len(probed), unit="episode", desc="recording")]
 
-    actors, episodes = {}, {}
-    with backend_runtime(config.backend, config.workers):  # one Ray for all methods
-        for name in matches_last(methods):
-            number = matched_number(name, dense, recorded, episodes, options)
-            policy = dense.with_pruner(make_pruner(name, number=number, settings=options))
+    actors, numbers, played = {}, {}, {}
+
+    def play(name: str, count: int) -> list[EpisodeResult]:
+        if name not in actors:  # what it matches has been played
+            numbers[name] = matched_number(name, dense, recorded, played, options)
+            policy = dense.with_pruner(make_pruner(name, number=numbers[name], settings=options))
             actors[name] = ChunkExecutor(policy, config.n_action_steps, make_controller(name))
-            episodes[name] = evaluate(
-                name,
-                actors[name],
-                make_env,
-                seeds,
-                log=episode_log(out, name, config.dense_log),
-                identity=method_identity(name, number, dense, options) | settings,
-                num_envs=config.num_envs,
-                workers=config.workers,
-                backend=config.backend,
-                policy_device=config.device,
-            )
+        played[name] = evaluate(
+            name,
+            actors[name],
+            make_env,
+            seeds[:count],
+            log=episode_log(out, name, config.dense_log),
+            identity=method_identity(name, numbers[name], dense, options) | settings,
+            num_envs=config.num_envs,
+            workers=config.workers,
+            backend=config.backend,
+            policy_device=config.device,
+        )
+        return played[name]
+
+    with backend_runtime(config.backend, config.workers):  # one Ray for all methods
+        episodes = play_rounds(matches_last(methods), play, terms)
     policies = {name: actors[name].policy for name in methods}  # in the order asked for
 
     timing = {"repeats": config.latency_repeats, "threads": config.threads, "device": config.device}
@@ -83,13 +95,15 @@ def main(config: DictConfig) -> None:
     results = build_results(
         {name: MethodRun(episodes[name], latency[name], errors[name]) for name in policies},
         task=config.task,
+        split=config.split,
         seed=config.seed,
+        terms=terms,
         machine=describe_machine(config.device, config.threads),
         policy=describe_policy(dense, config.n_action_steps),
-        margin=config.margin,
     )
     save_results(results, out / "results.json")
     plot_pareto(results, out / "pareto.png")
+    plot_success_within(results, out / "success_within.png")
     depth = {name: answer[keys.TOKEN_DEPTH].numpy(force=True) for name, answer in answers.items()}
     plot_tokens_per_layer(depth, dense.network.config.llm.layers, out / "tokens_per_layer.png")
     for name in config.videos:
@@ -98,7 +112,7 @@ def main(config: DictConfig) -> None:
     if config.wandb:
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
-    print(f"\n{config.episodes} paired episodes per method; files are in {out}")
+    print(f"\nFiles are in {out}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,9 @@
 """Compute the BAC schedules of a trained policy from one dense query.
 
-python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
+    python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
+    python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=3 sampler=ddpm10
+
+With a sampler, the files are called ``bac_ddpm10.json`` and so on, and so are the methods of a benchmark.
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import tuning_seeds
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
@@ -20,8 +25,11 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 @recipe("calibrate_bac")
 def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy)
+    if config.sampler is not None:
+        train_steps = policy.sampler.num_train_timesteps
+        policy.sampler = Sampler.from_name(config.sampler, num_train_timesteps=train_steps)
     environment = diffusion_env(config.task, policy)
-    seeds = range(config.seed, config.seed + config.samples)
+    seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
     for name in config.methods:
@@ -29,7 +37,7 @@ def main(config: DictConfig) -> None:
         schedule = SCHEDULES[name](
             calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
         )
-        path = Path(config.out) / f"{name}.json"
+        path = Path(config.out) / f"{'_'.join(filter(None, [name, config.sampler]))}.json"
         schedule.save_pretrained(path)
         mask = schedule.mask()
         ratio = query_flops(policy.network, mask) / dense

@@ -1,12 +1,14 @@
-"""Find the timesteps at which few DDIM steps of a trained policy come closest to its demonstrations.
+"""Find the timesteps at which few denoising steps of a trained policy come closest to its demonstrations.
 
-    python recipes/calibrate_timesteps.py task=square demos=data/square_recovering.h5 num_inference_steps=3
+    python recipes/calibrate_timesteps.py task=square demos=data/square_recovering.h5 kind=ddpm num_inference_steps=3
 
-The result is the name of a benchmark's method, e.g. ``ddim_90_50_10``; ``out`` also lists all that was tried.
+The result is the name of a benchmark's method, e.g. ``ddpm_90_50_10``; ``out`` lists all that was tried, and how the
+spacings do that take no search, among them the rule ``logsnr``.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -34,28 +36,51 @@ def main(config: DictConfig) -> None:
     n_action_steps = published_shape(task.name).n_action_steps
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     train_steps = policy.sampler.num_train_timesteps
-    start = Sampler("ddim", config.num_inference_steps, train_steps).timesteps.tolist()
+
+    def make(**where) -> Sampler:
+        return Sampler(config.kind, num_train_timesteps=train_steps, eta=config.eta, **where)
+
+    starts = {
+        spacing: tuple(
+            make(num_inference_steps=config.num_inference_steps, spacing=spacing).timesteps.tolist()
+        )
+        for spacing in config.spacings
+    }
     with tqdm(desc="chains", unit="chain", mininterval=2) as bar:
 
+        @cache
         def error(timesteps: tuple[int, ...]) -> float:
             bar.update()
-            return demonstration_error(policy, targets, timesteps, n_action_steps=n_action_steps)
+            return demonstration_error(
+                policy, targets, make(timesteps=timesteps), n_action_steps=n_action_steps
+            )
 
+        start = min(starts.values(), key=error)
         best, tried = search_timesteps(error, start, num_train_timesteps=train_steps, strides=config.strides)
-    chosen = Sampler("ddim", num_train_timesteps=train_steps, timesteps=best)
+    tried |= {timesteps: error(timesteps) for timesteps in starts.values()}
+    chosen = make(timesteps=best)
     path = Path(config.out) / f"{chosen.name}.json"
-    write_json(path, report(policy, tried, config))
-    print(
-        f"{path}: {chosen.name}, error {tried[best]:.4f}; evenly spaced {start}, error {tried[tuple(start)]:.4f}"
-    )
+    write_json(path, report(policy, tried, starts, config))
+    print(f"{path}: {chosen.name}, error {tried[best]:.4f}")
+    for spacing, timesteps in starts.items():
+        print(f"{spacing}: {list(timesteps)}, error {tried[timesteps]:.4f}")
 
 
-def report(policy: DiffusionPolicy, tried: dict[tuple[int, ...], float], config: DictConfig) -> dict:
-    """Return everything that was tried, best first, and what it was tried with."""
+def report(
+    policy: DiffusionPolicy,
+    tried: dict[tuple[int, ...], float],
+    starts: dict[str, tuple[int, ...]],
+    config: DictConfig,
+) -> dict:
+    """Return everything that was tried, best first, what the spacings took, and what it was tried with."""
     ordered = sorted(tried.items(), key=lambda entry: entry[1])
     return {
         "policy": policy.fingerprint,
         "settings": OmegaConf.to_container(config, resolve=True),
+        "spacings": {
+            spacing: {"timesteps": timesteps, "error": tried[timesteps]}
+            for spacing, timesteps in starts.items()
+        },
         "tried": [{"timesteps": timesteps, "error": error} for timesteps, error in ordered],
     }
 

@@ -24,6 +24,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -95,7 +96,7 @@ def executor(policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
 
 
 def seeds(config: DictConfig) -> range:
-    return range(config.seed, config.seed + config.episodes)
+    return tuning_seeds(config.seed, config.episodes)
 
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:

@@ -19,7 +19,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.block_push import way_of
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
@@ -54,7 +54,7 @@ def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
         "dense",
         ChunkExecutor(policy, n_action_steps),
         diffusion_env(task.name, policy, config.horizon),
-        range(first, first + config.episodes),
+        tuning_seeds(first, config.episodes),
         num_envs=config.num_envs,
         log=episode_log(config.out, "dense"),
         identity=played | method_identity("dense", policy),

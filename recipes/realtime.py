@@ -18,7 +18,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
@@ -45,12 +45,12 @@ def main(config: DictConfig) -> None:
         check_method(name, planners)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     make_env = diffusion_env(task.name, policy, config.horizon)
-    first_observations = range(CALIBRATION_SEED, CALIBRATION_SEED + config.calibration_samples)
+    first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
     calibration = cache(partial(calibrate_policy, policy, make_env, first_observations))
     methods = make_methods(
         config.methods, policy, num_updates=config.num_updates, planners=planners, calibration=calibration
     )
-    seeds = evaluation_seeds(config.seed, config.episodes)
+    seeds = evaluation_seeds(config.split, config.seed, config.episodes)
     queries = record_queries(ChunkExecutor(policy), make_env, seeds[:1])
     latency = time_queries(methods, queries, repeats=config.latency_repeats, threads=config.threads)
 

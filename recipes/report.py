@@ -1,6 +1,11 @@
 """Make one HTML page on any set of results: tables with intervals, Pareto fronts, masks and videos, nothing to fetch.
 
-python recipes/report.py runs=outputs out=outputs/report.html
+    python recipes/report.py runs=outputs out=outputs/report.html
+
+Or make a `results.json` of schema 1 anew in schema 2, with times from the episodes beside it; or put several tasks together:
+
+    python recipes/report.py upgrade=[assets/can/results.json,assets/can/results_400.json]
+    python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results_400.json] out=outputs/aggregate.json
 """
 
 from __future__ import annotations
@@ -11,15 +16,38 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.html_report import write_report
+from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
+from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.tables import markdown_table
+from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 
 
 @recipe("report", out="file")
 def main(config: DictConfig) -> None:
-    faults = write_report(config.runs, config.out, title=config.title)
-    for fault in faults.values():
-        print(fault, file=sys.stderr)
-    print(f"{config.out}: {Path(config.out).stat().st_size / 1e6:.1f} MB")
+    if config.upgrade:
+        for path in map(Path, config.upgrade):
+            upgrade(path)
+    elif config.aggregate:
+        results = aggregate_results(config.aggregate)
+        save_aggregate(results, config.out)
+        print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
+    else:
+        faults = write_report(config.runs, config.out, title=config.title)
+        for fault in faults.values():
+            print(fault, file=sys.stderr)
+        print(f"{config.out}: {Path(config.out).stat().st_size / 1e6:.1f} MB")
+
+
+def upgrade(path: Path) -> None:
+    """Write schema 2 in the place of schema 1, and the curves of success that it makes possible beside it."""
+    results, lacking = upgrade_results(path)
+    save_results(results, path)
+    plot_success_within(results, path.parent / "figures" / f"success_within_{path.stem}.png")
+    for name, why in lacking.items():
+        print(f"{path}: {name}: no times, {why}")
+    print(f"{path}: times of {len(results.methods) - len(lacking)} of {len(results.methods)} methods")
 
 
 if __name__ == "__main__":

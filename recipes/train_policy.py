@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -108,7 +108,7 @@ def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | N
         "dense",
         ChunkExecutor(policy, trainer.config.n_action_steps),
         diffusion_env(config.task, policy),
-        range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.eval_episodes),
+        tuning_seeds(DEVELOPMENT_SEED, config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )

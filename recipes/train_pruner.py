@@ -1,10 +1,11 @@
-"""Train SAG's pruner, or L2C's static gates, for a trained policy.
+"""Train SAG's pruner, or static gates, for a trained policy.
 
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
-Stop it at any moment; the same command resumes it, equal to the last bit. ``out/pruner`` is for
-`SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the ablation; ``out/l2c.json`` is for
-`SchedulePlanner`; ``out/curves.png`` shows how it went.
+``method=l2c reuse=block`` learns with SAG's objective what needs no observation, and with ``objective=noise rate=0.45
+train.norm=l2 targets.source=data`` as Learning-to-Cache does. Stop it at any moment; the same command resumes it, equal
+to the last bit. ``out/pruner`` is for `SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the
+ablation; ``out/l2c.json`` and ``out/l2c_noise.json`` are for `SchedulePlanner`; ``out/curves.png`` shows how it went.
 """
 
 from __future__ import annotations
@@ -98,13 +99,13 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.control.queries import record_queries
     from torchrl_sparse.envs.for_policy import diffusion_env
-    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED
+    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
 
     schedules = initial_schedules(config)
     planner = SchedulePlanner.from_pretrained(schedules[0]) if schedules else None
     n_action_steps = published_shape(config.task).n_action_steps
     actor = ChunkExecutor(policy.with_plan(planner), n_action_steps=n_action_steps)
-    seeds = range(CLOSED_LOOP_SEED, CLOSED_LOOP_SEED + config.rollouts)
+    seeds = tuning_seeds(CLOSED_LOOP_SEED, config.rollouts)
     return record_queries(actor, diffusion_env(config.task, policy), seeds)
 
 

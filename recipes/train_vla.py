@@ -21,7 +21,7 @@ from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
@@ -103,7 +103,7 @@ def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None
         "dense",
         ChunkExecutor(policy, config.n_action_steps),
         instructed_env(config.task, policy.network.config, chosen_cameras(config.cameras)),
-        range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.eval_episodes),
+        tuning_seeds(DEVELOPMENT_SEED, config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,
     )

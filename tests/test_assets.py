@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_sparse.envs.seeds import EVALUATION_SEED
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
@@ -42,8 +41,7 @@ def test_tables_count_the_episodes(folder):
         results = load_results(path)
         for name in results.methods.keys() & logs.keys():
             success, paired = results.methods[name].success, results.methods[name].paired_vs_dense
-            first = EVALUATION_SEED + results.seed
-            seeds = range(first, first + success.n)
+            seeds = range(results.first_seed, results.first_seed + success.n)
             ours, dense = ([logs[method][seed] for seed in seeds] for method in (name, "dense"))
             assert success.k == sum(ours), (path, name)
             if name != "dense":

@@ -18,7 +18,7 @@ from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
-METHODS = ("dense", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
+METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,9 @@ def policy(work, demos):
 def schedules(work, policy):
     output = run("calibrate_bac", f"policy={policy}", f"out={work}/schedules", "num_updates=7")
     assert "bac.json: prune rate 0." in output
+    options = (f"policy={policy}", f"out={work}/schedules", "methods=[bac]")
+    output = run("calibrate_bac", *options, "num_updates=2", "sampler=ddpm4")
+    assert "bac_ddpm4.json: prune rate 0." in output
     return work / "schedules"
 
 
@@ -64,7 +67,7 @@ def test_a_policy_is_evaluated(work, policy):
     assert "demos: expected none for lift, which does not tell its ways" in refused
 
 
-def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
+def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedules):
     options = (
         f"policy={policy}",
         f"demos={demos}",
@@ -72,17 +75,24 @@ def test_timesteps_are_found_and_benchmarked_by_name(work, demos, policy):
         "strides=[20]",
         "targets.share=0.1",
     )
-    output = run("calibrate_timesteps", *options, f"out={work}/timesteps")
+    output = run("calibrate_timesteps", *options, "kind=ddpm", f"out={work}/timesteps")
     (path,) = (work / "timesteps").iterdir()
-    tried = json.loads(path.read_text())["tried"]
-    assert path.stem == "ddim_" + "_".join(map(str, tried[0]["timesteps"]))
+    found = json.loads(path.read_text())
+    assert path.stem == "ddpm_" + "_".join(map(str, found["tried"][0]["timesteps"]))
     assert f"{path.stem}, error" in output
-    assert [50, 0] in [entry["timesteps"] for entry in tried]
+    assert "logsnr: [91, 41], error" in output
+    assert [found["spacings"][name]["timesteps"] for name in ("leading", "logsnr")] == [[50, 0], [91, 41]]
+    # Chains that end at timestep 0: this policy has learned too little to end anywhere else.
+    methods = ["dense", "ddpm4", "ddim4_eta0.5", "uniform2_ddpm4", "bac_ddpm4"]
     run(
-        "benchmark", f"policy={policy}", f"methods=[dense,{path.stem}]", "episodes=1", "horizon=16", "latency_repeats=2",
-        "probe_episodes=1", f"out={work}/few",
+        "benchmark", f"policy={policy}", f"methods=[{','.join(methods)}]", "episodes=1", "horizon=16", "latency_repeats=2",
+        "probe_episodes=1", f"planners={schedules}", f"out={work}/few",
     )  # fmt: skip
-    assert load_results(work / "few" / "results.json").methods[path.stem].flops.ratio_to_dense == 0.02
+    made = load_results(work / "few" / "results.json").methods
+    assert list(made) == methods
+    assert made["ddpm4"].flops.ratio_to_dense == made["ddim4_eta0.5"].flops.ratio_to_dense == 0.04
+    assert 0.02 < made["bac_ddpm4"].flops.ratio_to_dense < 0.04
+    assert made["uniform2_ddpm4"].flops.ratio_to_dense == pytest.approx(0.03, abs=0.002)
 
 
 def test_training_exports_a_policy(policy):
@@ -93,6 +103,7 @@ def test_calibration_writes_a_schedule_per_method(schedules):
     assert sorted(file.name for file in schedules.iterdir()) == [
         "bac.json",
         "bac_blockwise.json",
+        "bac_ddpm4.json",
         "bac_unified.json",
     ]
 
@@ -210,6 +221,9 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
     for mask in taught:
         learned = pruner.masks(cond, prune_rate(mask).view(1, 1))[0]
         assert (learned == mask).float().mean() > 0.9
+    own = ("method=l2c", "reuse=block", "objective=noise", f"out={work}/own")
+    assert "step 2 of 2, finished" in run("train_pruner", *training, *own, "rate=0.3")
+    assert CacheSchedule.from_pretrained(work / "own" / "l2c_noise.json").method == "l2c_noise"
     plans = shutil.copytree(schedules, work / "plans")
     shutil.copytree(work / "sag" / "pruner", plans / "sag")
     for path in (work / "l2c" / "l2c.json", work / "sag" / "fixed.json"):
@@ -231,7 +245,10 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 
 def test_unknown_names_are_refused_before_any_work(work, policy):
     output = run("benchmark", f"policy={policy}", "methods=[dense,magic]", f"out={work}/none", expect=2)
-    assert "methods: expected dense, ddim10, ddim<N>, ddim_<t>_<t>..., uniform" in output
+    assert (
+        "methods: expected dense, dense_noise, ddim10, <sampler><steps>, <sampler>_<t>_<t>..., uniform"
+        in output
+    )
     assert "got 'magic'" in output
     assert not (work / "none").exists()
     assert "task: expected one of Lift" in run("benchmark", "task=juggle", f"policy={policy}", expect=2)

@@ -36,7 +36,7 @@ def test_any_two_independent_rows_become_a_rotation():
 
 @pytest.mark.parametrize("rot6d", [np.zeros(6), np.array([1.0, 0, 0, 2, 0, 0])])
 def test_rows_that_fix_no_rotation_are_refused(rot6d):
-    with pytest.raises(ValueError, match="parallel or zero"):
+    with pytest.raises(ValueError, match="parallel, zero or beyond"):
         rot6d_to_matrix(rot6d)
 
 

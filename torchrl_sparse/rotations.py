@@ -11,20 +11,22 @@ from scipy.spatial.transform import Rotation
 POSE_DIM = 7
 """Position (3), rotation vector (3) and gripper (1) of one arm, as robosuite's absolute controller takes them."""
 
+_MAX_ANGLE = 100
+
 ABSOLUTE_DIM = 10
 """Position (3), 6-D rotation (6) and gripper (1) of one arm, as the policy predicts them."""
 
 
 def matrix_to_rot6d(matrix: np.ndarray) -> np.ndarray:
-    """Return [..., 3, 3] rotation matrices to [..., 6] first two rows."""
+    """Convert [..., 3, 3] rotation matrices to [..., 6] first two rows."""
     return matrix[..., :2, :].reshape(*matrix.shape[:-2], 6)
 
 
 def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
-    """Return [..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
+    """Convert [..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
 
     Raises:
-        ValueError: if the last axis is not 6, or the two rows are parallel or zero.
+        ValueError: if the last axis is not 6, or the two rows are parallel, zero or beyond measure.
     """
     if rot6d.shape[-1] != 6:
         raise ValueError(f"rot6d: expected a last axis of 6, got shape {tuple(rot6d.shape)}")
@@ -35,17 +37,22 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
 
 
 def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
-    """Return [..., 3] rotation vectors (rad) to [..., 6].
+    """Convert [..., 3] rotation vectors (rad) to [..., 6].
+
+    Raises:
+        ValueError: if one is longer than a hundred radians: nobody turns that far, and of 1e30 no angle is left.
 
     >>> rotvec_to_rot6d(np.zeros(3))
     array([1., 0., 0., 0., 1., 0.])
     """
+    if rotvec.size and not (longest := np.abs(rotvec).max()) <= _MAX_ANGLE:
+        raise ValueError(f"rotation vector: expected at most {_MAX_ANGLE} rad, got {longest:g}")
     matrix = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
     return matrix_to_rot6d(matrix.reshape(*rotvec.shape[:-1], 3, 3))
 
 
 def quaternion_to_rot6d(quat: np.ndarray) -> np.ndarray:
-    """Return [..., 4] unit quaternions (xyzw) to [..., 6].
+    """Convert [..., 4] unit quaternions (xyzw) to [..., 6].
 
     >>> quaternion_to_rot6d(np.array([0.0, 0.0, 0.0, 1.0]))
     array([1., 0., 0., 0., 1., 0.])
@@ -55,20 +62,20 @@ def quaternion_to_rot6d(quat: np.ndarray) -> np.ndarray:
 
 
 def rot6d_to_rotvec(rot6d: np.ndarray) -> np.ndarray:
-    """Return [..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
+    """Convert [..., 6] to [..., 3] rotation vectors (rad); the inverse of `rotvec_to_rot6d` up to 2 pi."""
     matrix = rot6d_to_matrix(rot6d)
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(*rot6d.shape[:-1], 3)
 
 
 def pose_to_absolute(pose: np.ndarray) -> np.ndarray:
-    """Return [..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
+    """Convert [..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
     arms = _split_arms(pose, POSE_DIM)
     absolute = np.concatenate([arms[..., :3], rotvec_to_rot6d(arms[..., 3:6]), arms[..., 6:]], axis=-1)
     return absolute.reshape(*pose.shape[:-1], -1)
 
 
 def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
-    """Return [..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
+    """Convert [..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
     arms = _split_arms(absolute, ABSOLUTE_DIM)
     pose = np.concatenate([arms[..., :3], rot6d_to_rotvec(arms[..., 3:9]), arms[..., 9:]], axis=-1)
     return pose.reshape(*absolute.shape[:-1], -1)
@@ -91,6 +98,6 @@ def _split_arms(flat: np.ndarray, dim: int) -> np.ndarray:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(vector, axis=-1, keepdims=True)
-    if (norm < 1e-6).any():
-        raise ValueError("rot6d: its two rows are parallel or zero, so they fix no rotation")
+    if not ((norm >= 1e-6) & np.isfinite(norm)).all():
+        raise ValueError("rot6d: its two rows are parallel, zero or beyond measure, so they fix no rotation")
     return vector / norm

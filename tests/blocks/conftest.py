@@ -27,9 +27,9 @@ def network():
     return network.eval().requires_grad_(False)
 
 
-@pytest.fixture(params=["ddpm", "ddim"])
+@pytest.fixture(params=["ddpm", "ddim", "ddim_eta0.5", "unipc"])
 def sampler(request):
-    return Sampler(request.param, NUM_STEPS)
+    return Sampler.from_name(request.param, NUM_STEPS)
 
 
 @pytest.fixture

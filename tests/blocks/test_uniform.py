@@ -18,6 +18,13 @@ def test_number_of_computed_steps(interval, computed):
     assert (~uniform_mask(10, 3, interval)).all(dim=1).sum() == computed
 
 
+@pytest.mark.parametrize(("interval", "computed"), [(7, [0, 7, 9]), (3, [0, 3, 6, 9]), (99, [0, 9])])
+def test_the_last_step_may_be_computed_too(interval, computed):
+    mask = uniform_mask(10, 3, interval, last=True)
+    assert (~mask).all(dim=1).nonzero().flatten().tolist() == computed
+    assert (mask != uniform_mask(10, 3, interval)).any() == (interval != 3)
+
+
 def test_the_planner_writes_the_mask_for_every_observation():
     planner = Uniform(interval=3)
     planner.bind(PlanSpec(num_inference_steps=7, num_layers=2, policy="any"))

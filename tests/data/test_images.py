@@ -64,7 +64,7 @@ def replaced(value):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (None, "cannot be read"),
+        (None, r"expected a dataset 'obs/agentview_image', got \['actions'"),
         (np.zeros((3, 6, 8, 3), np.float32), r"expected uint8 \[3, h, w, 3\], got float32"),
         (np.zeros((2, 6, 8, 3), np.uint8), r"expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]"),
         (np.zeros((3, 6, 6, 3), np.uint8), r"expected images \[3, 6, 8\] as before, got \[3, 6, 6\]"),

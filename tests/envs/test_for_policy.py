@@ -5,12 +5,6 @@ import torch
 
 from torchrl_sparse import DiffusionPolicy, Normalizer, TransformerForDiffusion, VisionEncoder, keys
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import (
-    CALIBRATION_SEED,
-    CLOSED_LOOP_SEED,
-    DEVELOPMENT_SEED,
-    EVALUATION_SEED,
-)
 
 
 def seeing_policy(cameras):
@@ -43,8 +37,3 @@ def test_a_policy_that_does_not_name_its_cameras_is_refused():
     policy = seeing_policy(["image"])
     with pytest.raises(ValueError, match=r"policy.source\['cameras'\]: expected those of"):
         diffusion_env("lift", policy)
-
-
-def test_ranges_of_seeds_are_apart():
-    first = sorted([EVALUATION_SEED, DEVELOPMENT_SEED, CALIBRATION_SEED, CLOSED_LOOP_SEED])
-    assert all(later - earlier >= 100_000 for earlier, later in zip([0, *first], first, strict=False))

@@ -3,9 +3,10 @@
 import numpy as np
 
 from torchrl_sparse.evaluation.latency.measure import Machine, summarize_latency
-from torchrl_sparse.evaluation.results.report import MethodRun, build_results
-from torchrl_sparse.evaluation.results.schema import PolicyShape
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
+from torchrl_sparse.evaluation.results.parts import PolicyShape
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.statistics.sequential import Design
 
 # name: success rate, prune rate, FLOPs ratio, latency (s), mean action error, episode length
 METHODS = {
@@ -19,6 +20,7 @@ METHODS = {
 MACHINE = Machine("Imaginary CPU @ 2.5 GHz", 1, "cpu", "2.13.0", "2026-01-31T12:00:00+00:00")
 POLICY = PolicyShape(params=8967434, num_inference_steps=100, horizon=10, n_obs_steps=2, n_action_steps=8)
 DENSE_FLOPS = 15.74e9
+HORIZON = 400
 
 
 def make_runs(episodes=100, names=tuple(METHODS), seed=0):
@@ -31,7 +33,10 @@ def make_runs(episodes=100, names=tuple(METHODS), seed=0):
         runs[name] = MethodRun(
             [
                 EpisodeResult(
-                    index, bool(difficulty[index] < success), length, 5, 5 * ratio * DENSE_FLOPS, prune_rate
+                    index,
+                    bool(difficulty[index] < success),
+                    length + index % 7 if difficulty[index] < success else HORIZON,
+                    *(5, 5 * ratio * DENSE_FLOPS, prune_rate),
                 )
                 for index in range(episodes)
             ],
@@ -43,7 +48,9 @@ def make_runs(episodes=100, names=tuple(METHODS), seed=0):
 
 def make_results(episodes=100, **kwargs):
     """The content of a `results.json`."""
-    return build_results(make_runs(episodes, **kwargs), task="lift", seed=0, machine=MACHINE, policy=POLICY)
+    terms = Terms(Design(episodes), HORIZON, early_cut=44)
+    about = {"task": "lift", "split": "development", "seed": 0, "machine": MACHINE, "policy": POLICY}
+    return build_results(make_runs(episodes, **kwargs), terms=terms, **about)
 
 
 def make_similarity(layers=8, steps=100):

@@ -1,18 +1,28 @@
 """Methods by name: what is made of each, how rates are written, and what one from another package takes."""
 
+import re
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.fixtures.diffusion import SIZES
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
+from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
 from torchrl_sparse.blocks.planner import Dense, StaticPlanner
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
-from torchrl_sparse.blocks.schedule import CacheSchedule
+from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
-from torchrl_sparse.methods.diffusion import METHODS, Method, check_method, make_controller, make_method
+from torchrl_sparse.methods.diffusion import (
+    METHODS,
+    Method,
+    check_method,
+    make_controller,
+    make_method,
+    method_identity,
+)
 
 LAYERS = 2
 QUERY = TensorDict({"history": {"state": torch.zeros(1, 2, SIZES["cond_dim"])}}, [1])
@@ -76,19 +86,57 @@ def test_dense_shares_the_networks(policy, make):
     assert isinstance(dense.plan, Dense)
 
 
+def test_dense_with_other_noise_is_dense_but_for_its_noise(make):
+    query = (
+        QUERY.clone().set(keys.EPISODE_SEED, torch.tensor([[7]])).set(keys.EPISODE_STEP, torch.tensor([[8]]))
+    )
+    dense, other = make("dense"), make("dense_noise")
+    answers = [method(query.clone()) for method in (dense, other, other)]
+    assert answers[0][keys.SEED] != answers[1][keys.SEED]
+    assert (answers[0][keys.CHUNK] != answers[1][keys.CHUNK]).any()
+    assert (answers[1][keys.CHUNK] == answers[2][keys.CHUNK]).all()
+    assert (answers[0][keys.COND] == answers[1][keys.COND]).all()
+    identities = [method_identity("dense", method) for method in (dense, other)]
+    assert identities[1] == {**identities[0], "noise": 1}
+    assert other.with_plan(Dense()).noise_stream == 1
+
+
 @pytest.mark.parametrize(
     ("name", "timesteps"),
-    [("ddim10", list(range(90, -1, -10))), ("ddim4", [75, 50, 25, 0]), ("ddim_87_20", [87, 20])],
+    [
+        ("ddim10", list(range(90, -1, -10))),
+        ("ddim4", [75, 50, 25, 0]),
+        ("ddim_87_20", [87, 20]),
+        ("ddpm_82_14", [82, 14]),
+        ("ddpm2_logsnr", [91, 41]),
+        ("ddim4_trailing_eta0.5", [99, 74, 49, 24]),
+        ("unipc_90_50_3", [90, 50, 3]),
+    ],
 )
-def test_ddim_takes_its_timesteps_from_the_name(make, name, timesteps):
+def test_samplers_are_taken_from_the_name(make, name, timesteps):
     method = make(name)
-    assert method.sampler.kind == "ddim"
+    assert method.sampler.kind == re.match("ddim|ddpm|unipc", name)[0]
     assert method.sampler.timesteps.tolist() == timesteps
     assert isinstance(method.plan, Dense)
+    assert method(QUERY.clone())[keys.CHUNK].isfinite().all()
+    assert make_controller(name) is None
 
 
 @pytest.mark.parametrize(
-    "name", ["ddim0", "ddim_", "ddpm", "Dense", "bac@0.5-", "dense@1", "uniform@0.5@0.5", ""]
+    "name",
+    [
+        "ddim0",
+        "ddim_",
+        "ddpm",
+        "ddim10_eta",
+        "Dense",
+        "bac@0.5-",
+        "dense@1",
+        "uniform@0.5@0.5",
+        "uniform0",
+        "uniform7_",
+        "",
+    ],
 )
 def test_other_names_are_refused(make, name):
     with pytest.raises(ValueError, match="methods: expected"):
@@ -99,6 +147,18 @@ def test_uniform_computes_each_block_as_often_as_asked(make):
     planner = make("uniform").plan
     assert isinstance(planner, Uniform)
     assert (~planner.mask(planner.spec)).sum(dim=0).tolist() == [5] * 3 * LAYERS
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "computed"),
+    [("uniform7", "ddpm", [0, 7, 14, 19]), ("uniform2_ddim4", "ddim", [0, 2, 3]), ("uniform2_ddpm_82_40_14", "ddpm", [0, 2])],
+)  # fmt: skip
+def test_uniform_with_an_interval_also_computes_the_last_step(make, name, kind, computed):
+    method = make(name)
+    mask = method(QUERY.clone())[keys.PRUNE_MASK][0]
+    assert method.sampler.kind == kind
+    assert (~mask).all(dim=1).nonzero().flatten().tolist() == computed
+    assert mask.any(dim=1).sum() == len(mask) - len(computed)
 
 
 def test_bac_is_read_where_it_fits_and_computed_where_not(policy, make, tmp_path):
@@ -113,6 +173,21 @@ def test_bac_is_read_where_it_fits_and_computed_where_not(policy, make, tmp_path
             "bac", policy, num_updates=6, planners=tmp_path, calibration=lambda: asked.append("asked")
         )
     assert asked == ["asked"]
+
+
+@pytest.mark.parametrize("chain", ["ddim10", "ddpm_82_40_14", "sde2m6_logsnr"])
+def test_bac_of_another_sampler_is_a_saved_planner(policy, make, tmp_path, chain):
+    """What `calibrate_bac sampler=CHAIN` writes."""
+    sampler = Sampler.from_name(chain)
+    noise = torch.randn(1, sampler.num_inference_steps, SIZES["horizon"], 10)
+    calibration = calibrate(policy.network, sampler, noise, torch.zeros(1, 2, SIZES["cond_dim"]))
+    schedule = bac_schedule(calibration, 2, policy=policy.fingerprint)
+    schedule.save_pretrained(tmp_path / f"bac_{chain}.json")
+    method = make(f"bac_{chain}")
+    assert method.sampler.config == sampler.config
+    assert torch.equal(method(QUERY.clone())[keys.PRUNE_MASK][0], schedule.mask())
+    with pytest.raises(ValueError, match=f"made for .*{sampler.name}|made for num_inference_steps"):
+        policy.with_plan(SchedulePlanner(schedule))
 
 
 def test_a_saved_planner_brings_its_sampler(policy, make, tmp_path):

@@ -16,20 +16,17 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.engine_report import format_engine_table, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import format_realtime, load_realtime
-from torchrl_sparse.evaluation.results.report import (
-    MethodRun,
-    build_results,
-    format_pairs,
-    format_table,
-)
+from torchrl_sparse.evaluation.results.report import format_pairs, format_table
 from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
+from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import make_controller, make_method
 from torchrl_sparse.methods.vla import TokenMethodName, make_controller as make_token_controller, make_pruner
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -169,5 +166,6 @@ def results_of(episodes: dict[str, list[EpisodeResult]], like: Results) -> Resul
     """The content of a ``results.json`` about them, as if every query took a second; the rest is that of ``like``."""
     second = summarize_latency([1.0])
     runs = {name: MethodRun(of_method, second, (0.0, 0.0)) for name, of_method in episodes.items()}
-    about = {name: getattr(like, name) for name in ("task", "seed", "machine", "policy")}
-    return build_results(runs, **about)
+    about = {name: getattr(like, name) for name in ("task", "split", "seed", "machine", "policy")}
+    terms = Terms(Design(len(episodes["dense"])), like.episode_horizon, like.early_cut)
+    return build_results(runs, terms=terms, **about)

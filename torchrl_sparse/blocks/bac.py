@@ -263,5 +263,11 @@ def _schedule(
     num_blocks, num_steps = calibration.similarity.shape[:2]
     settings = {**settings, "num_calibration_samples": calibration.num_samples}
     return CacheSchedule(
-        method, policy, num_steps, num_blocks // len(BLOCK_TYPES), tuple(steps), settings=settings
+        method,
+        policy,
+        num_steps,
+        num_blocks // len(BLOCK_TYPES),
+        tuple(steps),
+        calibration.sampler,
+        settings=settings,
     )

@@ -58,11 +58,13 @@ class Calibration:
         similarity: f64 [3L, K, K], see :func:`feature_similarity`.
         errors: f64 [3L], see :func:`block_error`.
         num_samples: queries that were averaged.
+        sampler: name of the sampler that denoised them; the schedules made from this are for it.
     """
 
     similarity: Tensor
     errors: Tensor
     num_samples: int
+    sampler: str = "ddpm"
 
 
 @torch.no_grad()
@@ -103,4 +105,4 @@ def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor,
         blocks = recorder.features()
         similarity = similarity + torch.stack([feature_similarity(block) for block in blocks])
         errors = errors + torch.stack([block_error(block) for block in blocks])
-    return Calibration(similarity / len(cond), errors / len(cond), num_samples=len(cond))
+    return Calibration(similarity / len(cond), errors / len(cond), len(cond), sampler.name)

@@ -43,7 +43,10 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
-from torchrl_sparse.networks.diffusion.sampler import split_sampler
+from torchrl_sparse.networks.diffusion.naming import SamplerName
+from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
+from torchrl_sparse.networks.diffusion.transformer import MAX_LAYERS
+from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import read_json
 
@@ -121,10 +124,9 @@ class CacheSchedule:
         for name in ("method", "policy"):
             if not getattr(self, name):
                 raise ValueError(f"{name}: expected a non-empty string, got {getattr(self, name)!r}")
-        for name in ("num_inference_steps", "num_layers"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)!r}")
-        split_sampler(self.sampler)
+        check_size("num_inference_steps", self.num_inference_steps, MAX_TRAIN_TIMESTEPS)
+        check_size("num_layers", self.num_layers, MAX_LAYERS)
+        SamplerName.parse(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:

@@ -23,7 +23,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from torchrl_sparse.data.hdf5_reader import demo_names, naming, open_demos, read_array
+from torchrl_sparse.data.hdf5_reader import (
+    ArrayReader,
+    demo_group,
+    demo_names,
+    naming,
+    open_demo,
+    open_demos,
+)
 from torchrl_sparse.data.hdf5_writer import copy_attributes, lay_out
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
@@ -75,7 +82,7 @@ def convert_demos(path: str | Path, out: str | Path) -> int:
         parts = claim_parts(out, settings)
         missing = [name for name in names if not _part(parts, name).exists()]
         if missing:
-            _make_parts(path, source["data"], missing, control, parts)
+            _make_parts(path, demo_group(path, source), missing, control, parts)
         _merge(path, source, out, names, parts, settings | {"env_args": _env_args(control)})
     shutil.rmtree(parts)
     return len(names)
@@ -194,12 +201,12 @@ def _make_parts(
         absolute = AbsoluteActions(control)
     for name in tqdm(names, unit="demo"):
         where = f"{path}, {name}"
-        with naming(where):
-            length = int(data[name].attrs["num_samples"])
-        states, actions = (read_array(where, data[name], key, length) for key in ("states", "actions"))
+        demo, length = open_demo(where, data, name)
+        reader = ArrayReader(data.file)  # one demonstration is in memory at a time
+        states, actions = (reader.numbers(where, demo, key, length) for key in ("states", "actions"))
         with _saying(where):
             arrays = absolute.convert(states, actions)
-        _check_hands(where, data[name], arrays, length)
+        _check_hands(where, demo, arrays, length)
         with atomic_path(_part(parts, name)) as temporary, h5py.File(temporary, "w") as file:
             for key, value in arrays.items():
                 file[key] = value
@@ -218,7 +225,9 @@ def _check_hands(where: str, demo: h5py.Group, arrays: Mapping[str, np.ndarray],
     """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
     for key, value in arrays.items():
         if key.endswith("eef_pos") and key in demo:
-            far = np.linalg.norm(read_array(where, demo, key, length) - value, axis=1).max()
+            far = np.linalg.norm(
+                ArrayReader(demo.file).numbers(where, demo, key, length) - value, axis=1
+            ).max()
             if far > _TOLERANCE:
                 raise ValueError(
                     f"{where}, {key}: expected the hand where the states put it, got {far:.4f} m off"
@@ -228,7 +237,7 @@ def _check_hands(where: str, demo: h5py.Group, arrays: Mapping[str, np.ndarray],
 def _merge(
     path: Path, source: h5py.File, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]
 ) -> None:
-    total = sum(int(source["data"][name].attrs["num_samples"]) for name in names)
+    total = sum(open_demo(f"{path}, {name}", source["data"], name)[1] for name in names)
     with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
         data = lay_out(file, names, attributes | {"total": total})
         if "mask" in source:

@@ -11,7 +11,8 @@ import torch
 from tensordict import MemoryMappedTensor
 from torch import Tensor
 
-from torchrl_sparse.data.hdf5_reader import naming
+from torchrl_sparse.data.hdf5_bounds import IMAGES
+from torchrl_sparse.data.hdf5_reader import ArrayReader
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["chosen_cameras", "read_images"]
@@ -60,23 +61,13 @@ def _episodes(
 ) -> Iterator[np.ndarray]:
     """Return u8 [T, 3, h, w] of each demonstration, all of one height and width."""
     frame: tuple[int, ...] | None = None
+    reader = ArrayReader(data.file, IMAGES)
     for name, length in lengths.items():
         where = f"{path}, {name}, obs/{key}"
-        episode = _read_episode(where, data[name], key, length)
+        episode = reader.images(where, data[name], f"obs/{key}", length).transpose(0, 3, 1, 2)
         frame = frame or episode.shape[1:]
         if episode.shape[1:] != frame:
             raise ValueError(
                 f"{where}: expected images {list(frame)} as before, got {list(episode.shape[1:])}"
             )
-        yield episode
-
-
-def _read_episode(where: str, demo: h5py.Group, key: str, length: int) -> np.ndarray:
-    """Return u8 [T, 3, h, w]."""
-    with naming(where):
-        images = np.asarray(demo[f"obs/{key}"])
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[-1] != 3 or len(images) != length:
-        raise ValueError(
-            f"{where}: expected uint8 [{length}, h, w, 3], got {images.dtype} {list(images.shape)}"
-        )
-    return np.ascontiguousarray(images.transpose(0, 3, 1, 2))
+        yield np.ascontiguousarray(episode)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any
 
 import h5py
 
+from torchrl_sparse.data.hdf5_bounds import text_attribute
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.storage.json import parse_json
 
@@ -19,14 +21,14 @@ def read_instruction(demo: h5py.Group) -> str | None:
     Raises:
         ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
     """
-    text = demo.attrs.get("ep_meta", "{}")
+    text = text_attribute(demo.name, demo, "ep_meta") or "{}"
     try:
         words = parse_json(text, dict[str, Any], "ep_meta").get("lang")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {text!r}") from error
+    except ValueError as error:
+        raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {reprlib.repr(text)}") from error
     if words is None or isinstance(words, str):
         return words
-    raise ValueError(f"{demo.name}, ep_meta: expected a text as 'lang', got {words!r}")
+    raise ValueError(f"{demo.name}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
 
 
 def read_instructions(path: str | Path) -> list[str]:

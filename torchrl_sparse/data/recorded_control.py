@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from torchrl_sparse.data.hdf5_bounds import text_attribute
 from torchrl_sparse.rotations import POSE_DIM
 from torchrl_sparse.storage.json import parse_json
 
@@ -54,7 +56,7 @@ def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
     Raises:
         ValueError: naming the file, if ``env_args`` are damaged or describe anything but one OSC_POSE controller.
     """
-    text = file["data"].attrs.get("env_args")
+    text = text_attribute(str(path), file["data"], "env_args")
     if text is None:
         return None
     try:
@@ -64,9 +66,10 @@ def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:
         arm, is_old = _arm_settings(config)
         robots = (robots,) if isinstance(robots, str) else tuple(robots)
         return RecordedControl(str(env_args["env_name"]), robots, arm, keeps_orientation=is_old)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path}, env_args: expected robomimic's description of a robosuite task under OSC_POSE, got {text!r} ({error})"
+            f"{path}, env_args: expected robomimic's description of a robosuite task under OSC_POSE, "
+            f"got {reprlib.repr(text)} ({error})"
         ) from error
 
 

@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.data.hdf5_reader import demo_names, naming, open_demos, read_array
+from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
 from torchrl_sparse.data.images import read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
@@ -137,13 +137,14 @@ def read_demos(
         with suppress(ValueError):
             control = read_control(path, file)
         convert = partial(_absolute_poses, control=control) if poses else _as_they_are
+        data, reader = demo_group(path, file), ArrayReader(file)
         episodes = [
-            _read_episode(f"{path}, {name}", file["data"], name, state_keys, convert) for name in names
+            _read_episode(f"{path}, {name}", reader, data, name, state_keys, convert) for name in names
         ]
         lengths = [len(action) for _, action in episodes]
         steps = dict(zip(names, lengths, strict=True))
         images = {
-            ("observation", name): read_images(path, file["data"], steps, key, image_folder)
+            ("observation", name): read_images(path, data, steps, key, image_folder)
             for name, key in (cameras or {}).items()
         }
     widths = sorted({(state.shape[1], action.shape[1]) for state, action in episodes})
@@ -156,17 +157,16 @@ def read_demos(
 
 def _read_episode(
     where: str,
+    reader: ArrayReader,
     data: h5py.Group,
     name: str,
     state_keys: Sequence[str],
     convert: Callable[[str, np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32."""
-    with naming(where):
-        demo = data[name]
-        length = int(demo.attrs["num_samples"])
-    action = convert(f"{where}, actions", read_array(where, demo, "actions", length))
-    state = [read_array(where, demo, f"obs/{key}", length) for key in state_keys]
+    demo, length = open_demo(where, data, name)
+    action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
+    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in state_keys]
     return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32)
 
 
@@ -178,7 +178,10 @@ def _absolute_poses(where: str, pose: np.ndarray, control: RecordedControl | Non
         raise ValueError(
             f"{where}: expected absolute poses, got deltas; recipes/convert_robomimic.py converts them"
         )
-    return pose_to_absolute(pose)
+    try:
+        return pose_to_absolute(pose)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def _as_they_are(where: str, action: np.ndarray) -> np.ndarray:

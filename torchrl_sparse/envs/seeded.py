@@ -25,7 +25,8 @@ class SeededEnv(EnvBase):
     (`_observe_state`) and whether the task is done (`_is_solved`).
 
     Attributes:
-        action_mode: what an action is, in a word: "absolute" or "delta".
+        action_mode: what an action is, in a word: "absolute" or "delta". A delta beyond the bounds of the action's spec counts
+            as the bound.
 
     Args:
         horizon: steps until truncation.
@@ -141,6 +142,9 @@ class SeededEnv(EnvBase):
         action = action.detach().cpu().numpy().astype(np.float64)
         if not np.isfinite(action).all():
             raise ValueError(f"action: expected finite numbers, got {action.tolist()}")
+        if self.action_mode == "delta":
+            bounds = self.action_spec.space
+            action = action.clip(bounds.low.cpu().numpy(), bounds.high.cpu().numpy())
         return action
 
     def _observe(self) -> TensorDict:

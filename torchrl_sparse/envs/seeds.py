@@ -1,19 +1,77 @@
-"""Ranges of seeds by the purpose of their episodes: nothing is tested on what it was trained or tuned on.
+"""Which episodes are for what, by their seeds: nothing is tested on what it was trained or tuned on.
 
-Demonstrations begin at seed 0. Ranges are far longer than anybody's number of episodes.
+Demonstrations begin at seed 0. Whatever is tuned (calibrations, sweeps, searches, evaluations during training, benchmarks while
+a method is being made) looks at development seeds; a table is made on test seeds, once. Until November 2026 evaluations during
+training and sweeps began at 200 000, so benchmarks begin beyond what those saw. Schedules and pruners that were calibrated on
+the seeds of that time, from 1 000 000 and 2 000 000 on, are not remade: no table reaches those either.
 """
 
-EVALUATION_SEED = 100_000  # of benchmarks, and of nothing else: Diffusion Policy's test_start_seed
-DEVELOPMENT_SEED = 200_000  # of evaluations during training, and of sweeps
-CALIBRATION_SEED = 1_000_000  # of the observations that cache schedules are computed from
-CLOSED_LOOP_SEED = 2_000_000  # of the episodes that a pruner is trained on
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+__all__ = [
+    "CALIBRATION_SEED",
+    "CLOSED_LOOP_SEED",
+    "DEVELOPMENT_SEED",
+    "FIRST_TEST_SEED",
+    "Split",
+    "evaluation_seeds",
+    "tuning_seeds",
+]
+
+Split = Literal["test", "development"]
+
+FIRST_TEST_SEED = 200_000
+_SPLITS: dict[str, range] = {
+    "development": range(100_000, FIRST_TEST_SEED),
+    "test": range(210_000, 1_000_000),
+}
+
+# All within the development range, and as far apart as anybody's number of episodes.
+DEVELOPMENT_SEED = 150_000  # of evaluations during training, and of sweeps
+CLOSED_LOOP_SEED = 160_000  # of the episodes that a pruner is trained on
+CALIBRATION_SEED = 180_000  # of the observations that cache schedules are computed from
 
 
-def evaluation_seeds(offset: int, episodes: int) -> range:
+def evaluation_seeds(split: str, offset: int, episodes: int) -> range:
     """Return the seeds of a benchmark's episodes; a second benchmark with another ``offset`` may extend the first.
 
-    >>> evaluation_seeds(200, 3)
-    range(100200, 100203)
+    Args:
+        split: "test" or "development".
+        offset: of the first episode in the split's range.
+        episodes: how many.
+
+    Raises:
+        ValueError: for another split, or seeds that would leave its range.
+
+    >>> evaluation_seeds("development", 200, 3), evaluation_seeds("test", 0, 2)
+    (range(100200, 100203), range(210000, 210002))
     """
-    first = EVALUATION_SEED + offset
+    if split not in get_args(Split):
+        raise ValueError(f"split: expected {' or '.join(get_args(Split))}, got {split!r}")
+    of_split = _SPLITS[split]
+    if offset < 0 or offset + episodes > len(of_split):
+        raise ValueError(
+            f"seed: expected {episodes} episodes from 0 to {len(of_split)} of the {split} seeds, got {offset}"
+        )
+    return of_split[offset : offset + episodes]
+
+
+def tuning_seeds(first: int, episodes: int) -> range:
+    """Return the seeds of episodes that something is tuned on.
+
+    Args:
+        first: seed.
+        episodes: how many.
+
+    Raises:
+        ValueError: if one of them is for tests.
+
+    >>> tuning_seeds(CALIBRATION_SEED, 2)
+    range(180000, 180002)
+    """
+    if first + episodes > FIRST_TEST_SEED:
+        last = first + episodes - 1
+        raise ValueError(f"seed: expected seeds below {FIRST_TEST_SEED} for tuning, got the test seed {last}")
     return range(first, first + episodes)

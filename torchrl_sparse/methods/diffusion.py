@@ -2,8 +2,15 @@
 
 A method is written ``NAME``, ``NAME@RATE`` (every query is asked for that prune rate) or ``NAME@COARSE-FINE`` (a
 controller asks for the first rate in coarse motion and for the second in fine motion). NAME is a key of
-:data:`METHODS`, or matches the pattern of one (``ddim10``, ``ddim_87_20``), or names a planner that is saved in the
-folder at hand, as ``NAME.json`` or ``NAME/``.
+:data:`METHODS`, or matches the pattern of one, or names a planner that is saved in the folder at hand, as ``NAME.json`` or
+``NAME/``; saved planners bring the sampler that they were made for.
+
+==================== ===========================================================================================
+``ddpm_82_14``       a sampler with its steps, as :mod:`torchrl_sparse.networks.diffusion.naming` says, nothing pruned
+``uniform``          every block each ``-(-K // M)``-th step, as released
+``uniform7``         every block each 7th step and in the last
+``uniform2_ddpm10``  the same of another sampler
+==================== ===========================================================================================
 
 A method of one's own is one line, executed before its name is used::
 
@@ -28,6 +35,7 @@ from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.keys import PRUNE_RATE
+from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
@@ -61,7 +69,7 @@ class MethodName:
         >>> MethodName.parse("sag_rates@0.95-0.7")
         MethodName(name='sag_rates', rates=(0.95, 0.7))
         """
-        match = re.fullmatch(r"(\w+)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
         if match is None:
             raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
         name, *rates = match.groups()
@@ -107,30 +115,36 @@ class Method:
         controller: returns what a `ChunkExecutor` runs at every step beside the policy, given the rates that were
             written, or None.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
+        noise: stream of the noise that it draws; 0 is what all methods share, so that they can be paired.
     """
 
     make: Callable[[MethodInputs], tuple[Planner, Sampler]]
     pattern: str | None = None
     controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
     color: str | None = None
+    noise: int = 0
 
 
 def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     return Dense(), inputs.sampler
 
 
-def _ddim(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """Take diffusers' timesteps, as many as the name ends with."""
-    return Dense(), Sampler("ddim", int(inputs.name.removeprefix("ddim")), inputs.sampler.num_train_timesteps)
-
-
-def _ddim_at_timesteps(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    """Take the timesteps of the name."""
+def _sampler(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """Take the sampler of the name."""
     return Dense(), Sampler.from_name(inputs.name, num_train_timesteps=inputs.sampler.num_train_timesteps)
 
 
 def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     return Uniform(interval=-(-inputs.spec.num_inference_steps // inputs.num_updates)), inputs.sampler
+
+
+def _uniform_and_last(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    """Take interval and, where it is written, sampler of the name."""
+    interval, _, chain = inputs.name.removeprefix("uniform").partition("_")
+    sampler = inputs.sampler
+    if chain:
+        sampler = Sampler.from_name(chain, num_train_timesteps=sampler.num_train_timesteps)
+    return Uniform(int(interval), last=True), sampler
 
 
 def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -154,10 +168,13 @@ def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
 METHODS: dict[str, Method] = {
     "dense": Method(_dense, color="#333333"),
-    "ddim10": Method(_ddim, color="#E69F00"),
-    "ddim<N>": Method(_ddim, pattern=r"ddim[1-9]\d*"),
-    "ddim_<t>_<t>...": Method(_ddim_at_timesteps, pattern=r"ddim(_\d+)+"),
+    "dense_noise": Method(_dense, color="#9A9AA0", noise=1),
+    "ddim10": Method(_sampler, color="#E69F00"),
+    "<sampler><steps>, <sampler>_<t>_<t>...": Method(_sampler, pattern=CHAIN_PATTERN),
     "uniform": Method(_uniform, color="#56B4E9"),
+    "uniform<interval>[_<sampler>]": Method(
+        _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"
+    ),
     "bac": Method(_bac, color="#0072B2"),
     "bac_blockwise": Method(_bac, color="#D55E00"),
     "bac_unified": Method(_bac, color="#CC79A7"),
@@ -204,7 +221,8 @@ def make_method(
     planner, sampler = method.make(inputs)
     if written.rates:
         _ask_for(planner, written)
-    return policy.with_plan(planner, sampler)
+    made = policy.with_plan(planner, sampler)
+    return made.with_noise(method.noise) if method.noise else made
 
 
 def make_controller(text: str) -> TensorDictModuleBase | None:
@@ -220,12 +238,14 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         text: the method.
         policy: as :func:`make_method` returned it.
     """
+    other_noise = {"noise": policy.noise_stream} if policy.noise_stream else {}
     return {
         "method": text,
         "policy": policy.fingerprint,
         "engine": policy.engine,
         "sampler": policy.sampler.config,
         "planner": policy.plan.fingerprint,
+        **other_noise,
     }
 
 

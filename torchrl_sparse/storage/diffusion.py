@@ -13,10 +13,12 @@ Network weights are fp16 unless full precision is asked for, normalisation const
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -24,7 +26,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_tensors, read_tensors, take, write_tensors
+from torchrl_sparse.storage.tensors import read_tensors, take, write_tensors
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
@@ -85,37 +87,43 @@ def read_pretrained(path: Path) -> StoredPolicy:
         ValueError: naming the file, what was expected and what came.
     """
     config = read_json(path / "config.json", _Config)
-    tensors = read_tensors(path / "model.safetensors")
-    network = _make(path, TransformerForDiffusion, config, "network")
-    sampler = _make(path, Sampler, config, "schedule")
-    vision = None if config.vision is None else _make(path, VisionEncoder, config, "vision")
+    sampler = _make(path / "config.json", "schedule", Sampler, config.schedule)
+    with torch.device("meta"):  # the configuration is compared with the weights before memory is taken for it
+        expected = _state(_modules(path / "config.json", config))
+    tensors = read_tensors(path / "model.safetensors", expected)
+    modules = _modules(path / "config.json", config)
+    for prefix, module in modules.items():
+        module.load_state_dict({name: value.float() for name, value in take(tensors, prefix).items()})
+        module.eval()
+    normalizer = _make(path / "model.safetensors", "normalizer", Normalizer, take(tensors, _NORMALIZER))
+    return StoredPolicy(modules[_NETWORK], normalizer, sampler, modules.get(_VISION), config.source or {})
+
+
+def _modules(file: Path, config: _Config) -> dict[str, nn.Module]:
+    """Make the untrained networks that a configuration describes, by the prefix of their weights."""
+    modules = {_NETWORK: _make(file, "network", TransformerForDiffusion, config.network)}
+    if config.vision is not None:
+        modules[_VISION] = _make(file, "vision", VisionEncoder, config.vision)
+    return modules
+
+
+def _state(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
+    """Return all tensors that a file must hold for ``modules``; only their shapes count."""
+    network, vision = modules[_NETWORK], modules.get(_VISION)
     state_dim = network.cond_dim - (0 if vision is None else vision.feature_dim)
-    where = path / "model.safetensors"
-    _load(where, _NETWORK, tensors, network)
-    if vision is not None:
-        _load(where, _VISION, tensors, vision)
-    normalizer_tensors = take(tensors, _NORMALIZER)
-    expected = {
-        f"{name}_{part}": (size,)
-        for name, size in (("state", state_dim), ("action", network.input_dim))
+    sizes = {"state": max(state_dim, 0), "action": network.input_dim}
+    tensors = {
+        f"{_NORMALIZER}{name}_{part}": torch.empty(size)
+        for name, size in sizes.items()
         for part in ("scale", "offset")
     }
-    check_tensors(f"{where}: {_NORMALIZER}", normalizer_tensors, expected)
-    if tensors:
-        raise ValueError(f"{where}: expected tensors of the policy alone, got {sorted(tensors)}")
-    return StoredPolicy(network, Normalizer(**normalizer_tensors), sampler, vision, config.source or {})
+    for prefix, module in modules.items():
+        tensors |= {prefix + name: value for name, value in module.state_dict().items()}
+    return tensors
 
 
-def _load(where: Path, prefix: str, tensors: dict[str, Tensor], module: nn.Module) -> None:
-    """Move the tensors under ``prefix`` into ``module`` and puts it in evaluation mode."""
-    found = take(tensors, prefix)
-    check_tensors(f"{where}: {prefix}", found, {k: tuple(v.shape) for k, v in module.state_dict().items()})
-    module.load_state_dict({name: value.float() for name, value in found.items()})
-    module.eval()
-
-
-def _make(path: Path, kind: type[T], config: _Config, field: str) -> T:
+def _make(file: Path, field: str, kind: Callable[..., T], arguments: dict[str, Any]) -> T:
     try:
-        return kind(**getattr(config, field))
+        return kind(**arguments)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path / 'config.json'}: {field}: {error}") from error
+        raise ValueError(f"{file}: {field}: {error}") from error

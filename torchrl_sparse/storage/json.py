@@ -22,7 +22,9 @@ from torchrl_sparse.storage.atomic import atomic_path
 __all__ = ["check_plain", "describe_differences", "parse_json", "read_json", "to_plain", "write_json"]
 
 T = TypeVar("T")
-MAX_BYTES = 64 << 20  # the largest file of ours, the words of a Llama tokenizer, has a few million
+# The largest file of ours, the words of a Llama tokenizer, has a few million bytes and sixty thousand lists.
+MAX_BYTES, MAX_PARTS = 64 << 20, 1 << 18
+_NAMED = 12  # differing keys that are named
 
 
 def read_json(path: str | os.PathLike, kind: type[T]) -> T:
@@ -32,7 +34,7 @@ def read_json(path: str | os.PathLike, kind: type[T]) -> T:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep.
+        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep or of too many parts.
 
     Examples:
         >>> import tempfile
@@ -73,6 +75,9 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
 
     data = text.encode() if isinstance(text, str) else text
     _check_size(len(data), where)
+    parts = data.count(b"[") + data.count(b"{")
+    if parts > MAX_PARTS:  # of an empty list, two bytes, Python makes sixty
+        raise ValueError(f"{where}: expected at most {MAX_PARTS} lists and objects, got {parts}")
     try:
         from_json(data, allow_inf_nan=False)  # also where a field may hold anything
     except ValueError as error:
@@ -129,10 +134,10 @@ def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> 
     nothing = object()
 
     def say(values: Mapping[str, Any], key: str) -> str:
-        return repr(values[key]) if key in values else "missing"
+        return _short(values[key]) if key in values else "missing"
 
     keys = [key for key in {**found, **asked} if found.get(key, nothing) != asked.get(key, nothing)]
-    return ", ".join(f"{key} is {say(asked, key)} here and {say(found, key)} there" for key in keys)
+    return ", ".join(f"{key} is {say(asked, key)} here and {say(found, key)} there" for key in keys[:_NAMED])
 
 
 def to_plain(value: Any) -> Any:
@@ -166,12 +171,16 @@ def _check_size(size: int, where: str) -> None:
         raise ValueError(f"{where}: expected at most {MAX_BYTES} bytes of JSON, got {size}")
 
 
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 def _fault(error: Mapping[str, Any]) -> str:
     """Say what pydantic found in this package's words."""
     key = ".".join(str(part) for part in error["loc"][1:])
     place = f"{key}: " if key else ""
-    got = repr(error["input"])
-    got = got if len(got) <= 80 else f"{got[:77]}..."
+    got = _short(error["input"])
     if error["type"] == "missing":
         return f"{place}expected this key, got nothing"
     if error["type"] == "unexpected_keyword_argument":

@@ -11,10 +11,12 @@ Network weights are fp16, normalisation constants as they are.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from torchrl_sparse.networks.vla.config import VLAConfig
@@ -22,7 +24,7 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, take, write_tensors
+from torchrl_sparse.storage.tensors import read_tensors, take, write_tensors
 
 __all__ = ["StoredVLA", "read_vla", "write_vla"]
 
@@ -55,8 +57,8 @@ class StoredVLA:
 
 def write_vla(path: Path, policy: StoredVLA) -> None:
     """Write both files into the folder ``path``, each in one piece or not at all."""
-    tensors = {_NETWORK + name: value.half() for name, value in policy.network.state_dict().items()}
-    tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
+    weights = {name: value.half() for name, value in policy.network.state_dict().items()}
+    tensors = _prefixed(_NETWORK, weights) | _prefixed(_NORMALIZER, policy.normalizer.state_dict())
     write_tensors(path / "model.safetensors", tensors)
     config = _Config(
         "torchrl_sparse.vla_policy/1", policy.network.config.to_dict(), policy.tokenizer.to_config()
@@ -83,19 +85,17 @@ def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
     _check_architecture(where, expected, config)
-    network, where = VLANetwork(config), path / "model.safetensors"
-    tensors = read_tensors(where)
-    weights, constants = take(tensors, _NETWORK), take(tensors, _NORMALIZER)
-    if tensors:
-        raise ValueError(
-            f"{where}: expected tensors under {_NETWORK!r} and {_NORMALIZER!r}, got {sorted(tensors)}"
-        )
+    with torch.device("meta"):  # the configuration is compared with the weights before memory is taken for it
+        state = _prefixed(_NETWORK, VLANetwork(config).state_dict())
     identity = QuantileNormalizer.identity(config.state_dim, config.action_dim)
-    for prefix, found, module in ((_NETWORK, weights, network), (_NORMALIZER, constants, identity)):
-        check_shapes(f"{where}: {prefix}", found, _shapes(module.state_dict()))
-        check_finite(f"{where}: {prefix}", found)
-    network.load_state_dict({name: value.float() for name, value in weights.items()})
-    return StoredVLA(network.eval(), QuantileNormalizer(**constants), tokenizer)
+    tensors = read_tensors(path / "model.safetensors", state | _prefixed(_NORMALIZER, identity.state_dict()))
+    network = VLANetwork(config)
+    network.load_state_dict({name: value.float() for name, value in take(tensors, _NETWORK).items()})
+    try:
+        normalizer = QuantileNormalizer(**take(tensors, _NORMALIZER))
+    except ValueError as error:
+        raise ValueError(f"{path / 'model.safetensors'}: normalizer: {error}") from error
+    return StoredVLA(network.eval(), normalizer, tokenizer)
 
 
 def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig) -> None:
@@ -106,5 +106,5 @@ def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig
     raise ValueError(f"{path}: {'; '.join(parts)}")
 
 
-def _shapes(tensors: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(value.shape) for name, value in tensors.items()}
+def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + name: value for name, value in tensors.items()}

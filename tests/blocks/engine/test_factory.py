@@ -81,8 +81,9 @@ class TestEagerBaseline:
         return torch.stack([initial, *steps], dim=1)
 
     @pytest.mark.parametrize("pruned", [False, True])
-    def test_equals_the_reference_on_the_noise_that_diffusers_draws(self, network, sampler, query, pruned):
-        noise, cond = self.noise(7), query[1][:1]
+    @pytest.mark.parametrize("name", ["ddpm", "ddpm_trailing", "ddim", "ddim_eta0.5", "ddim_trailing"])
+    def test_equals_the_reference_on_the_noise_that_diffusers_draws(self, network, name, query, pruned):
+        sampler, noise, cond = Sampler.from_name(name, NUM_STEPS), self.noise(7), query[1][:1]
         mask = random_mask(1) if pruned else None
         expected = denoise(network, sampler, noise, cond, mask)
         eager = EagerBaseline(network, sampler)
@@ -91,5 +92,10 @@ class TestEagerBaseline:
         torch.testing.assert_close(actions, expected, atol=1e-4, rtol=0)
 
     def test_timesteps_that_diffusers_does_not_have_are_refused(self, network):
-        with pytest.raises(ValueError, match="diffusers has no sampler 'ddim_90_50'"):
-            EagerBaseline(network, Sampler("ddim", timesteps=[90, 50]))
+        for sampler in (
+            Sampler("ddim", timesteps=[90, 50]),
+            Sampler("ddim", 3, spacing="trailing"),
+            Sampler("unipc", 5),
+        ):
+            with pytest.raises(ValueError, match=f"diffusers has no sampler {sampler.name!r}"):
+                EagerBaseline(network, sampler)

@@ -10,10 +10,12 @@ NUM_BLOCKS = 3 * NUM_LAYERS
 
 
 def dense_loop(network, sampler, noise, cond):
-    sample = noise[:, 0]
+    sample, cleans = noise[:, 0], ()
     for k, timestep in enumerate(sampler.timesteps.tolist()):
         noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
-        sample = sampler.step(network(sample, timestep, cond), k, sample, noise_k)
+        eps, before = network(sample, timestep, cond), sample
+        sample = sampler.step(eps, k, before, noise_k, cleans)
+        cleans = sampler.remember(cleans, eps, k, before)
     return sample
 
 

@@ -56,7 +56,7 @@ def test_the_gradient_is_that_of_the_mixture(network, sampler, double_query, reu
 
 def mixed_chain(network, sampler, noise, cond, gate, reuse):
     slots = {"block": NUM_BLOCKS, "type": 3}[reuse]
-    latest, sample = [None] * slots, noise[:, 0]
+    latest, sample, cleans = [None] * slots, noise[:, 0], ()
     for k, timestep in enumerate(sampler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(NUM_BLOCKS):
@@ -65,7 +65,9 @@ def mixed_chain(network, sampler, noise, cond, gate, reuse):
             latest[slot] = fresh if k == 0 else pruned * latest[slot] + (1 - pruned) * fresh
             x = x + latest[slot]
         noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
-        sample = sampler.step(network.head_out(x), k, sample, noise_k)
+        eps, before = network.head_out(x), sample
+        sample = sampler.step(eps, k, before, noise_k, cleans)
+        cleans = sampler.remember(cleans, eps, k, before)
     return sample
 
 

@@ -3,15 +3,10 @@ from dataclasses import replace
 
 import pytest
 
-from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results, make_runs
+from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
-from torchrl_sparse.evaluation.results.report import (
-    MethodRun,
-    build_results,
-    format_pairs,
-    format_table,
-)
-from torchrl_sparse.evaluation.results.schema import (
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
+from torchrl_sparse.evaluation.results.parts import (
     ActionError,
     Difference,
     Flops,
@@ -19,17 +14,23 @@ from torchrl_sparse.evaluation.results.schema import (
     Success,
     TokensKept,
 )
+from torchrl_sparse.evaluation.results.report import format_pairs, format_table, results_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
+from torchrl_sparse.evaluation.statistics.sequential import Design
+
+ABOUT = {"task": "lift", "split": "test", "seed": 3, "machine": MACHINE, "policy": POLICY}
 
 
-def build(runs, **kwargs):
-    return build_results(runs, task="lift", seed=3, machine=MACHINE, policy=POLICY, **kwargs)
+def build(runs, design=None, **kwargs):
+    design = Design(len(next(iter(runs.values())).episodes)) if design is None else design
+    return build_results(runs, terms=Terms(design, 60, early_cut=30, **kwargs), **ABOUT)
 
 
 def run(outcomes, *, queries=2, flops=10.0, latency=1.0, first_seed=0):
     episodes = [
-        EpisodeResult(first_seed + i, bool(outcome), 30, queries, queries * flops, 0.25)
+        EpisodeResult(first_seed + i, bool(outcome), 30 if outcome else 60, queries, queries * flops, 0.25)
         for i, outcome in enumerate(outcomes)
     ]
     return MethodRun(episodes, summarize_latency([latency] * 5), (0.1, 0.4))
@@ -46,8 +47,12 @@ def test_build_computes_what_the_schema_promises():
     assert entry.latency_s == Percentiles(0.25, 0.25, 5)
     assert entry.speedup_vs_dense == 4.0
     assert entry.action_error_vs_dense == ActionError(0.1, 0.4)
-    assert entry.episode_length == 30
-    assert (results.schema, results.seed) == (1, 3)
+    assert entry.episode_length == entry.restricted_mean_time == 45
+    assert entry.time_vs_dense.ratio == 45 / 37.5
+    assert entry.success_within["30"] == 0.5
+    assert max(share for steps, share in entry.success_within.items() if int(steps) < 30) == 0
+    assert entry.speedup_ci95 == (4.0, 4.0)
+    assert (results.schema, results.split, results.seed, results.first_seed) == (2, "test", 3, 210_003)
 
 
 def test_visual_tokens_are_reported_where_there_are_any():
@@ -146,6 +151,39 @@ def test_table_says_when_episodes_cannot_suffice():
 
 
 def test_table_covers_the_methods_that_ran():
-    text = format_table(build(make_runs(30, names=("dense", "ddim10"))))
+    text = format_table(make_results(30, names=("dense", "ddim10")))
     assert "ddim10" in text
     assert "bac" not in text
+
+
+def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_look():
+    design = Design(40, looks=2)
+    dense, slow = run([1, 1, 1, 0] * 10), run([1, 0, 1, 0] * 5)
+    results = build({"dense": dense, "slow": slow}, design)
+    entry, level = results.methods["slow"], design.confidence(20)
+    assert level > 0.95
+    assert (entry.success.n, results.dense.success.n) == (20, 40)
+    assert entry.paired_vs_dense.ci95 == tango_interval(0, 5, 20, level)
+    ours, theirs = [30, 60, 30, 60] * 5, [30, 30, 30, 60] * 5
+    assert entry.time_vs_dense.ci95 == time_ratio(ours, theirs, 60, confidence=level).ci
+    assert "looked at 2 times up to 40" in format_table(results)
+
+
+def test_worse_is_said_whatever_the_margin():
+    dense, worse = run([1] * 400), run([0] * 8 + [1] * 392)
+    rows = results_rows(build({"dense": dense, "worse": worse}))
+    assert rows[1]["verdict"] == "non-inferior, worse"
+    assert rows[0]["verdict"] == "baseline"
+
+
+def test_a_verdict_that_many_comparisons_explain_is_marked():
+    dense = run([1, 0] * 200)
+    close = run([1, 0] * 191 + [0, 0] * 9)
+    many = {"dense": dense, "close": close} | {
+        f"other{index}": run([1, 0, 0, 1] * 100) for index in range(30)
+    }
+    alone = results_rows(build({"dense": dense, "close": close}))[1]
+    among = results_rows(build(many))[1]
+    assert alone["verdict"].startswith("non-inferior")
+    assert among["verdict"] == alone["verdict"].replace("non-inferior", "non-inferior†", 1)
+    assert "62 comparisons with dense" in format_table(build(many))

@@ -5,12 +5,15 @@ import json
 import math
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from tests.evaluation.synthetic import make_results
-from torchrl_sparse.evaluation.results.schema import Results, load_results, save_results
+from torchrl_sparse.evaluation.results.schema import Results, Results1, Stopping, load_results, save_results
 from torchrl_sparse.storage.json import parse_json, to_plain
+
+ASSETS = Path(__file__).parents[3] / "assets"
 
 
 def read(content):
@@ -34,7 +37,7 @@ def test_failed_save_keeps_the_old_file(tmp_path):
 
 
 FAULTS = {
-    "schema": (("schema",), 2, "schema: expected 1, got 2"),
+    "schema": (("schema",), 1, "schema: expected 2, got 1"),
     "boolean integer": (("seed",), True, "seed: expected a valid integer, got True"),
     "float integer": (("machine", "threads"), 1.0, "machine.threads: expected a valid integer, got 1.0"),
     "number for text": (("task",), 7, "task: expected a valid string, got 7"),
@@ -61,6 +64,24 @@ FAULTS = {
         ("methods", "bac", "tokens"),
         {"kept_mean": 1.0, "kept_fine": "many", "kept_coarse": None},
         "methods.bac.tokens.kept_fine: expected a valid number, got 'many'",
+    ),
+    "split": (("split",), "train", "split: expected 'test' or 'development', got 'train'"),
+    "horizon": (("episode_horizon",), 4.5, "episode_horizon: expected a valid integer, got 4.5"),
+    "time ratio": (
+        ("methods", "bac", "time_vs_dense", "ratio"),
+        0,
+        "methods.bac.time_vs_dense.ratio: expected a number above 0",
+    ),
+    "share": (
+        ("methods", "bac", "success_within"),
+        {"44": 1.2},
+        "methods.bac.success_within: expected steps and",
+    ),
+    "p-value": (("methods", "bac", "p_values", "time"), 0.7, "methods.bac.p_values.time: expected 0 to 0.5"),
+    "half of the times": (
+        ("methods", "bac", "time_vs_dense"),
+        None,
+        "methods.bac.restricted_mean_time: expected all of restricted_mean_time, .* or none, got 'some'",
     ),
     "planning": (
         ("methods", "bac", "planning_s"),
@@ -106,11 +127,38 @@ def test_all_methods_have_as_many_episodes():
         replace(results, methods={**results.methods, "bac": fewer.methods["bac"]})
 
 
+def test_methods_may_stop_early_where_the_file_says_so():
+    results, fewer = make_results(20), make_results(10)
+    stopped = {**results.methods, "bac": fewer.methods["bac"]}
+    early = replace(results, methods=stopped, until_decided=Stopping(20, 2))
+    assert early.methods["bac"].success.n == 10
+    more = {"dense": fewer.dense, "bac": results.methods["bac"]}
+    with pytest.raises(ValueError, match=r"methods.bac.success.n: expected at most 10, as dense, got 20"):
+        replace(early, methods=more)
+
+
+def test_version_1_can_be_read_and_is_no_version_2():
+    path = ASSETS / "vla" / "results.json"
+    results = load_results(path)
+    assert isinstance(results, Results1)
+    assert results.first_seed == 100_000
+    with pytest.raises(ValueError, match="schema: expected 2, got 1"):
+        read(json.loads(path.read_text()))
+
+
+def test_version_1_holds_nothing_of_version_2(tmp_path):
+    content = json.loads((ASSETS / "vla" / "results.json").read_text())
+    content["methods"]["dense"]["restricted_mean_time"] = 100.0
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"methods.dense.restricted_mean_time: expected no such key"):
+        load_results(tmp_path / "results.json")
+
+
 def test_load_names_the_file(tmp_path):
     path = tmp_path / "results.json"
-    path.write_text('{"schema": 1')
+    path.write_text('{"schema": 2')
     with pytest.raises(ValueError, match=r"results.json: expected a complete JSON file"):
         load_results(path)
     path.write_text(json.dumps({"schema": 9}))
-    with pytest.raises(ValueError, match=r"results.json: schema: expected 1, got 9"):
+    with pytest.raises(ValueError, match=r"results.json: schema: expected 1 or 2, got 9"):
         load_results(path)

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from tests.evaluation.synthetic import make_results
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, EVALUATION_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, evaluation_seeds
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
@@ -40,8 +40,8 @@ def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials(path, tmp_pat
         assert command[:2] == ["/usr/bin/env", "python"]
         assert (path.parents[2] / command[2]).is_file()
         assert not any(word.startswith("${") for word in command)
-        first = EVALUATION_SEED + int(next(word for word in command if word.startswith("seed="))[5:])
-        assert first == DEVELOPMENT_SEED
+        options = dict(word.split("=", 1) for word in command if "=" in word)
+        assert evaluation_seeds(options["split"], int(options["seed"]), 1)[0] == DEVELOPMENT_SEED
         seen.add(tuple(command))
         finish(sweep, trial)
     assert len(seen) == len(sweep.trials) == 8
@@ -74,6 +74,20 @@ def test_another_sweep_in_the_folder_is_refused(tmp_path):
 def test_what_wandb_would_refuse_is_named(tmp_path):
     (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, "method": "guess"}))
     with pytest.raises(ValueError, match=r"bad.yaml: expected a wandb sweep, got .*guess"):
+        read_sweep(tmp_path / "bad.yaml")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"command": ["${program}", "split=test"]},
+        {"parameters": {"split": {"values": ["development", "test"]}}},
+        {"parameters": {"split": {"value": "test"}}},
+    ],
+)
+def test_a_sweep_on_test_seeds_is_refused(tmp_path, change):
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, **change}))
+    with pytest.raises(ValueError, match=r"bad.yaml: split: expected development, got test"):
         read_sweep(tmp_path / "bad.yaml")
 
 

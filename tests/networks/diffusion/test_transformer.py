@@ -150,8 +150,8 @@ def test_only_linear_and_attention_weights_decay(make_network):
     ("changes", "message"),
     [
         ({"n_emb": 10, "n_head": 4}, "n_emb=10, n_head=4"),
-        ({"horizon": 0}, "horizon must be at least 1, got 0"),
-        ({"n_cond_layers": -1}, "n_cond_layers must be >= 0, got -1"),
+        ({"horizon": 0}, "horizon: expected a whole number from 1 to 4096, got 0"),
+        ({"n_cond_layers": -1}, "n_cond_layers: expected a whole number from 0 to 256, got -1"),
         ({"n_emb": 2, "n_head": 1}, "at least 4, got 2"),
     ],
 )

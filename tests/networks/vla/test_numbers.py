@@ -81,7 +81,7 @@ def test_the_crop_is_central_and_linear():
         ({"image_size": 30}, "multiple of patch_size=14"),
         ({"cameras": ()}, "one or two keys"),
         ({"crop_area": 0.0}, "crop_area"),
-        ({"chunk_size": 0}, "chunk_size: expected a positive"),
+        ({"chunk_size": 0}, "chunk_size: expected a whole number"),
         ({"dino": TransformerSize(16, 1, 2, 32)}, "at least 2 layers"),
         ({"dino": TransformerSize(16, 2, 2, 40)}, "multiple of dino.dim=16"),
     ],

@@ -75,6 +75,21 @@ def test_a_tokenizer_file_is_data(definition, tmp_path):
     assert tokenizer.vocab_size == 29872
 
 
+def test_padding_and_cuts_that_a_file_asks_for_are_not_made(definition):
+    fields = json.loads(definition)
+    padding = {"strategy": {"Fixed": 10**12}, "direction": "Right", "pad_to_multiple_of": None}
+    fields["padding"] = padding | {"pad_id": 0, "pad_type_id": 0, "pad_token": "<unk>"}
+    fields["truncation"] = {"max_length": 1, "strategy": "LongestFirst", "stride": 0, "direction": "Right"}
+    expected = LlamaTokenizer(definition).encode(["lift the cube"])
+    assert torch.equal(LlamaTokenizer(json.dumps(fields)).encode(["lift the cube"]).ids, expected.ids)
+
+
+def test_the_highest_id_of_a_vocabulary_counts(definition):
+    fields = json.loads(definition)
+    fields["model"]["vocab"]["cube"] = 99_999
+    assert LlamaTokenizer(json.dumps(fields)).vocab_size == 100_000
+
+
 @pytest.mark.parametrize("make", [lambda _: WordTokenizer(["lift"]), LlamaTokenizer])
 def test_config_round_trip(make, definition):
     tokenizer = make(definition)
@@ -82,9 +97,13 @@ def test_config_round_trip(make, definition):
     assert torch.equal(again.encode(["lift it"]).ids, tokenizer.encode(["lift it"]).ids)
 
 
-def test_damaged_files_are_named(tmp_path):
+def test_damaged_files_are_named(definition, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"tokenizer.json"):
         LlamaTokenizer.from_file(tmp_path / "tokenizer.json")
     (tmp_path / "tokenizer.json").write_text("{}")
     with pytest.raises(ValueError, match=r"tokenizer.json: expected the text of a tokenizer.json"):
+        LlamaTokenizer.from_file(tmp_path / "tokenizer.json")
+    charsmap = {"normalizer": {"type": "Precompiled", "precompiled_charsmap": ""}}
+    (tmp_path / "tokenizer.json").write_text(json.dumps(json.loads(definition) | charsmap))
+    with pytest.raises(ValueError, match=r"tokenizer.json: expected the text .*Precompiled"):
         LlamaTokenizer.from_file(tmp_path / "tokenizer.json")

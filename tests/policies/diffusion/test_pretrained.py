@@ -41,15 +41,15 @@ def change_config(folder, change):
 
 
 TENSOR_FAULTS = {
-    "missing": (lambda t: t.pop("network.head.bias"), r"missing \['head.bias'\]"),
-    "extra": (lambda t: t.update({"network.more": torch.zeros(1)}), r"unexpected \['more'\]"),
-    "foreign": (lambda t: t.update({"optimizer": torch.zeros(1)}), r"got \['optimizer'\]"),
+    "missing": (lambda t: t.pop("network.head.bias"), r"missing \['network.head.bias'\]"),
+    "extra": (lambda t: t.update({"network.more": torch.zeros(1)}), r"unexpected \['network.more'\]"),
+    "foreign": (lambda t: t.update({"optimizer": torch.zeros(1)}), r"unexpected \['optimizer'\]"),
     "shape": (
         lambda t: t.update({"network.head.bias": torch.zeros(9)}),
         r"expected shape \(4,\), got \(9,\)",
     ),
     "nan": (lambda t: t.update({"network.head.bias": torch.full((4,), float("nan"))}), "finite"),
-    "normalizer": (lambda t: t.pop("normalizer.state_scale"), r"missing \['state_scale'\]"),
+    "normalizer": (lambda t: t.pop("normalizer.state_scale"), r"missing \['normalizer.state_scale'\]"),
 }
 
 

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse import DiffusionPolicy, Uniform, keys
 from torchrl_sparse.blocks.engine import native_available
-from torchrl_sparse.storage.published.diffusion_policy import CheckpointError
+from torchrl_sparse.storage.published.faults import CheckpointError
 
 from .checkpoints import put_config, write_checkpoint
 from .image_checkpoints import TRANSPORT, ImagePolicy, image_config
@@ -113,6 +113,12 @@ def weight(name, value):
     return lambda payload: payload["state_dicts"]["ema_model"].update({name: value})
 
 
+def endless_keypoints(payload):
+    """A grid of 300,000 x 300,000 places, told by its edges."""
+    for axis in ("pos_x", "pos_y"):
+        weight(f"{CAMERA}nets.1.{axis}", torch.linspace(-1, 1, 300_000)[None])(payload)
+
+
 CAMERA = "obs_encoder.obs_nets.agentview_image."
 FAULTS = {
     "random crops in use": (put_config("policy.eval_fixed_crop", False), "eval_fixed_crop: expected true"),
@@ -139,6 +145,11 @@ FAULTS = {
         "expected temperature 1",
     ),
     "another grid": (weight(f"{CAMERA}nets.1.pos_x", torch.zeros(1, 9)), "expected a regular grid"),
+    "a grid far larger than the file": (endless_keypoints, "expected a regular grid .*, got .* in 300000"),
+    "a state far larger than the file": (
+        put_config("task.shape_meta.obs.robot0_eef_pos.shape", [10**12]),
+        "shape_meta has 1000000000134 features, the tensors say",
+    ),
     "another normalisation": (
         weight("normalizer.params_dict.agentview_image.scale", torch.tensor([1.0])),
         "agentview_image: expected scale 2, offset -1, got 1.0",

@@ -8,6 +8,8 @@ from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.timesteps import demonstration_error, search_timesteps
 
 
@@ -43,16 +45,20 @@ def test_a_start_that_does_not_fall_is_refused(start):
         search_timesteps(lambda timesteps: 0.0, start)
 
 
-def test_the_error_is_that_of_the_executed_actions_of_the_chain(policy):
+@pytest.mark.parametrize("name", ["ddim_70_20", "ddpm_70_20", "unipc3_logsnr"])
+def test_the_error_is_that_of_the_executed_actions_of_the_chain(make_network, name):
+    ones, zeros = (fill(5) for fill in (torch.ones, torch.zeros))
+    policy = DiffusionPolicy(make_network(), Normalizer(ones, zeros, torch.ones(10), torch.zeros(10)))
     targets = TensorDict(
         {
             keys.COND: torch.randn(20, 2, 5),
             keys.SEED: torch.arange(20)[:, None],
-            "target": torch.randn(20, 6, 4),
+            "target": torch.randn(20, 6, 10),
         },
         [20],
     )
-    error = demonstration_error(policy, targets, [70, 20], n_action_steps=3)
-    policy.sampler = Sampler("ddim", timesteps=[70, 20])
+    sampler = Sampler.from_name(name)
+    error = demonstration_error(policy, targets, sampler, n_action_steps=3)
+    policy.sampler = sampler
     actions = policy.denoise(policy.sample_noise(torch.arange(20)), targets[keys.COND])
     assert error == pytest.approx((actions - targets["target"])[:, 1:4].abs().mean().item(), rel=1e-5)

@@ -9,7 +9,7 @@ import torch
 from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS
 from tests.training.pruner.conftest import NUM_BLOCKS, sag_gates
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.l2c import StaticGates
+from torchrl_sparse.blocks.l2c import StaticGates, noise_errors
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.fit import fit_to_masks
 from torchrl_sparse.training.pruner.loss import sparsity_loss
@@ -71,10 +71,39 @@ def test_training_reaches_the_rate_and_beats_random_masks_of_it(policy, targets,
     assert learned["error"] < statistics.median(errors)
 
 
+def test_the_objective_of_learning_to_cache_learns_where_a_step_after_a_dense_one_errs_least(policy, targets):
+    gates = StaticGates(NUM_STEPS, NUM_BLOCKS)
+    options = {"objective": "noise", "reuse": "block", "norm": "l2", "rate": 0.25}
+    trainer = trainer_of(policy, targets, gates, max_updates=300, epochs=200, lr=0.1, **options)
+    while trainer.step < trainer.total:
+        trainer.train_step()
+    learned = trainer.fixed_mask()
+    assert not learned[::2].any()
+    assert learned.float().mean() == pytest.approx(0.25, abs=0.06)
+
+    def error(mask):
+        torch.manual_seed(0)
+        clean, cond = trainer.held_out["target"], trainer.held_out[keys.COND]
+        noise = torch.randn(len(clean), 2, *clean.shape[1:])
+        gates = mask.float().expand(len(clean), -1, -1)
+        query = policy.network, policy.sampler, clean, noise, cond
+        steps = range(1, NUM_STEPS, 2)
+        return sum(noise_errors(*query, gates[:, step], step).square().mean() for step in steps).item()
+
+    errors = []
+    for seed in range(10):
+        cells = torch.randperm(NUM_BLOCKS * NUM_STEPS // 2, generator=torch.Generator().manual_seed(seed))
+        mask = torch.zeros(NUM_STEPS, NUM_BLOCKS, dtype=torch.bool)
+        mask[1::2] = (cells < learned.sum()).view(-1, NUM_BLOCKS)
+        errors.append(error(mask))
+    assert error(learned) < min(errors)
+
+
 @pytest.mark.parametrize(
     "options",
     [
         {},
+        {"objective": "noise", "reuse": "block", "rate": 0.4},
         {"estimator": "gumbel", "explore": 0.5},
         {"gradient": "step", "norm": "l2"},
         {"sparsity": "block", "checkpointed": True},
@@ -128,6 +157,8 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"objective": "steps"}, r"objective: expected one of \['actions', 'noise'\], got 'steps'"),
+        ({"objective": "noise"}, "reuse: expected 'block' with objective 'noise', got 'type'"),
         ({"rate": 1.0}, r"rate: expected a prune rate in \(0, 1\), got 1.0"),
         ({"rate_range": (0.7, 0.9)}, "rate_range: expected 0 < low <= rate=0.6"),
         (
@@ -154,6 +185,8 @@ def test_gates_and_configuration_have_to_agree(policy, targets):
         ValueError, match=f"rate: expected at most {1 - 1 / NUM_STEPS:g}, since the first step"
     ):
         trainer_of(policy, targets, rate=0.99)
+    with pytest.raises(ValueError, match=r"rate: expected at most 0\.5, since every other step is kept"):
+        trainer_of(policy, targets, objective="noise", reuse="block", rate=0.6)
 
 
 def test_the_fixed_mask_of_static_gates_is_their_own(policy, targets):

@@ -8,6 +8,7 @@ it.
 from __future__ import annotations
 
 import torch
+from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -27,6 +28,22 @@ def published_forward(
     return network.head_out(x)
 
 
+def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
+    """Make diffusers' own, or raise ValueError if it would step elsewhere."""
+    options = {"num_train_timesteps": sampler.num_train_timesteps, "beta_schedule": "squaredcos_cap_v2"}
+    if sampler.kind == "ddpm":
+        scheduler = DDPMScheduler(variance_type="fixed_small", **options)
+        scheduler.set_timesteps(timesteps=sampler.timesteps.tolist())
+        return scheduler
+    gap = sampler.num_train_timesteps // sampler.num_inference_steps
+    steps = zip(sampler.timesteps.tolist(), sampler.previous_timesteps, strict=True)
+    if sampler.kind != "ddim" or any(max(timestep - gap, -1) != after for timestep, after in steps):
+        raise ValueError(f"eager baseline: diffusers has no sampler {sampler.name!r} that clips and steps so")
+    scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **options)
+    scheduler.set_timesteps(sampler.num_inference_steps)
+    return scheduler
+
+
 class EagerBaseline:
     """Denoises with the modules and the sampler of the published implementation.
 
@@ -36,7 +53,8 @@ class EagerBaseline:
         compiled: put :func:`published_forward` through ``torch.compile``.
 
     Raises:
-        ValueError: for chosen timesteps, which diffusers' DDIM does not have.
+        ValueError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down
+            by T // K.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -50,12 +68,8 @@ class EagerBaseline:
     """
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler, *, compiled: bool = False) -> None:
-        if "timesteps" in sampler.config:
-            raise ValueError(
-                f"eager baseline: diffusers has no sampler {sampler.name!r}, only evenly spaced timesteps"
-            )
-        self._network, self._scheduler = network, sampler.scheduler
-        self._timesteps = sampler.timesteps
+        self._network, self._scheduler = network, _diffusers_scheduler(sampler)
+        self._timesteps, self._eta = sampler.timesteps, sampler.eta
         self._forward = torch.compile(published_forward) if compiled else published_forward
 
     @torch.no_grad()
@@ -77,7 +91,9 @@ class EagerBaseline:
                 published. None runs the decoder.
             generator: of the noise that the sampler adds.
         """
-        extra = {} if self._is_ddim() else {"generator": generator}
+        extra = {"generator": generator}
+        if isinstance(self._scheduler, DDIMScheduler):
+            extra["eta"] = self._eta
         computed = None if mask is None else (~mask).tolist()
         latest: list[Tensor | None] = [None] * self._network.num_blocks
         for step, timestep in enumerate(self._timesteps):
@@ -87,9 +103,6 @@ class EagerBaseline:
                 eps = self._skipping_forward(sample, timestep, cond, computed[step], latest)
             sample = self._scheduler.step(eps, timestep, sample, **extra).prev_sample
         return sample
-
-    def _is_ddim(self) -> bool:
-        return type(self._scheduler).__name__ == "DDIMScheduler"
 
     def _skipping_forward(self, sample, timestep, cond, computed: list[bool], latest: list) -> Tensor:
         network = self._network

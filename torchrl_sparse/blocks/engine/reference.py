@@ -66,7 +66,7 @@ def denoise(
         network: the denoiser; gradients flow through it, and to ``noise`` and ``cond``.
         sampler: the denoising steps, K of them.
         noise: f32 [B, K, H, A], standard normal; ``noise[:, 0]`` is the initial sample, ``noise[:, k]`` the
-            gaussian of the transition from step k-1 to step k (not read by DDIM).
+            gaussian of the transition from step k-1 to step k (not read by deterministic samplers).
         cond: encoded observations f32 [B, To, D].
         mask: bool [B, K, 3L], True = pruned, row 0 all False; rows of the batch may differ. None prunes
             nothing.
@@ -97,7 +97,7 @@ def denoise(
     check_query(network, sampler, noise, cond, mask, reuse)
     computed = ComputedRows(mask)
     latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks)
-    sample = noise[:, 0]
+    sample, cleans = noise[:, 0], ()
     for step, timestep in enumerate(sampler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(network.num_blocks):
@@ -108,7 +108,9 @@ def denoise(
             if record is not None:
                 record(step, block, output)
         noise_k = noise[:, step + 1] if step + 1 < sampler.num_inference_steps else None
-        sample = sampler.step(network.head_out(x), step, sample, noise_k)
+        eps, before = network.head_out(x), sample
+        sample = sampler.step(eps, step, before, noise_k, cleans)
+        cleans = sampler.remember(cleans, eps, step, before)
     return sample
 
 

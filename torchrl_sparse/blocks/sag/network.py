@@ -7,6 +7,7 @@ compiled code of :mod:`torchrl_sparse.blocks.engine.native.pruner` where that ca
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,9 +17,15 @@ from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner, PrunerWeights
+from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
 from torchrl_sparse.networks.diffusion.transformer import SinusoidalPosEmb
+from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["PrunerNetwork"]
+
+# Bounds, far beyond any use, on what a file can ask for before its weights are seen: each cell of a mask takes 2 * width
+# numbers that no file holds.
+_MAX_CELLS, _MAX_TOKEN, _MAX_WIDTH, _MAX_LAYERS = 1 << 16, 512, 1 << 16, 64
 
 
 class PrunerNetwork(nn.Module):
@@ -36,6 +43,9 @@ class PrunerNetwork(nn.Module):
         hidden: of the MLP.
         n_layer, n_head: of the transformer encoder over the coordinates.
         rate_input: whether the target prune rate is an input.
+
+    Raises:
+        ValueError: if a size is no positive number or far too large, or ``width`` no multiple of ``n_head``.
 
     Examples:
         >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))
@@ -60,7 +70,7 @@ class PrunerNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input = rate_input
+        self.rate_input = bool(rate_input)
         self.config: dict[str, Any] = {
             "timesteps": self.timesteps,
             "num_blocks": num_blocks,
@@ -70,8 +80,9 @@ class PrunerNetwork(nn.Module):
             "hidden": hidden,
             "n_layer": n_layer,
             "n_head": n_head,
-            "rate_input": rate_input,
+            "rate_input": self.rate_input,
         }
+        _check(**self.config)
         self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
         self.token = nn.Linear(2 * width, width)
         layer = nn.TransformerEncoderLayer(
@@ -197,3 +208,18 @@ class PrunerNetwork(nn.Module):
 
 def _is_f32_on_cpu(tensor: Tensor) -> bool:
     return tensor.is_cpu and tensor.dtype == torch.float32
+
+
+def _check(timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool, **sizes: int) -> None:
+    if len(cond_shape) != 2:
+        raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
+    if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
+        raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
+    check_size("timesteps", len(timesteps), _MAX_CELLS)
+    check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
+    check_size("width", sizes["width"], _MAX_TOKEN)
+    check_size("n_layer", sizes["n_layer"], _MAX_LAYERS)
+    for name, size in (*sizes.items(), *(("cond_shape", size) for size in cond_shape)):
+        check_size(name, size, _MAX_WIDTH)
+    if sizes["width"] % sizes["n_head"]:
+        raise ValueError(f"width: expected a multiple of n_head={sizes['n_head']}, got {sizes['width']}")

@@ -33,7 +33,7 @@ from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.keys import COND, PRUNE_RATE
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, write_tensors
+from torchrl_sparse.storage.tensors import read_tensors, write_tensors
 
 __all__ = ["PrunerInfo", "SAGPruner", "check_rates", "rate_threshold"]
 
@@ -219,13 +219,12 @@ class SAGPruner(Planner):
         config = read_json(path / "config.json", _Config)
         info = PrunerInfo(**{field.name: getattr(config, field.name) for field in fields(PrunerInfo)})
         try:
-            network = PrunerNetwork(**config.network)
+            with torch.device("meta"):  # compared with the weights before memory is taken for it
+                expected = PrunerNetwork(**config.network).state_dict()
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path / 'config.json'}: network: {error}") from error
-        where, expected = path / "pruner.safetensors", network.state_dict()
-        tensors = read_tensors(where)
-        check_shapes(str(where), tensors, {name: tuple(value.shape) for name, value in expected.items()})
-        check_finite(str(where), tensors)
+        tensors = read_tensors(path / "pruner.safetensors", expected)
+        network = PrunerNetwork(**config.network)
         network.load_state_dict(tensors)
         return cls(network, info)
 

@@ -85,7 +85,7 @@ def denoise_relaxed(
         ValueError: as ``denoise`` does.
     """
     options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
-    *_, (_, actions) = _chain(network, sampler, noise, cond, gate, **options)
+    *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, **options)
     return actions
 
 
@@ -113,12 +113,12 @@ def step_errors(
     options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
     chain = _chain(network, sampler, noise, cond, gate, **options, cut=True)
     errors = []
-    for k, (before, after) in enumerate(chain):
+    for k, (before, cleans, after) in enumerate(chain):
         if k == 0:  # dense by definition
             continue
         with torch.no_grad():
             eps = network(before, int(sampler.timesteps[k]), cond)
-            dense = sampler.step(eps, k, before, _transition_noise(noise, k))
+            dense = sampler.step(eps, k, before, _transition_noise(noise, k), cleans)
         errors.append((after - dense).abs())
     return torch.stack(errors, dim=1)
 
@@ -134,8 +134,8 @@ def _chain(
     explore: float,
     checkpointed: bool,
     cut: bool = False,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield the samples before and after each denoising step."""
+) -> Iterator[tuple[Tensor, tuple[Tensor, ...], Tensor]]:
+    """Yield the sample before each denoising step, the clean predictions that the step reads, and the sample after it."""
     pruned = gate.detach().bool()
     check_query(network, sampler, noise, cond, pruned, reuse)
     if not 0 < explore <= 1:
@@ -143,18 +143,19 @@ def _chain(
     explored = torch.rand(gate.shape[1:], device=gate.device) < explore
     computed = ComputedRows(pruned & ~explored)
     gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))
-    slots, buffers = num_buffers(reuse, network.num_blocks), ()
+    slots, buffers, cleans = num_buffers(reuse, network.num_blocks), (), ()
     sample = noise[:, 0]
     for k in range(sampler.num_inference_steps):
         if cut:
-            sample, buffers = sample.detach(), tuple(buffer.detach() for buffer in buffers)
+            sample = sample.detach()
+            cleans, buffers = (tuple(tensor.detach() for tensor in kept) for kept in (cleans, buffers))
         run = _Step(network, sampler, k, cond, _transition_noise(noise, k), computed, slots)
-        arguments = (sample, gate[:, k], *buffers)
-        after, *buffers = (
+        arguments = (sample, gate[:, k], cleans, buffers)
+        after, new_cleans, buffers = (
             checkpoint(run, *arguments, use_reentrant=False) if checkpointed else run(*arguments)
         )
-        yield sample, after
-        sample = after
+        yield sample, cleans, after
+        sample, cleans = after, new_cleans
 
 
 class _Step:
@@ -174,8 +175,10 @@ class _Step:
         self._cond, self._noise = cond, noise
         self._computed, self._slots = computed, slots
 
-    def __call__(self, sample: Tensor, gate: Tensor, *buffers: Tensor) -> tuple[Tensor, ...]:
-        """Return the next sample and the buffers after the step; ``gate`` is [B, 3L]."""
+    def __call__(
+        self, sample: Tensor, gate: Tensor, cleans: tuple[Tensor, ...], buffers: tuple[Tensor, ...]
+    ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Return the next sample, and clean predictions and buffers after the step; ``gate`` is [B, 3L]."""
         network, latest = self._network, list(buffers) or [None] * self._slots
         memory = network.memory(int(self._sampler.timesteps[self._k]), self._cond)
         x = network.embed(sample)
@@ -183,7 +186,9 @@ class _Step:
             slot = block % self._slots
             latest[slot] = output = self._output(block, x, memory, gate[:, block, None, None], latest[slot])
             x = x + output
-        return self._sampler.step(network.head_out(x), self._k, sample, self._noise), *latest
+        eps = network.head_out(x)
+        after = self._sampler.step(eps, self._k, sample, self._noise, cleans)
+        return after, self._sampler.remember(cleans, eps, self._k, sample), tuple(latest)
 
     def _output(self, block: int, x: Tensor, memory: Tensor, gate: Tensor, latest: Tensor | None) -> Tensor:
         rows = self._computed.at(self._k, block)

@@ -8,6 +8,11 @@ from .film import (
     film_masks as film_masks,
     film_tokens as film_tokens,
 )
+from .rounds import (
+    episode_horizon as episode_horizon,
+    make_design as make_design,
+    play_rounds as play_rounds,
+)
 from .summary import (
     describe_policy as describe_policy,
     error_to_dense as error_to_dense,

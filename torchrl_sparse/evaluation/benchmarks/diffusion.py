@@ -11,6 +11,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
+from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.masks import plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.plots import (
@@ -19,7 +20,7 @@ from torchrl_sparse.evaluation.figures.plots import (
     plot_similarity,
 )
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
-from torchrl_sparse.evaluation.results.report import MethodRun
+from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.schema import Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.statistics.fidelity import block_errors
@@ -107,6 +108,7 @@ def draw_methods(
         out: folder of the figures.
     """
     plot_pareto(results, out / "pareto.png")
+    plot_success_within(results, out / "success_within.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
     masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
     for name, mask in masks.items():

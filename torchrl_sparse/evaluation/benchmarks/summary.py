@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.evaluation.results.parts import PolicyShape
 from torchrl_sparse.evaluation.results.report import format_pairs, format_table
-from torchrl_sparse.evaluation.results.schema import PolicyShape, Results
+from torchrl_sparse.evaluation.results.schema import Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.fidelity import action_error
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -64,4 +65,10 @@ def format_benchmark(
         episodes: method -> its episodes.
         pairs, margin: see `format_pairs`.
     """
-    return "\n\n".join([format_table(results), *([format_pairs(episodes, pairs, margin)] if pairs else [])])
+    table = format_table(results)
+    if not pairs:
+        return table
+    if results.until_decided is not None:  # methods may have stopped after different numbers of episodes
+        shared = set.intersection(*({episode.seed for episode in played} for played in episodes.values()))
+        episodes = {n: [e for e in played if e.seed in shared] for n, played in episodes.items()}
+    return f"{table}\n\n{format_pairs(episodes, pairs, margin)}"

@@ -1,3 +1,4 @@
+from .curves import plot_success_within as plot_success_within
 from .html_report import write_report as write_report
 from .pareto import plot_pareto as plot_pareto
 from .plots import (

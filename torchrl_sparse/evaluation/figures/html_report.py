@@ -9,27 +9,40 @@ from __future__ import annotations
 import base64
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
-from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_note, realtime_rows
+from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, realtime_note, realtime_rows
 from torchrl_sparse.evaluation.results.report import results_note, results_rows
-from torchrl_sparse.evaluation.results.schema import load_results
+from torchrl_sparse.evaluation.results.schema import AnyResults, Results, load_results
 from torchrl_sparse.evaluation.results.tables import LEFT
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["find_runs", "write_report"]
 
+
+def _plots_of_results(results: AnyResults) -> dict[str, Callable[..., Path]]:
+    plots: dict[str, Callable[..., Path]] = {"success against latency": plot_pareto}
+    if isinstance(results, Results):
+        plots["success within the time allowed"] = plot_success_within
+    return plots
+
+
+def _plots_of_realtime(results: Realtime) -> dict[str, Callable[..., Path]]:
+    return {"success against latency": plot_realtime}
+
+
 _KINDS = {
-    "results.json": (load_results, results_rows, results_note, plot_pareto),
-    "realtime.json": (load_realtime, realtime_rows, realtime_note, plot_realtime),
+    "results.json": (load_results, results_rows, results_note, _plots_of_results),
+    "realtime.json": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
 }
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 # From the numbers, instead of a file that may be older than they are.
-_DRAWN_HERE = ("pareto.png", "realtime.png")
+_DRAWN_HERE = ("pareto.png", "realtime.png", "success_within.png")
 _TEMPLATE = "report.html.jinja"
 
 
@@ -50,26 +63,28 @@ class Medium:
 
 @dataclass(frozen=True)
 class Run:
-    """A file of results: its table, notes and figure, or what is wrong with it."""
+    """A file of results: its table, notes and figures, or what is wrong with it."""
 
     name: str
     rows: Sequence[dict[str, str]] = ()
     note: str = ""
-    figure: Medium | None = None
+    figures: Sequence[Medium] = ()
     fault: str = ""
 
     @classmethod
     def read(cls, file: Path, name: str) -> Run:
-        """Read a file and draw its figure."""
-        load, make_rows, make_note, plot = _KINDS[file.name]
+        """Read a file and draw its figures."""
+        load, make_rows, make_note, find_plots = _KINDS[file.name]
         try:
             results = load(file)
         except ValueError as error:
             return cls(name, fault=str(error))
         with tempfile.TemporaryDirectory() as folder:
-            picture = plot(results, Path(folder) / "figure.png")
-            figure = Medium.read(picture, "success against latency")
-        return cls(name, make_rows(results), make_note(results), figure)
+            figures = [
+                Medium.read(plot(results, Path(folder) / "figure.png"), caption)
+                for caption, plot in find_plots(results).items()
+            ]
+        return cls(name, make_rows(results), make_note(results), figures)
 
 
 def find_runs(root: str | os.PathLike) -> list[Path]:

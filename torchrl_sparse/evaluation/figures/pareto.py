@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.labels import place_labels
-from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
+from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1
 from torchrl_sparse.evaluation.results.text import threads_text
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _FRONT_COLOR = "#B5B5BA"
 _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
 
-def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
+def plot_pareto(results: AnyResults, path: str | os.PathLike) -> Path:
     """Draw success, with its interval, against the median latency of a query (log axis); the marker is the verdict.
 
     Args:
@@ -96,7 +96,7 @@ def _draw_front(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
         )
 
 
-def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntry]) -> None:
+def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntry1]) -> None:
     from matplotlib.lines import Line2D
 
     present = {m.paired_vs_dense.verdict for name, m in methods.items() if name != DENSE}

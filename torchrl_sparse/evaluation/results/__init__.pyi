@@ -1,13 +1,16 @@
-from .pages import write_pages as write_pages
-from .report import (
+from .build import (
     MethodRun as MethodRun,
+    Terms as Terms,
     build_results as build_results,
+)
+from .pages import write_pages as write_pages
+from .parts import PolicyShape as PolicyShape
+from .report import (
     format_pairs as format_pairs,
     format_table as format_table,
 )
 from .schema import (
     MethodEntry as MethodEntry,
-    PolicyShape as PolicyShape,
     Results as Results,
     load_results as load_results,
     save_results as save_results,

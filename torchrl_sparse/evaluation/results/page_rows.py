@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
-from torchrl_sparse.evaluation.results.schema import Results, load_results
+from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.text import percent_text
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.storage.json import parse_json
+from torchrl_sparse.evaluation.rollouts.episodes import read_episodes
 
 __all__ = ["Row", "Table", "read_table"]
 
@@ -44,7 +43,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """Read a file of results, whose kind its name begins with.
 
     Args:
-        path: ``results*.json``, ``realtime*.json``, ``engine*.json`` or ``vla_latency*.json``.
+        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json`` or ``vla_latency*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -67,18 +66,32 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
 
 def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
-    rows = [{**row, **_more(results, row["method"])} for row in results_rows(results)]
-    return {"methods": _table(results.task, rows, len(rows[0]) - len(_MORE))}
+    rows = results_rows(results)
+    whole = [{**row, **_more(results, row["method"])} for row in rows]
+    return {"methods": _table(results.task, whole, len(rows[0]))}
 
 
-_MORE = "success, %", "action chunks per second", "actions per second"
-
-
-def _more(results: Results, name: str) -> Row:
+def _more(results: AnyResults, name: str) -> Row:
+    """Return the columns that only a page asks for."""
     method = results.methods[name]
     chunks = 1 / method.latency_s.p50
-    texts = percent_text(method.success), f"{chunks:.1f}", f"{results.policy.n_action_steps * chunks:.0f}"
-    return dict(zip(_MORE, texts, strict=True))
+    more = {
+        "success, %": percent_text(method.success),
+        "action chunks per second": f"{chunks:.1f}",
+        "actions per second": f"{results.policy.n_action_steps * chunks:.0f}",
+    }
+    return {**more, **(_more_of_times(results, method) if isinstance(method, MethodEntry) else {})}
+
+
+def _more_of_times(results: Results, method: MethodEntry) -> Row:
+    """Return those of version 2, empty where a method's episodes are not kept."""
+    mean, shares, limits = method.restricted_mean_time, method.success_within, method.speedup_ci95
+    early = None if shares is None or results.early_cut is None else shares[str(results.early_cut)]
+    return {
+        "mean time, steps": "" if mean is None else f"{mean:.1f}",
+        "early, %": "" if early is None else f"{100 * early:.1f}",
+        "speed-up, 95 %": "" if limits is None else f"[{limits[0]:.2f}, {limits[1]:.2f}]",
+    }
 
 
 def _realtime(path: Path) -> dict[str, Table]:
@@ -99,9 +112,10 @@ def _vla(path: Path) -> dict[str, Table]:
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
-    seeds = evaluation_seeds(results.seed, results.dense.success.n)
+    seeds = range(results.first_seed, results.first_seed + results.dense.success.n)
     names = {name for pair in pairs for name in pair}
-    episodes = {name: list(_episodes(path.parent / "episodes" / f"{name}.jsonl", seeds)) for name in names}
+    logs = {name: read_episodes(path.parent / "episodes" / f"{name}.jsonl") for name in names}
+    episodes = {name: [episode for episode in log if episode.seed in seeds] for name, log in logs.items()}
     return _table(results.task, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
 
 
@@ -110,16 +124,15 @@ def _table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
     return Table(task, tuple(rows[0])[:shown], rows)
 
 
-def _episodes(path: Path, seeds: range) -> Iterator[EpisodeResult]:
-    """Read the episodes of these seeds from a log, which stays as it is."""
-    if not path.is_file():
-        raise FileNotFoundError(f"expected a log of episodes {path}, got none")
-    with path.open(encoding="utf-8") as lines:
-        next(lines)
-        for number, line in enumerate(lines, start=2):
-            episode = parse_json(line, EpisodeResult, f"{path}:{number}")
-            if episode.seed in seeds:
-                yield episode
+def _aggregate(path: Path) -> dict[str, Table]:
+    results = load_aggregate(path)
+    return {"methods": _table(", ".join(results.tasks), aggregate_rows(results))}
 
 
-_READERS = {"results": _results, "realtime": _realtime, "engine": _engine, "vla_latency": _vla}
+_READERS = {
+    "results": _results,
+    "aggregate": _aggregate,
+    "realtime": _realtime,
+    "engine": _engine,
+    "vla_latency": _vla,
+}

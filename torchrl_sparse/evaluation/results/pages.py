@@ -10,7 +10,8 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
 
 - ``methods``: which rows, in this order; all without it. Rows of ``engine.json`` are its variants.
 - ``columns``: which columns, in this order. Those of ``results*.json`` are named as the benchmark prints them, and there are
-  also ``success, %``, ``action chunks per second`` and ``actions per second``. An ``engine.json`` also has ``f32 arithmetic
+  also ``success, %``, ``action chunks per second`` and ``actions per second``, of schema 2 ``mean time, steps``, ``early, %``
+  (solved within the task's early cut) and ``speed-up, 95 %``. An ``engine.json`` also has ``f32 arithmetic
   alone, ms``, and what reads its weights, ``memory alone, ms``.
 - ``rows``: which table of a file with several: a shape of an ``engine.json``, or ``methods`` or ``parts`` of a
   ``vla_latency.json``.
@@ -40,7 +41,7 @@ from torchrl_sparse.storage.json import read_json
 
 __all__ = ["find_pages", "write_pages", "write_tables"]
 
-_FOLDERS = ("assets", "recipes", "torchrl_sparse", "docs")
+_FOLDERS = ("assets", "recipes", "tests", "torchrl_sparse", "docs")
 _BEGIN, _END = re.compile(r"<!-- table: (.*) -->"), "<!-- end -->"
 _OPTIONS = ("methods", "columns", "rows", "pairs", "tasks", "cells", "published")
 

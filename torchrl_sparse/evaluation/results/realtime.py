@@ -15,7 +15,8 @@ import torch
 
 from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.evaluation.latency.measure import Machine
-from torchrl_sparse.evaluation.results.schema import DENSE, Difference, Success
+from torchrl_sparse.evaluation.results.parts import Difference, Success
+from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import count_text, difference_text, threads_text
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals

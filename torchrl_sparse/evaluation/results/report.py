@@ -1,23 +1,16 @@
-"""From what was measured of a benchmark to its `Results`, and from there to the table."""
+"""The table of a ``results.json``, and the lines that explain it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
-from torchrl_sparse.evaluation.latency.measure import Latency, Machine
+from torchrl_sparse.evaluation.results.parts import Difference, TokensKept
 from torchrl_sparse.evaluation.results.schema import (
     DENSE,
-    SCHEMA,
-    ActionError,
-    Difference,
-    Flops,
+    AnyResults,
     MethodEntry,
-    Percentiles,
-    PolicyShape,
+    MethodEntry1,
     Results,
-    Success,
-    TokensKept,
 )
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -25,19 +18,21 @@ from torchrl_sparse.evaluation.results.text import (
     difference_text,
     milliseconds_text,
     points_text,
+    ratio_text,
     threads_text,
+    verdict_text,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals, totals
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
+from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN
 from torchrl_sparse.evaluation.statistics.intervals import (
     DEFAULT_MARGIN,
-    PairedDifference,
     episodes_needed,
     paired_difference,
 )
+from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
 __all__ = [
-    "MethodRun",
-    "build_results",
     "format_pairs",
     "format_table",
     "pair_rows",
@@ -46,118 +41,42 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class MethodRun:
-    """Everything measured of one method.
-
-    Attributes:
-        episodes: its episodes, the same seeds as every other method's, in any order.
-        latency: of one query, measured interleaved with the other methods.
-        action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
-            observations and the same noise; (0, 0) for the dense policy.
-        planning: of the planner alone, within a query; where it looks at the observation.
-    """
-
-    episodes: Sequence[EpisodeResult]
-    latency: Latency
-    action_error: tuple[float, float]
-    planning: Latency | None = None
-
-
-def build_results(
-    runs: Mapping[str, MethodRun],
-    *,
-    task: str,
-    seed: int,
-    machine: Machine,
-    policy: PolicyShape,
-    margin: float = DEFAULT_MARGIN,
-) -> Results:
-    """Make the content of ``results.json`` from what was measured.
-
-    Args:
-        runs: method name -> its run; ``"dense"``, which all are compared with, must be there.
-        task: name of the task.
-        seed: of the whole benchmark.
-        machine: see `describe_machine`.
-        policy: the dense policy.
-        margin: non-inferiority margin of the verdicts, a difference of success rates.
-
-    Raises:
-        ValueError: if dense is missing, methods ran on different seeds, or a value is out of range.
-    """
-    if DENSE not in runs:
-        raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
-    methods = {name: _entry(name, run, runs[DENSE], margin) for name, run in runs.items()}
-    return Results(SCHEMA, task, seed, machine, policy, methods)
-
-
-def _entry(name: str, run: MethodRun, dense: MethodRun, margin: float) -> MethodEntry:
-    outcomes, paired = _compare(name, run, dense, margin)
-    cost, tokens = totals(run.episodes), token_totals(run.episodes)
-    return MethodEntry(
-        success=Success.of(outcomes),
-        paired_vs_dense=Difference.of(paired),
-        prune_rate=cost.prune_rate,
-        flops=Flops(cost.flops_per_query, cost.flops_per_query / totals(dense.episodes).flops_per_query),
-        latency_s=Percentiles.of(run.latency),
-        speedup_vs_dense=dense.latency.p50 / run.latency.p50,
-        action_error_vs_dense=ActionError(*map(float, run.action_error)),
-        episode_length=cost.episode_length,
-        planning_s=None if run.planning is None else Percentiles.of(run.planning),
-        tokens=None if tokens is None else TokensKept(tokens.mean, tokens.fine, tokens.coarse),
-    )
-
-
-def _compare(
-    name: str, run: MethodRun, dense: MethodRun, margin: float
-) -> tuple[list[bool], PairedDifference]:
-    ours, theirs = paired_outcomes({name: run.episodes, DENSE: dense.episodes}, name, DENSE)
-    if name == DENSE:
-        return ours, PairedDifference(0.0, (0.0, 0.0), margin, "non-inferior", 0, 0, len(ours))
-    return ours, paired_difference(ours, theirs, margin)
-
-
-def paired_outcomes(
-    episodes: Mapping[str, Sequence[EpisodeResult]], name: str, other: str
-) -> tuple[list[bool], list[bool]]:
-    """Return the successes of two methods, seed by seed.
-
-    Raises:
-        ValueError: if they ran on different seeds, or a seed ran twice.
-    """
-    ours, theirs = _by_seed(episodes[name]), _by_seed(episodes[other])
-    if ours.keys() != theirs.keys():
-        odd = sorted(ours.keys() ^ theirs.keys())
-        raise ValueError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
-    return [episode.success for episode in ours.values()], [theirs[seed].success for seed in ours]
-
-
-def _by_seed(episodes: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
-    by_seed = {episode.seed: episode for episode in episodes}
-    if len(by_seed) != len(episodes):
-        raise ValueError(f"expected one episode per seed, got {len(episodes)} for {len(by_seed)} seeds")
-    return by_seed
-
-
-def format_table(results: Results) -> str:
+def format_table(results: AnyResults) -> str:
     """Return the table of a benchmark, as Markdown that also lines up in a terminal, and the lines that explain it."""
     return f"{markdown_table(results_rows(results))}\n\n{results_note(results)}"
 
 
-def results_rows(results: Results) -> list[dict[str, str]]:
+def results_rows(results: AnyResults) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text."""
-    return [_table_row(name, method) for name, method in results.methods.items()]
+    survivors = _survivors(results)
+    return [_table_row(name, method, survivors) for name, method in results.methods.items()]
 
 
-def _table_row(name: str, method: MethodEntry) -> dict[str, str]:
+def _survivors(results: AnyResults) -> set[str] | None:
+    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
+    if not isinstance(results, Results):
+        return None
+    tested = {name: method.p_values for name, method in results.methods.items() if method.p_values}
+    p_values = {f"{name} success": p.success for name, p in tested.items()}
+    p_values |= {f"{name} time": p.time for name, p in tested.items()}
+    return holm(p_values, _comparisons(results))
+
+
+def _comparisons(results: Results) -> int:
+    """Return the verdicts of the table: on success and on time, of every method but dense."""
+    return 2 * (len(results.methods) - 1)
+
+
+def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> dict[str, str]:
     error, baseline = method.action_error_vs_dense, name == DENSE
+    survives = survivors is None or f"{name} success" in survivors
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
     return {
         "method": name,
         "success": count_text(method.success),
         "vs dense, points": "" if baseline else difference_text(method.paired_vs_dense),
-        "verdict": "baseline" if baseline else method.paired_vs_dense.verdict,
+        "verdict": "baseline" if baseline else verdict_text(method.paired_vs_dense, survives),
+        **(_time_cells(name, method, survivors or ()) if isinstance(method, MethodEntry) else {}),
         "pruned": f"{100 * method.prune_rate:.1f} %",
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
@@ -167,6 +86,19 @@ def _table_row(name: str, method: MethodEntry) -> dict[str, str]:
         "speed-up": f"{method.speedup_vs_dense:.2f}×",
         "action error (max)": "" if baseline else f"{error.mean:.2g} ({error.max:.2g})",
         "steps": f"{method.episode_length:.1f}",
+    }
+
+
+def _time_cells(name: str, method: MethodEntry, survivors: Collection[str]) -> dict[str, str]:
+    """Return the columns that version 2 adds, empty where a method's episodes are not kept."""
+    texts = dict.fromkeys(("time vs dense", "time verdict", "correlation"), "")
+    if method.time_vs_dense is None or name == DENSE:
+        return texts
+    correlation = method.correlation_with_dense
+    return {
+        "time vs dense": ratio_text(method.time_vs_dense),
+        "time verdict": verdict_text(method.time_vs_dense, f"{name} time" in survivors),
+        "correlation": "" if correlation is None else f"{correlation:.2f}",
     }
 
 
@@ -211,18 +143,19 @@ def _pair_row(
 ) -> dict[str, str]:
     if len(pair) != 2 or not set(pair) <= set(episodes):
         raise ValueError(f"pairs: expected two of {', '.join(episodes)}, got {list(pair)}")
-    ours, theirs = paired_outcomes(episodes, *pair)
+    pairs = pair_episodes(pair[0], episodes[pair[0]], pair[1], episodes[pair[1]])
+    ours, theirs = pairs.solved
     paired = paired_difference(ours, theirs, margin)
     return {
         "method": pair[0],
         "against": pair[1],
         "success": f"{sum(ours)} : {sum(theirs)}",
         "difference, points": points_text(paired.diff, paired.ci),
-        "verdict": paired.verdict,
+        "verdict": verdict_text(Difference.of(paired)),
     }
 
 
-def results_note(results: Results) -> str:
+def results_note(results: AnyResults) -> str:
     """Return the lines that explain the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
     n, margin = dense.success.n, dense.paired_vs_dense.margin
@@ -230,11 +163,13 @@ def results_note(results: Results) -> str:
     if dense.tokens:
         steps, flops = f"chunks of {policy.horizon} actions", "whole network"
     lines = [
-        f"{results.task}, {n} paired episodes a method (seed {results.seed}): the same initial states "
+        f"{results.task}, {_episodes_text(results)}: the same initial states "
         "and the same noise for every method. Success with Wilson's 95 % interval, difference to dense with "
         "Tango's.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
-        f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell).",
+        f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
+        "below 0, whatever the margin.",
+        *(_time_lines(results) if isinstance(results, Results) else []),
         f"Dense: {policy.params:,} parameters, {steps}. FLOPs are "
         f"2·MAC of a query, {flops}. Latency of a query, all methods interleaved in one process, on "
         f"{machine.cpu}, {machine.device}, {threads_text(machine.threads)}, torch {machine.torch}, "
@@ -250,7 +185,35 @@ def results_note(results: Results) -> str:
     return "\n".join(lines)
 
 
-def _planning(methods: Mapping[str, MethodEntry]) -> Iterator[str]:
+def _episodes_text(results: AnyResults) -> str:
+    n = results.dense.success.n
+    if not isinstance(results, Results):
+        return f"{n} paired episodes a method (seed {results.seed})"
+    seeds = f"{results.split} seeds from {results.first_seed}"
+    if (stopping := results.until_decided) is None:
+        return f"{n} paired episodes a method ({seeds})"
+    return (
+        f"paired episodes ({seeds}) until a method's verdicts are reached, looked at {stopping.looks} times up to "
+        f"{stopping.max_episodes}; intervals of differences are as much wider as that takes"
+    )
+
+
+def _time_lines(results: Results) -> Iterator[str]:
+    margin = results.dense.time_vs_dense.margin if results.dense.time_vs_dense else DEFAULT_TIME_MARGIN
+    yield (
+        f"Time vs dense is the ratio of mean steps to success, {results.episode_horizon} where there is none, with a paired "
+        f"95 % interval and a verdict against a margin of {100 * margin:g} %; correlation is that of these steps with dense's "
+        "over the seeds, about 0 where a method does not share dense's noise step by step."
+    )
+    yield (
+        f"{_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
+        "correction for them."
+    )
+    if lacking := [name for name, method in results.methods.items() if method.time_vs_dense is None]:
+        yield f"Episodes of {', '.join(lacking)} were not kept: they count as comparisons without a p-value."
+
+
+def _planning(methods: Mapping[str, MethodEntry1]) -> Iterator[str]:
     """Yield what each planner that looks at the observation takes, and its share of a query."""
     for name, method in methods.items():
         if method.planning_s:

@@ -1,163 +1,58 @@
 """``results.json``: the only source of every table and figure.
 
-The dataclasses are the schema, version 1; `load_results` and `save_results` refuse everything else. Seconds are those of a
-query; FLOPs are 2 * MAC of a query, of the denoiser alone or of a whole vision-language-action model.
+The dataclasses are the schema. Version 2 is written; version 1, without times to success, can still be read, as `Results1`, and
+`load_results` refuses everything else. Seconds are those of a query; FLOPs are 2 * MAC of a query, of the denoiser alone or
+of a whole vision-language-action model.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.evaluation.latency.measure import Latency, Machine
-from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Verdict, wilson_interval
+from torchrl_sparse.envs.seeds import Split, evaluation_seeds
+from torchrl_sparse.evaluation.latency.measure import Machine
+from torchrl_sparse.evaluation.results.parts import (
+    ActionError,
+    Difference,
+    Flops,
+    Interval,
+    Percentiles,
+    PolicyShape,
+    PValues,
+    Success,
+    TimeDifference,
+    TokensKept,
+    check_interval,
+    require,
+)
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
     "DENSE",
     "SCHEMA",
-    "ActionError",
-    "Difference",
-    "Flops",
-    "Interval",
+    "AnyResults",
     "MethodEntry",
-    "Percentiles",
-    "PolicyShape",
+    "MethodEntry1",
     "Results",
-    "Success",
-    "TokensKept",
+    "Results1",
+    "Stopping",
     "load_results",
     "save_results",
 ]
 
-SCHEMA = 1
+SCHEMA = 2
 DENSE = "dense"
 """The method that all others are compared with."""
 
-Interval = tuple[float, float]
+_FIRST_SEED_1 = 100_000  # of every benchmark of version 1
 
 
 @dataclass(frozen=True)
-class PolicyShape:
-    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed."""
-
-    params: int
-    num_inference_steps: int
-    horizon: int
-    n_obs_steps: int
-    n_action_steps: int
-
-
-@dataclass(frozen=True)
-class Success:
-    """Episodes solved, with Wilson's 95 % interval of the rate.
-
-    >>> Success.of([True, False]).rate
-    0.5
-    """
-
-    k: int
-    n: int
-    rate: float
-    ci95: Interval
-
-    def __post_init__(self) -> None:
-        _require(self.n >= 1, "n", "at least 1", self.n)
-        _require(0 <= self.k <= self.n, "k", f"0 to {self.n}", self.k)
-        rate = self.k / self.n
-        _require(math.isclose(self.rate, rate, abs_tol=1e-9), "rate", f"k / n = {rate}", self.rate)
-        _check_interval(self.ci95)
-        _require(self.ci95[0] >= 0 and self.ci95[1] <= 1, "ci95", "limits in [0, 1]", self.ci95)
-
-    @classmethod
-    def of(cls, outcomes: Sequence[bool]) -> Success:
-        """Count the successes of episodes."""
-        k, n = sum(outcomes), len(outcomes)
-        return cls(k, n, k / n, wilson_interval(k, n))
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Success minus dense success on the same seeds, with Tango's 95 % interval and the verdict against a margin.
-
-    The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
-    """
-
-    diff: float
-    ci95: Interval
-    margin: float
-    verdict: Verdict
-
-    def __post_init__(self) -> None:
-        _require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
-        _check_interval(self.ci95)
-        _require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
-
-    @classmethod
-    def of(cls, paired: PairedDifference) -> Difference:
-        """Keep what a file holds of a comparison."""
-        return cls(paired.diff, paired.ci, paired.margin, paired.verdict)
-
-
-@dataclass(frozen=True)
-class Percentiles:
-    """Median and 95th percentile of ``n`` timed calls, seconds."""
-
-    p50: float
-    p95: float
-    n: int
-
-    def __post_init__(self) -> None:
-        _require(0 < self.p50 <= self.p95, "p50", "0 < p50 <= p95", (self.p50, self.p95))
-        _require(self.n >= 1, "n", "at least 1", self.n)
-
-    @classmethod
-    def of(cls, latency: Latency) -> Percentiles:
-        """Keep what a file holds of a measurement."""
-        return cls(latency.p50, latency.p95, latency.n)
-
-
-@dataclass(frozen=True)
-class Flops:
-    """FLOPs of a query, and over those of a dense one."""
-
-    per_query: float
-    ratio_to_dense: float
-
-    def __post_init__(self) -> None:
-        _require(self.per_query >= 0, "per_query", "at least 0", self.per_query)
-        _require(self.ratio_to_dense >= 0, "ratio_to_dense", "at least 0", self.ratio_to_dense)
-
-
-@dataclass(frozen=True)
-class ActionError:
-    """Absolute difference of an action entry to the dense policy's, on the same observations and the same noise."""
-
-    mean: float
-    max: float
-
-    def __post_init__(self) -> None:
-        for name in ("mean", "max"):
-            value = getattr(self, name)
-            _require(0 <= value < math.inf, name, "a finite number >= 0", value)
-
-
-@dataclass(frozen=True)
-class TokensKept:
-    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, in fine and in coarse mode."""
-
-    kept_mean: float
-    kept_fine: float | None
-    kept_coarse: float | None
-
-
-@dataclass(frozen=True)
-class MethodEntry:
-    """Everything about one method.
+class MethodEntry1:
+    """Everything that version 1 says about one method.
 
     Attributes:
         success: of its episodes.
@@ -184,26 +79,68 @@ class MethodEntry:
     tokens: TokensKept | None = None
 
     def __post_init__(self) -> None:
-        _require(0 <= self.prune_rate <= 1, "prune_rate", "0 to 1", self.prune_rate)
+        require(0 <= self.prune_rate <= 1, "prune_rate", "0 to 1", self.prune_rate)
 
 
 @dataclass(frozen=True)
-class Results:
-    """The content of a ``results.json``: where it was measured, on what, and all methods, the dense policy among them."""
+class MethodEntry(MethodEntry1):
+    """Everything about one method.
 
-    schema: Literal[1]
-    task: str
-    seed: int
-    machine: Machine
-    policy: PolicyShape
-    methods: dict[str, MethodEntry]
+    What follows from episodes is None in a file that was made from one of version 1, where the method's are not kept; what
+    follows from the rounds of the latency measurement, in every such file.
+
+    Attributes:
+        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
+        time_vs_dense: its ratio to the dense policy's.
+        success_within: share of episodes solved within so many steps; see `allowed_steps`.
+        correlation_with_dense: Pearson's, of times over the seeds; None also where times never differ.
+        p_values: of the two verdicts.
+        speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement.
+    """
+
+    restricted_mean_time: float | None = None
+    time_vs_dense: TimeDifference | None = None
+    success_within: dict[str, float] | None = None
+    correlation_with_dense: float | None = None
+    p_values: PValues | None = None
+    speedup_ci95: Interval | None = None
 
     def __post_init__(self) -> None:
-        _require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
+        super().__post_init__()
+        known = {getattr(self, name) is not None for name in _OF_EPISODES}
+        require(len(known) == 1, "restricted_mean_time", f"all of {', '.join(_OF_EPISODES)} or none", "some")
+        for steps, share in (self.success_within or {}).items():
+            require(
+                steps.isdecimal() and 0 <= share <= 1, "success_within", "steps and shares", {steps: share}
+            )
+        if self.speedup_ci95 is not None:
+            check_interval(self.speedup_ci95)
+
+
+_OF_EPISODES = ("restricted_mean_time", "time_vs_dense", "success_within")
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Of a benchmark that went on until verdicts were reached: see `torchrl_sparse.evaluation.statistics.sequential.Design`."""
+
+    max_episodes: int
+    looks: int
+
+
+class _Methods:
+    """What both versions offer."""
+
+    methods: dict[str, MethodEntry]
+
+    def _check_methods(self, *, same_episodes: bool = True) -> None:
+        require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
         n = self.dense.success.n
+        expected = f"{n}, as every method" if same_episodes else f"at most {n}, as dense"
         for name, method in self.methods.items():
             got = method.success.n
-            _require(got == n, f"methods.{name}.success.n", f"{n}, as every method", got)
+            fits = got == n if same_episodes else got <= n
+            require(fits, f"methods.{name}.success.n", expected, got)
 
     @property
     def dense(self) -> MethodEntry:
@@ -211,26 +148,78 @@ class Results:
         return self.methods[DENSE]
 
 
-def load_results(path: str | os.PathLike) -> Results:
-    """Read a ``results.json``.
+@dataclass(frozen=True)
+class Results1(_Methods):
+    """The content of a ``results.json`` of version 1."""
+
+    schema: Literal[1]
+    task: str
+    seed: int
+    machine: Machine
+    policy: PolicyShape
+    methods: dict[str, MethodEntry1]
+
+    def __post_init__(self) -> None:
+        self._check_methods()
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first episode."""
+        return _FIRST_SEED_1 + self.seed
+
+
+@dataclass(frozen=True)
+class Results(_Methods):
+    """The content of a ``results.json``: where it was measured, on what, and all methods, the dense policy among them.
+
+    Attributes:
+        task: name of the task.
+        split: of the seeds.
+        seed: of the first episode, in the split's range.
+        episode_horizon: steps after which an episode is truncated.
+        machine: of the latencies.
+        policy: the dense one.
+        methods: name -> entry.
+        early_cut: steps of the task's pre-registered early cut; None for a task without one.
+        until_decided: where methods have as many episodes as their verdicts took; None where all have the same.
+    """
+
+    schema: Literal[2]
+    task: str
+    split: Split
+    seed: int
+    episode_horizon: int
+    machine: Machine
+    policy: PolicyShape
+    methods: dict[str, MethodEntry]
+    early_cut: int | None = None
+    until_decided: Stopping | None = None
+
+    def __post_init__(self) -> None:
+        self._check_methods(same_episodes=self.until_decided is None)
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first episode."""
+        return evaluation_seeds(self.split, self.seed, 1)[0]
+
+
+AnyResults = Results | Results1
+
+
+def load_results(path: str | os.PathLike) -> AnyResults:
+    """Read a ``results.json`` as what its ``schema`` says.
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is not of this schema or does not agree with itself.
+        ValueError: naming file and key, if it is of neither version or does not agree with itself.
     """
-    return read_json(path, Results)
+    found = read_json(path, dict[str, Any]).get("schema")
+    if found not in (1, SCHEMA):
+        raise ValueError(f"{path}: schema: expected 1 or {SCHEMA}, got {found!r}")
+    return read_json(path, Results if found == SCHEMA else Results1)
 
 
 def save_results(results: Results, path: str | os.PathLike) -> Path:
     """Write a ``results.json`` in one piece or not at all; return the path."""
     return write_json(path, results)
-
-
-def _check_interval(interval: Interval) -> None:
-    low, high = interval
-    _require(low <= high, "ci95", "low <= high", list(interval))
-
-
-def _require(condition: bool, key: str, expected: str, got: Any) -> None:
-    if not condition:
-        raise ValueError(f"{key}: expected {expected}, got {got!r}")

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
+from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, load_results
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
@@ -57,7 +57,7 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     Raises:
         FileNotFoundError: if there is none.
         ImportError: without the ``sweeps`` package.
-        ValueError: if wandb would refuse it; the message names the file and says why.
+        ValueError: if wandb would refuse it, or its trials would see test seeds; the message names the file and says why.
     """
     try:
         config = yaml.safe_load(Path(path).read_bytes())
@@ -68,6 +68,9 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     violations = _engine().config.cfg.schema_violations_from_proposed_config(config)
     if violations:
         raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
+    split = config["parameters"].get("split", {})
+    if "split=test" in config.get("command", []) or "test" in [split.get("value"), *split.get("values", [])]:
+        raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
     return config
 
 
@@ -129,7 +132,7 @@ class LocalSweep:
         self.trials[self.trials.index(trial)] = replace(trial, finished=True)
         self._save()
 
-    def results(self) -> list[tuple[Trial, Results]]:
+    def results(self) -> list[tuple[Trial, AnyResults]]:
         """Return the finished trials and what they found, in the order in which they were chosen."""
         return [(trial, load_results(self.results_file(trial))) for trial in self.trials if trial.finished]
 
@@ -179,7 +182,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     sweep.finish(trial)
 
 
-def write_trials(trials: Sequence[tuple[Trial, Results]], path: str | os.PathLike) -> None:
+def write_trials(trials: Sequence[tuple[Trial, AnyResults]], path: str | os.PathLike) -> None:
     """Write one line of CSV per trial: its parameters, the numbers of what it tested, and the id of its run."""
     rows = [{**trial.parameters, **_tested(results), "run": trial.id} for trial, results in trials]
     with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
@@ -188,13 +191,13 @@ def write_trials(trials: Sequence[tuple[Trial, Results]], path: str | os.PathLik
         writer.writerows(rows)
 
 
-def _tested(results: Results) -> dict[str, float]:
+def _tested(results: AnyResults) -> dict[str, float]:
     prefix = "tested/"
     metrics = trial_metrics(results).items()
     return {name.removeprefix(prefix): value for name, value in metrics if name.startswith(prefix)}
 
 
-def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
+def merge_trials(trials: Sequence[tuple[Trial, AnyResults]]) -> AnyResults:
     """Merge a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
 
     Latencies come from the trials' own processes, each with its own dense for ``speedup_vs_dense``; the dense entry

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_sparse.evaluation.results.schema import Difference, Interval, Success
+from torchrl_sparse.evaluation.results.parts import Difference, Interval, Success, TimeDifference
 
 __all__ = [
     "count_text",
@@ -10,7 +10,9 @@ __all__ = [
     "milliseconds_text",
     "percent_text",
     "points_text",
+    "ratio_text",
     "threads_text",
+    "verdict_text",
 ]
 
 
@@ -45,6 +47,28 @@ def points_text(diff: float, interval: Interval) -> str:
     """
     low, high = (f"{100 * limit:+.1f}" for limit in interval)
     return f"{100 * diff:+.1f} [{low}, {high}]"
+
+
+def ratio_text(difference: TimeDifference) -> str:
+    """Return a ratio of times with its interval.
+
+    >>> ratio_text(TimeDifference(1.06, (0.951, 1.182), 0.1, "undecided"))
+    '1.06 [0.95, 1.18]'
+    """
+    low, high = (f"{limit:.2f}" for limit in difference.ci95)
+    return f"{difference.ratio:.2f} [{low}, {high}]"
+
+
+def verdict_text(difference: Difference | TimeDifference, survives: bool = True) -> str:
+    """Return a verdict, whether the method is worse whatever the margin, and † unless it survives the other comparisons.
+
+    >>> verdict_text(Difference(-0.03, (-0.045, -0.015), 0.05, "non-inferior"), survives=False)
+    'non-inferior†, worse'
+    """
+    decided = difference.verdict != "undecided"
+    mark = "†" if decided and not survives else ""
+    worse = ", worse" if difference.worse and difference.verdict != "inferior" else ""
+    return f"{difference.verdict}{mark}{worse}"
 
 
 def milliseconds_text(seconds: float) -> str:

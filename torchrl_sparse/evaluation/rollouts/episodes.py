@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.storage.json import describe_differences, parse_json
 
-__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "token_totals", "totals"]
+__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "read_episodes", "token_totals", "totals"]
 
 
 @dataclass(frozen=True)
@@ -194,3 +194,19 @@ class EpisodeLog:
             raise ValueError(
                 f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
             )
+
+
+def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
+    """Yield the episodes of a log, which stays as it is.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: naming file and line, if one is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a log of episodes {path}, got none")
+    with path.open(encoding="utf-8") as lines:
+        next(lines)
+        for number, line in enumerate(lines, start=2):
+            yield parse_json(line, EpisodeResult, f"{path}:{number}")

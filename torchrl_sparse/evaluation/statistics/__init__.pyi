@@ -1,3 +1,13 @@
+from .bootstrap import (
+    aggregate_tasks as aggregate_tasks,
+    median_ratio_interval as median_ratio_interval,
+)
+from .durations import (
+    restricted_times as restricted_times,
+    success_within as success_within,
+    time_ratio as time_ratio,
+    time_verdict as time_verdict,
+)
 from .fidelity import (
     action_error as action_error,
     block_errors as block_errors,
@@ -9,3 +19,5 @@ from .intervals import (
     verdict as verdict,
     wilson_interval as wilson_interval,
 )
+from .multiplicity import holm as holm
+from .sequential import Design as Design

@@ -21,9 +21,11 @@ __all__ = [
     "DEFAULT_MARGIN",
     "PairedDifference",
     "Verdict",
+    "check_level",
     "episodes_needed",
     "paired_difference",
     "tango_interval",
+    "tango_z",
     "verdict",
     "wilson_interval",
 ]
@@ -69,7 +71,7 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     >>> [round(limit, 4) for limit in wilson_interval(81, 263)]
     [0.2553, 0.3662]
     """
-    _check_level(confidence)
+    check_level(confidence)
     if n < 1 or not 0 <= k <= n:
         raise ValueError(f"a rate needs 0 <= k <= n and n >= 1, got k={k}, n={n}")
     interval = binomtest(k, n).proportion_ci(confidence_level=confidence, method="wilson")
@@ -91,7 +93,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
     >>> [round(limit, 3) for limit in tango_interval(1, 7, 21)]
     [-0.517, -0.026]
     """
-    _check_level(confidence)
+    check_level(confidence)
     if n < 1 or won < 0 or lost < 0 or won + lost > n:
         raise ValueError(
             f"pairs need won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
@@ -113,6 +115,22 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
 
     diff = (won - lost) / n
     return float(brentq(excess, -1.0, diff, xtol=1e-12)), float(brentq(excess, diff, 1.0, xtol=1e-12))
+
+
+def tango_z(won: int, lost: int, n: int, delta: float) -> float:
+    """Return Tango's score statistic: by how many standard errors the difference lies above ``delta``.
+
+    `tango_interval` excludes ``delta`` where this is beyond its normal quantile.
+
+    Args:
+        won, lost, n: see `tango_interval`.
+        delta: the hypothesis, strictly between -1 and 1 and not 0; minus the margin for non-inferiority.
+
+    >>> round(tango_z(1, 7, 21, -0.026), 2), round(tango_z(0, 0, 73, -0.05), 2)
+    (-1.96, 1.96)
+    """
+    variance = 2 * _constrained_loss_rate(won, lost, n, delta) + delta * (1 - delta)
+    return (won - lost - n * delta) / math.sqrt(n * variance)
 
 
 def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:
@@ -171,13 +189,14 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
     >>> episodes_needed(0.05)
     73
     """
-    _check_level(confidence)
+    check_level(confidence)
     if not 0 < margin < 1:
         raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
     z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
     return math.floor(z2 * (1 - margin) / margin) + 1
 
 
-def _check_level(confidence: float) -> None:
+def check_level(confidence: float) -> None:
+    """Raise ValueError unless a level lies strictly between 0 and 1."""
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must lie strictly between 0 and 1, got {confidence}")

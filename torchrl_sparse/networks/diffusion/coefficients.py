@@ -1,22 +1,26 @@
-"""A sampler as six numbers for each denoising step, so that a loop needs no scheduler.
+"""A sampler as eight numbers for each denoising step, so that a loop needs no scheduler.
 
-With ``clip`` to [-1, 1], DDPM and DDIM are one update, in diffusers' order of operations::
+With ``clip`` to [-1, 1] and the clean predictions of the two steps before, every sampler is one update::
 
     clean = clip((sample - noise_scale * eps) / signal_scale)
-    next  = clean_weight * clean + sample_weight * sample + eps_weight * eps + spread * gaussian
+    next  = clean_weight * clean + sample_weight * sample + eps_weight * eps
+          + previous_weight * clean of the last step + earlier_weight * clean of the step before it
+          + spread * gaussian
 
-DDPM (arXiv:2006.11239, Eq. 7) has ``eps_weight = 0``; DDIM (arXiv:2010.02502, Eq. 12, eta = 0) has
-``sample_weight = spread = 0``.
+in diffusers' order of operations for DDPM (arXiv:2006.11239, Eq. 7: ``eps_weight = 0``) and DDIM (arXiv:2010.02502,
+Eq. 12: ``sample_weight = 0``), which remember no step. `torchrl_sparse.networks.diffusion.multistep` has the weights of
+those that do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+
+from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 
 __all__ = ["StepCoefficients", "step_coefficients"]
 
@@ -30,6 +34,7 @@ class StepCoefficients:
         signal_scale: sqrt(abar_t).
         clean_weight, sample_weight, eps_weight: of the clipped prediction, of the sample, of the predicted
             noise.
+        previous_weight, earlier_weight: of the clipped predictions one and two steps before; 0 where none is read.
         spread: standard deviation of the noise that is added; 0 where none is.
         clip: largest absolute value of a clean action.
     """
@@ -39,57 +44,64 @@ class StepCoefficients:
     clean_weight: Tensor
     sample_weight: Tensor
     eps_weight: Tensor
+    previous_weight: Tensor
+    earlier_weight: Tensor
     spread: Tensor
     clip: float
+
+    @property
+    def history(self) -> int:
+        """How many earlier clean predictions the steps read, 0 to 2."""
+        return 2 if self.earlier_weight.any() else 1 if self.previous_weight.any() else 0
 
     def reads_noise(self, step: int) -> bool:
         """Return whether denoising step ``step`` adds noise."""
         return bool(self.spread[step] > 0)
 
-    def update(self, step: int, sample: Tensor, eps: Tensor, gaussian: Tensor | None) -> Tensor:
+    def clean(self, step: int, sample: Tensor, eps: Tensor) -> Tensor:
+        """Return the clipped clean prediction of denoising step ``step``; arguments as of :meth:`update`."""
+        clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
+        return clean.clamp(-self.clip, self.clip)
+
+    def update(
+        self, step: int, sample: Tensor, eps: Tensor, gaussian: Tensor | None, cleans: Sequence[Tensor] = ()
+    ) -> Tensor:
         """Return the sample after denoising step ``step``.
 
         Args:
             step: in execution order.
             sample, eps: of one shape.
             gaussian: standard normal of the same shape; None where :meth:`reads_noise` is False.
+            cleans: clipped predictions of the steps before, the latest first; those of weight 0 may be missing.
         """
-        clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
-        clean = clean.clamp(-self.clip, self.clip)
-        result = self.clean_weight[step] * clean + self.sample_weight[step] * sample
+        result = self.clean_weight[step] * self.clean(step, sample, eps) + self.sample_weight[step] * sample
         result = result + self.eps_weight[step] * eps
+        for weight, clean in zip((self.previous_weight, self.earlier_weight), cleans, strict=False):
+            result = result + weight[step] * clean
         return result + self.spread[step] * gaussian if self.reads_noise(step) else result
 
     def table(self) -> Tensor:
-        """Return the six coefficients of every step, f32 [K, 6], in the order of the fields."""
-        return torch.stack(
-            [
-                self.noise_scale,
-                self.signal_scale,
-                self.clean_weight,
-                self.sample_weight,
-                self.eps_weight,
-                self.spread,
-            ],
-            dim=1,
-        )
+        """Return the eight coefficients of every step, f32 [K, 8], in the order of the fields."""
+        return torch.stack([getattr(self, field.name) for field in fields(self)[:-1]], dim=1)
 
 
 def step_coefficients(
-    kind: Literal["ddpm", "ddim"],
+    kind: str,
     alphas_cumprod: Tensor,
     timesteps: Sequence[int],
     previous_timesteps: Sequence[int],
     *,
+    eta: float = 0.0,
     clip: float = 1.0,
 ) -> StepCoefficients:
     """Tabulate the steps of a sampler.
 
     Args:
-        kind: of the sampler.
+        kind: of the sampler, one of `torchrl_sparse.networks.diffusion.sampler.KINDS`.
         alphas_cumprod: abar of every diffusion timestep, f32 [T].
         timesteps: of each denoising step, K of them.
         previous_timesteps: the timestep that each of them leads to; -1 is the clean sample.
+        eta: share of DDPM's noise that DDIM adds, in [0, 1].
         clip: largest absolute value of a clean action.
 
     Examples:
@@ -97,22 +109,40 @@ def step_coefficients(
         >>> coefficients.clean_weight[-1].item(), coefficients.eps_weight[-1].item()
         (1.0, 0.0)
     """
-    alpha_prod = alphas_cumprod[list(timesteps)]
+    abar = alphas_cumprod[list(timesteps)]
     # The clean sample, which a sampler ends on, has abar = 1.
-    alpha_prod_prev = torch.cat([alphas_cumprod, torch.ones(1)])[list(previous_timesteps)]
-    beta_prod, beta_prod_prev = 1 - alpha_prod, 1 - alpha_prod_prev
-    zeros = torch.zeros(len(timesteps))
-    if kind == "ddim":
-        weights = alpha_prod_prev**0.5, zeros, beta_prod_prev**0.5, zeros
+    abar_next = torch.cat([alphas_cumprod, torch.ones(1)])[list(previous_timesteps)]
+    if kind in MULTISTEP:
+        weights = {name: weight.float() for name, weight in MULTISTEP[kind](abar, abar_next).items()}
+    elif kind == "ddim":
+        weights = _ddim(abar, abar_next, eta)
     else:
-        alpha = alpha_prod / alpha_prod_prev
-        # diffusers keeps the variance away from 0; and adds no noise at all at timestep 0.
-        variance = (beta_prod_prev / beta_prod * (1 - alpha)).clamp(min=1e-20)
-        spread = torch.where(torch.tensor(timesteps) > 0, variance**0.5, zeros)
-        weights = (
-            alpha_prod_prev**0.5 * (1 - alpha) / beta_prod,
-            alpha**0.5 * beta_prod_prev / beta_prod,
-            zeros,
-            spread,
-        )
-    return StepCoefficients(beta_prod**0.5, alpha_prod**0.5, *weights, clip=clip)
+        weights = _ddpm(abar, abar_next)
+    names = [field.name for field in fields(StepCoefficients)[2:-1]]
+    all_weights = dict.fromkeys(names, torch.zeros(len(abar))) | weights
+    return StepCoefficients((1 - abar) ** 0.5, abar**0.5, **all_weights, clip=clip)
+
+
+def _variance(abar: Tensor, abar_next: Tensor) -> Tensor:
+    """DDPM's posterior variance between two timesteps ("fixed small"), f32 [K]."""
+    return (1 - abar_next) / (1 - abar) * (1 - abar / abar_next)
+
+
+def _ddpm(abar: Tensor, abar_next: Tensor) -> dict[str, Tensor]:
+    alpha = abar / abar_next
+    # diffusers keeps the variance away from 0; and no noise is added to the clean sample.
+    variance = _variance(abar, abar_next).clamp(min=1e-20)
+    return {
+        "clean_weight": abar_next**0.5 * (1 - alpha) / (1 - abar),
+        "sample_weight": alpha**0.5 * (1 - abar_next) / (1 - abar),
+        "spread": torch.where(abar_next < 1, variance**0.5, 0.0),
+    }
+
+
+def _ddim(abar: Tensor, abar_next: Tensor, eta: float) -> dict[str, Tensor]:
+    spread = eta * _variance(abar, abar_next) ** 0.5
+    return {
+        "clean_weight": abar_next**0.5,
+        "eps_weight": (1 - abar_next - spread**2).clamp(min=0) ** 0.5,  # rounding may lead below 0
+        "spread": spread,
+    }

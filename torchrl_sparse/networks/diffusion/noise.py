@@ -23,7 +23,10 @@ def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
 def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
     """Draw the noise of B queries, f32 [B, num_steps, H, A], row i from ``seed[i]`` alone.
 
-    Entry 0 is the initial sample, whatever ``num_steps``: a ten-step and a hundred-step sampler start from the same point.
+    Entry 0 is the initial sample, whatever ``num_steps``: a ten-step and a hundred-step sampler start from the same point,
+    and so they are paired. The gaussians of the transitions follow in one stream, entry k of a short chain being entry k
+    of a long one (of the last entry up to 16 numbers may differ, which is how torch draws); but those belong to other
+    intervals of noise, so that sharing them pairs nothing more. Chains of the same timesteps share everything.
 
     Args:
         seed: i64 [B].

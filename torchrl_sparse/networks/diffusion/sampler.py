@@ -1,123 +1,172 @@
-"""Samplers: diffusers' DDPM and DDIM with every noise tensor handed in from outside.
+"""Samplers: diffusers' own with every noise tensor handed in from outside, and the predicted clean sample always clipped.
 
-Diffusion Policy (arXiv:2303.04137) trains with 100 DDPM steps (arXiv:2006.11239), the squared-cosine beta
-schedule (arXiv:2102.09672), noise prediction and samples clipped to [-1, 1]. DDIM (arXiv:2010.02502, eta = 0)
-samples the same network in any smaller number of steps, by default at diffusers' ``"leading"`` timesteps, as Diffusion
-Policy does. Those lie evenly, end at 0 and, in few steps, begin far below the noise that the sample starts with (three of
-a hundred: 66, 33, 0); ``timesteps`` puts them elsewhere, and `torchrl_sparse.training.diffusion.timesteps` finds where.
+Diffusion Policy (arXiv:2303.04137) trains with 100 steps, the squared-cosine beta schedule (arXiv:2102.09672), noise prediction
+and samples clipped to [-1, 1]. The same network is sampled by
+
+======== ============ =====================================================================================
+kind     noise        method
+======== ============ =====================================================================================
+ddpm     every step   ancestral (arXiv:2006.11239); posterior variance of any two timesteps ("fixed small")
+ddim     none, or eta arXiv:2010.02502; ``eta`` times DDPM's standard deviation, fresh in every step
+dpmpp2m  none         DPM-Solver++ (2M), arXiv:2211.01095
+sde2m    every step   its SDE form, "sde-dpmsolver++"
+unipc    none         UniPC of order 2, B2(h), arXiv:2302.04867
+======== ============ =====================================================================================
+
+in any number of steps, at the timesteps of a spacing (`torchrl_sparse.networks.diffusion.spacing`) or at any that
+fall. DDPM and DDIM equal diffusers' classes to the last bit; the solvers equal theirs where nothing is clipped, since
+diffusers' solvers never clip. The equations are in `torchrl_sparse.networks.diffusion.coefficients` and
+`torchrl_sparse.networks.diffusion.multistep`, the names in `torchrl_sparse.networks.diffusion.naming`.
+
+Two steps are not new: GDP (arXiv:2510.21991) gets by with two network calls for diffusion policies, choosing among a
+population of chains; MIP (arXiv:2512.01809) trains a policy as two steps of regression and finds that supervised steps
+and stochasticity, not the fit of a distribution, are what helps; Hydra-DP3 (arXiv:2605.01581) argues that the denoising
+error of smooth actions saturates after very few steps, and takes two of DDIM.
 """
 
 from __future__ import annotations
 
-import re
+import reprlib
 from collections.abc import Sequence
 from itertools import pairwise
-from numbers import Integral
-from typing import Any, Literal
+from numbers import Integral, Real
+from typing import Any
 
 import torch
-from diffusers import DDIMScheduler, DDPMScheduler
+from diffusers import DDPMScheduler
 from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.coefficients import StepCoefficients, step_coefficients
+from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
+from torchrl_sparse.networks.diffusion.naming import KINDS, SamplerName
+from torchrl_sparse.networks.diffusion.spacing import spaced_timesteps
+from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["Sampler", "split_sampler", "timesteps_fall"]
+__all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler", "timesteps_fall"]
+
+MAX_TRAIN_TIMESTEPS = 10_000
+"""Far beyond any diffusion model: tables as long as this are made of what a file asks for."""
 
 
 class Sampler:
     """The denoising steps of one query, in execution order, and the noising of training.
 
     The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
-    noise of a query. Results equal theirs to the last bit.
+    noise of a query. A sampler cannot be changed: engines keep tables of its steps.
 
     Args:
-        kind: ``"ddpm"`` (ancestral, adds noise in every step but the last) or ``"ddim"`` (deterministic).
+        kind: ``"ddpm"``, ``"ddim"``, ``"dpmpp2m"``, ``"sde2m"`` or ``"unipc"``, see the module.
         num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
             ``timesteps``, or without those for all training steps.
-        num_train_timesteps: diffusion steps that the network was trained with.
-        timesteps: of DDIM's steps where they are not to be diffusers' own: K falling diffusion timesteps.
+        num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
+        timesteps: K falling diffusion timesteps, where no spacing shall decide.
+        eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance.
+        spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
+            :mod:`~torchrl_sparse.networks.diffusion.spacing`.
 
     Attributes:
         timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
         previous_timesteps: the timestep that each of them leads to; -1, the clean sample, in the end.
+        alphas_cumprod: abar of every diffusion timestep, f32 [T].
         coefficients: the update of each denoising step in numbers, for loops without a sampler.
-        scheduler: the diffusers scheduler.
 
     Raises:
-        ValueError: on an unknown ``kind``, a number of steps out of range, or ``timesteps`` that do not fall or are not DDIM's.
+        AttributeError: if an attribute is assigned.
+        ValueError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
+            ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM.
 
     Examples:
         >>> sampler = Sampler("ddim", num_inference_steps=10)
         >>> sampler.timesteps.tolist()
         [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]
-        >>> import torch
         >>> sample = torch.zeros(1, 10, 7)
         >>> sampler.step(torch.zeros_like(sample), 0, sample).shape
         torch.Size([1, 10, 7])
-        >>> Sampler("ddim", timesteps=[90, 50, 10]).name
-        'ddim_90_50_10'
+        >>> Sampler("ddpm", timesteps=[82, 14]).name, Sampler("ddpm", 2, spacing="logsnr").timesteps.tolist()
+        ('ddpm_82_14', [91, 41])
     """
+
+    kind: str
+    num_inference_steps: int
+    num_train_timesteps: int
+    eta: float
+    spacing: str
+    timesteps: Tensor
+    previous_timesteps: tuple[int, ...]
+    alphas_cumprod: Tensor
+    coefficients: StepCoefficients
 
     def __init__(
         self,
-        kind: Literal["ddpm", "ddim"] = "ddpm",
+        kind: str = "ddpm",
         num_inference_steps: int | None = None,
         num_train_timesteps: int = 100,
         *,
         timesteps: Sequence[int] | None = None,
+        eta: float = 0.0,
+        spacing: str = "leading",
     ) -> None:
-        if kind not in ("ddpm", "ddim"):
-            raise ValueError(f'kind must be "ddpm" or "ddim", got {kind!r}')
+        if kind not in KINDS:
+            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
         if num_inference_steps is None:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
-        if not 1 <= num_inference_steps <= num_train_timesteps:
+        check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
+        check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
+        if not isinstance(eta, Real) or not 0 <= eta <= 1 or (eta and kind != "ddim"):
             raise ValueError(
-                f"num_inference_steps must be in 1..{num_train_timesteps} (num_train_timesteps), "
-                f"got {num_inference_steps}"
+                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
-        self.kind = kind
-        self.num_inference_steps = num_inference_steps
-        self.num_train_timesteps = num_train_timesteps
-        common = {
-            "num_train_timesteps": num_train_timesteps,
-            "beta_schedule": "squaredcos_cap_v2",
-            "clip_sample": True,
-            "prediction_type": "epsilon",
-        }
-        if kind == "ddpm":
-            self.scheduler = DDPMScheduler(variance_type="fixed_small", **common)
+        scheduler = DDPMScheduler(num_train_timesteps, beta_schedule="squaredcos_cap_v2")
+        alphas_cumprod: Tensor = scheduler.alphas_cumprod
+        if timesteps is None:
+            order = _spaced(kind, spacing, num_inference_steps, alphas_cumprod)
         else:
-            self.scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **common)
-        self.scheduler.set_timesteps(num_inference_steps)
-        self._chosen = None if timesteps is None else self._checked(timesteps)
-        self.timesteps: Tensor = (
-            self.scheduler.timesteps.clone() if timesteps is None else torch.tensor(self._chosen)
+            order = _chosen(timesteps, spacing, num_inference_steps, num_train_timesteps)
+        previous = (*order[1:], -1)
+        vars(self).update(
+            kind=kind,
+            num_inference_steps=num_inference_steps,
+            num_train_timesteps=num_train_timesteps,
+            eta=float(eta),
+            spacing=spacing,
+            timesteps=torch.tensor(order),
+            previous_timesteps=previous,
+            alphas_cumprod=alphas_cumprod,
+            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=float(eta)),
+            _chosen=None if timesteps is None else tuple(order),
         )
-        self.previous_timesteps: list[int] = [*self.timesteps[1:].tolist(), -1]
-        self.coefficients: StepCoefficients = step_coefficients(
-            kind,
-            self.scheduler.alphas_cumprod,
-            self.timesteps.tolist(),
-            self.previous_timesteps,
-            clip=self.scheduler.config.clip_sample_range,
-        )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{name}: expected a sampler to stay as it was made; make another Sampler")
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
 
     @classmethod
     def from_name(
         cls, name: str, num_inference_steps: int | None = None, num_train_timesteps: int = 100
     ) -> Sampler:
-        """Make the sampler of that `name`; without ``num_inference_steps`` that of the constructor without it.
+        """Make the sampler of that name, see :mod:`~torchrl_sparse.networks.diffusion.naming`.
+
+        Args:
+            name: what :attr:`name` says, or with its number of steps, e.g. ``"ddpm10"``.
+            num_inference_steps: steps of a name that does not say how many; None as in the constructor.
+            num_train_timesteps: diffusion steps that the network was trained with.
 
         Raises:
             ValueError: if no sampler is called that, or not with so many steps.
         """
-        kind, timesteps = split_sampler(name)
-        return cls(kind, num_inference_steps, num_train_timesteps, timesteps=timesteps)
+        parts = SamplerName.parse(name)
+        written, asked = parts.num_inference_steps, num_inference_steps
+        if None not in (written, asked) and written != asked:
+            raise ValueError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
+        options = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
+        return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
     @property
     def name(self) -> str:
-        """``"ddpm"``, ``"ddim"``, or with its timesteps, where they were chosen, ``"ddim_90_50_10"``."""
-        return "_".join([self.kind, *map(str, self._chosen or [])])
+        """Its name without the number of steps: ``"ddpm"``, ``"ddpm_logsnr"``, ``"ddim_90_50_10"``."""
+        return str(SamplerName(self.kind, None, self._chosen, self.spacing, self.eta))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -127,9 +176,20 @@ class Sampler:
             "num_inference_steps": self.num_inference_steps,
             "num_train_timesteps": self.num_train_timesteps,
         }
-        return config if self._chosen is None else config | {"timesteps": self._chosen}
+        if self._chosen is not None:
+            config["timesteps"] = list(self._chosen)
+        if self.eta:
+            config["eta"] = self.eta
+        return config if self.spacing == "leading" else config | {"spacing": self.spacing}
 
-    def step(self, eps: Tensor, k: int, sample: Tensor, noise_k: Tensor | None = None) -> Tensor:
+    def step(
+        self,
+        eps: Tensor,
+        k: int,
+        sample: Tensor,
+        noise_k: Tensor | None = None,
+        cleans: Sequence[Tensor] = (),
+    ) -> Tensor:
         """Return the sample after denoising step ``k``.
 
         Args:
@@ -137,17 +197,33 @@ class Sampler:
             k: index of the denoising step in execution order, 0 .. K-1.
             sample: the sample that ``eps`` was predicted for, [B, H, A].
             noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by
-                DDIM nor by the last step.
+                deterministic samplers nor by the last step.
+            cleans: what :meth:`remember` returned after the step before; empty before the first.
 
         Raises:
             IndexError: if ``k`` is not in 0..K-1.
-            ValueError: if DDPM needs ``noise_k`` and it is None.
+            ValueError: if the step needs ``noise_k`` or ``cleans`` and they are missing.
         """
         if not 0 <= k < self.num_inference_steps:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
         if noise_k is None and self.coefficients.reads_noise(k):
-            raise ValueError(f"DDPM step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None")
-        return self.coefficients.update(k, sample, eps, noise_k)
+            raise ValueError(
+                f"{self.name} step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None"
+            )
+        if len(cleans) < (needed := min(k, self.coefficients.history)):
+            raise ValueError(
+                f"cleans: expected {needed} predictions before step k={k} of {self.name}, got {len(cleans)}"
+            )
+        return self.coefficients.update(k, sample, eps, noise_k, cleans)
+
+    def remember(self, cleans: Sequence[Tensor], eps: Tensor, k: int, sample: Tensor) -> tuple[Tensor, ...]:
+        """Return the clean predictions that the step after ``k`` reads, the latest first; empty where none does.
+
+        Arguments: :meth:`step`.
+        """
+        if not self.coefficients.history:
+            return ()
+        return (self.coefficients.clean(k, sample, eps), *cleans)[: self.coefficients.history]
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
         """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
@@ -157,21 +233,34 @@ class Sampler:
             noise: standard normal [B, H, A].
             timestep: i64 [B], 0 .. num_train_timesteps - 1.
         """
-        return self.scheduler.add_noise(clean, noise, timestep)
-
-    def _checked(self, timesteps: Sequence[int]) -> list[int]:
-        chosen = list(timesteps)
-        whole = all(isinstance(timestep, Integral) for timestep in chosen)
-        falls = whole and timesteps_fall(chosen, self.num_train_timesteps)
-        if self.kind != "ddim" or not falls or len(chosen) != self.num_inference_steps:
-            raise ValueError(
-                f"timesteps: expected {self.num_inference_steps} (num_inference_steps) whole numbers that fall from at most "
-                f'{self.num_train_timesteps - 1} to at least 0, of kind "ddim", got {chosen} of kind "{self.kind}"'
-            )
-        return [int(timestep) for timestep in chosen]
+        abar = self.alphas_cumprod.to(clean)[timestep][:, None, None]
+        return abar**0.5 * clean + (1 - abar) ** 0.5 * noise
 
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
+
+
+def _spaced(kind: str, spacing: str, steps: int, alphas_cumprod: Tensor) -> list[int]:
+    found = spaced_timesteps(spacing, steps, alphas_cumprod, without_last=kind in MULTISTEP)
+    num_train = len(alphas_cumprod)
+    if not timesteps_fall(found, num_train):
+        raise ValueError(
+            f"num_inference_steps: expected fewer, {spacing!r} has no {steps} falling timesteps of {num_train} for {kind!r}"
+        )
+    return found
+
+
+def _chosen(timesteps: Sequence[int], spacing: str, steps: int, num_train_timesteps: int) -> list[int]:
+    chosen = list(timesteps)
+    whole = all(isinstance(timestep, Integral) for timestep in chosen)
+    if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != steps:
+        raise ValueError(
+            f"timesteps: expected {steps} (num_inference_steps) whole numbers that fall from at most "
+            f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
+        )
+    if spacing != "leading":
+        raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
+    return [int(timestep) for timestep in chosen]
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
@@ -181,19 +270,3 @@ def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
     (True, False, False)
     """
     return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
-
-
-def split_sampler(name: str) -> tuple[str, list[int] | None]:
-    """Return the kind and the chosen timesteps of a `Sampler.name`.
-
-    Raises:
-        ValueError: if it is none.
-
-    Examples:
-        >>> split_sampler("ddim_90_50_10"), split_sampler("ddpm")
-        (('ddim', [90, 50, 10]), ('ddpm', None))
-    """
-    match = re.fullmatch(r"(ddpm|ddim)((?:_\d+)*)", name) if isinstance(name, str) else None
-    if match is None:
-        raise ValueError(f"sampler: expected 'ddpm', 'ddim' or 'ddim_<t>_<t>...', got {name!r}")
-    return match[1], [int(digits) for digits in match[2].split("_")[1:]] or None

@@ -19,11 +19,15 @@ import math
 import torch
 from torch import Tensor, nn
 
-__all__ = ["BLOCK_TYPES", "TransformerForDiffusion", "optimizer_groups"]
+from torchrl_sparse.networks.sizes import check_size
+
+__all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion", "optimizer_groups"]
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
 _INIT_STD = 0.02
-_SIZES = ("input_dim", "output_dim", "horizon", "n_obs_steps", "cond_dim", "n_layer", "n_head", "n_emb")
+# Attention masks are as large as the square of the horizon, and a layer takes a millisecond to make.
+_MAX_WIDTH, _MAX_TOKENS = 1 << 16, 4096
+MAX_LAYERS = 256
 
 
 class SinusoidalPosEmb(nn.Module):
@@ -73,7 +77,7 @@ class TransformerForDiffusion(nn.Module):
             transformer encoder.
 
     Raises:
-        ValueError: if a size is not positive or ``n_emb`` is not a multiple of ``n_head``.
+        ValueError: if a size is no positive number or far too large, or ``n_emb`` is not a multiple of ``n_head``.
 
     Examples:
         >>> network = TransformerForDiffusion(
@@ -283,12 +287,13 @@ def _causal_masks(horizon: int, num_memory: int) -> tuple[Tensor, Tensor]:
 
 
 def _check_config(config: dict) -> None:
-    for name in _SIZES:
-        if config[name] < 1:
-            raise ValueError(f"{name} must be at least 1, got {config[name]}")
+    for name in ("input_dim", "output_dim", "cond_dim", "n_emb", "n_head"):
+        check_size(name, config[name], _MAX_WIDTH)
+    for name in ("horizon", "n_obs_steps"):
+        check_size(name, config[name], _MAX_TOKENS)
+    check_size("n_layer", config["n_layer"], MAX_LAYERS)
+    check_size("n_cond_layers", config["n_cond_layers"], MAX_LAYERS, least=0)
     if config["n_emb"] % config["n_head"]:
         raise ValueError(
             f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"
         )
-    if config["n_cond_layers"] < 0:
-        raise ValueError(f"n_cond_layers must be >= 0, got {config['n_cond_layers']}")

@@ -7,11 +7,14 @@ batch statistics do not go together, a spatial softmax (arXiv:1509.06113) of 32 
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+
+from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["CameraEncoder", "VisionEncoder", "crop_centre", "crop_random", "spatial_softmax"]
 
@@ -19,6 +22,7 @@ _KEYPOINTS = 32
 _FEATURES = 64
 _CHANNELS_PER_GROUP = 16
 _STRIDE = 32
+_MAX_CAMERAS, _MAX_PIXELS, _MAX_WIDTH = 16, 4096, 4096
 
 
 def crop_centre(images: Tensor, size: tuple[int, int]) -> Tensor:
@@ -187,8 +191,13 @@ def _group_norm(channels: int) -> nn.GroupNorm:
 
 
 def _check(cameras: list[str], image_size: list[int], crop_size: list[int], width: int) -> None:
-    if not cameras or len(set(cameras)) != len(cameras):
-        raise ValueError(f"cameras: expected different names, at least one, got {cameras}")
+    named = all(isinstance(name, str) and name and "." not in name for name in cameras)  # as modules are
+    if not named or not 1 <= len(set(cameras)) == len(cameras) <= _MAX_CAMERAS:
+        raise ValueError(
+            f"cameras: expected different names, 1 to {_MAX_CAMERAS} of them, got {reprlib.repr(cameras)}"
+        )
+    for size in (*image_size, *crop_size):
+        check_size("image_size, crop_size", size, _MAX_PIXELS)
     if min(crop_size, default=0) <= _STRIDE:
         raise ValueError(
             f"crop_size: expected more than {_STRIDE} pixels, which make a map of more than one place, got {crop_size}"
@@ -200,5 +209,6 @@ def _check(cameras: list[str], image_size: list[int], crop_size: list[int], widt
         raise ValueError(
             f"crop_size: expected height and width within image_size {image_size}, got {crop_size}"
         )
-    if width < _CHANNELS_PER_GROUP or width % _CHANNELS_PER_GROUP:
+    check_size("width", width, _MAX_WIDTH)
+    if width % _CHANNELS_PER_GROUP:
         raise ValueError(f"width: expected a multiple of {_CHANNELS_PER_GROUP}, got {width}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,14 +11,19 @@ from typing import Any
 from tensordict import NestedKey
 
 from torchrl_sparse import keys
+from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["TransformerSize", "VLAConfig"]
 
 
-def _check_count(name: str, value: Any) -> None:
-    if not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name}: expected a positive whole number, got {value!r}")
+# Bounds, far beyond any use, on what a file can ask for before its weights are seen.
+_MAX_SIZE, _MAX_LAYERS, _MAX_PIXELS, _MAX_CHUNK = 1 << 20, 256, 4096, 4096
+
+
+def _is_key(value: Any) -> bool:
+    parts = value if isinstance(value, tuple) else (value,)
+    return bool(parts) and all(isinstance(part, str) for part in parts)
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,8 @@ class TransformerSize:
         mlp: width of the feed-forward network.
 
     Raises:
-        ValueError: if a size is not positive, or the width is no multiple of the heads with an even quotient.
+        ValueError: if a size is no positive number or far too large, or the width is no multiple of the heads with an even
+            quotient.
     """
 
     dim: int
@@ -40,8 +47,9 @@ class TransformerSize:
     mlp: int
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            _check_count(field.name, getattr(self, field.name))
+        for name in ("dim", "heads", "mlp"):
+            check_size(name, getattr(self, name), _MAX_SIZE)
+        check_size("layers", self.layers, _MAX_LAYERS)
         if self.dim % (2 * self.heads):
             raise ValueError(
                 f"dim: expected a multiple of 2 * heads = {2 * self.heads} (rotary embeddings), got {self.dim}"
@@ -90,8 +98,11 @@ class VLAConfig:
     crop_area: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("vocab_size", "image_size", "patch_size", "state_dim", "action_dim", "chunk_size"):
-            _check_count(name, getattr(self, name))
+        for name in ("vocab_size", "registers", "state_dim", "action_dim"):
+            check_size(name, getattr(self, name), _MAX_SIZE)
+        for name in ("image_size", "patch_size"):
+            check_size(name, getattr(self, name), _MAX_PIXELS)
+        check_size("chunk_size", self.chunk_size, _MAX_CHUNK)
         if self.image_size % self.patch_size:
             raise ValueError(
                 f"image_size: expected a multiple of patch_size={self.patch_size}, got {self.image_size}"
@@ -104,8 +115,8 @@ class VLAConfig:
             raise ValueError(
                 f"dino.mlp: expected a multiple of dino.dim={self.dino.dim}, got {self.dino.mlp}"
             )
-        if not 1 <= len(self.cameras) <= 2:
-            raise ValueError(f"cameras: expected one or two keys, got {list(self.cameras)}")
+        if not 1 <= len(self.cameras) <= 2 or not all(map(_is_key, self.cameras)):
+            raise ValueError(f"cameras: expected one or two keys, got {reprlib.repr(list(self.cameras))}")
         if not 0 < self.crop_area <= 1:
             raise ValueError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
 

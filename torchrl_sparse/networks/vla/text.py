@@ -98,10 +98,18 @@ class LlamaTokenizer:
 
         try:
             self._tokenizer = Tokenizer.from_str(definition)
-        except Exception as error:  # the Rust library raises plain Exceptions
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except (
+            BaseException
+        ) as error:  # the Rust library raises plain Exceptions, and panics that are not even those
             raise ValueError(f"expected the text of a tokenizer.json, got: {error}") from error
+        # Prompts are padded here; what a file asks for could be any length.
+        self._tokenizer.no_padding()
+        self._tokenizer.no_truncation()
         self.definition = definition
-        self.vocab_size = max(self._tokenizer.get_vocab_size(), _EMPTY_WORD_ID + 1)
+        highest = max(self._tokenizer.get_vocab().values(), default=0)
+        self.vocab_size = 1 + max(highest, _EMPTY_WORD_ID)
 
     @classmethod
     def from_file(cls, path: str | Path) -> LlamaTokenizer:

@@ -15,6 +15,8 @@ from torchrl_sparse.networks.normalize import Normalizer
 
 __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
+_STREAM = 2**32  # between two noises of an episode; no seed of an episode is as large
+
 
 class ConditionEncoder(nn.Module):
     """Computes the condition f32 [*B, To, D] of observations; D is the features' size and the state's together.
@@ -57,6 +59,9 @@ class ObservationEncoder(TensorDictModuleBase):
         normalizer: of states.
         vision: encoder of the cameras, if there are any.
 
+    Attributes:
+        noise_stream: which of the noises that an episode could have had; 0 unless another is assigned.
+
     Raises:
         ValueError: if features and state together are not what the network expects.
     """
@@ -77,6 +82,7 @@ class ObservationEncoder(TensorDictModuleBase):
                 f"got {network.cond_dim}"
             )
         self._state_shape = (network.n_obs_steps, state)
+        self.noise_stream = 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check(keys.read(tensordict, keys.HISTORY_STATE))
@@ -99,9 +105,8 @@ class ObservationEncoder(TensorDictModuleBase):
                 f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
             )
 
-    @staticmethod
-    def _seed(tensordict: TensorDictBase) -> Tensor:
+    def _seed(self, tensordict: TensorDictBase) -> Tensor:
         seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
         if seed is None or step is None:
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
-        return query_seed(seed, step)
+        return query_seed(seed + self.noise_stream * _STREAM, step)

@@ -147,7 +147,23 @@ class DiffusionPolicy(TensorDictSequential):
             engine=self.engine,
         )
         policy.source = self.source
+        policy.module["encode"].noise_stream = self.noise_stream
         return policy
+
+    def with_noise(self, stream: int) -> DiffusionPolicy:
+        """Return a policy of the same networks, planner and sampler that draws other noise: what chance alone does.
+
+        Args:
+            stream: 0 is the noise of every other policy.
+        """
+        policy = self.with_plan(self.plan)
+        policy.module["encode"].noise_stream = stream
+        return policy
+
+    @property
+    def noise_stream(self) -> int:
+        """Which of the noises that an episode could have had it draws; see `with_noise`."""
+        return self.module["encode"].noise_stream
 
     # -- numbers about it ----------------------------------------------------------------------------------------------
 

@@ -34,6 +34,7 @@ KNOWN_NAMES = {
 
 _REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 _MAX_DEPTH = 32
+_MAX_TEXT, _MAX_NAMES = 1000, 64
 _REQUIRED = object()
 
 
@@ -54,6 +55,7 @@ class PublishedConfig:
 
     def __init__(self, tree: Any) -> None:
         self._tree = _plain(tree, {}, _MAX_DEPTH)
+        self._found: dict[str, Any] = {}
         if not isinstance(self._tree, dict):
             raise ValueError(f"cfg: expected a configuration, got {type(tree).__name__}")
 
@@ -77,16 +79,37 @@ class PublishedConfig:
             raise ValueError(
                 f"cfg: {path}: expected a value, got the expression {value[:80]!r}: none is evaluated"
             )
+        if isinstance(value, str) and len(value) > _MAX_TEXT:
+            raise ValueError(f"cfg: {path}: expected at most {_MAX_TEXT} characters, got {len(value)}")
         accepted = (int, float) if kind is float else kind
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
             raise ValueError(f"cfg: {path}: expected {kind.__name__}, got {type(value).__name__}")
         return value
 
+    def names(self, path: str) -> list[str] | None:
+        """Return the names in the list at ``path``, or of the entries of the dict there; None if there is neither.
+
+        Raises:
+            ValueError: if there are too many, or it holds anything but names.
+        """
+        found = self._find(path, _MAX_DEPTH)
+        if found is None:
+            return None
+        plain = isinstance(found, (list, dict)) and len(found) <= _MAX_NAMES and all(map(_is_name, found))
+        if not plain:
+            raise ValueError(f"cfg: {path}: expected at most {_MAX_NAMES} names, got {type(found).__name__}")
+        return list(found)
+
     def _find(self, path: str, depth: int) -> Any:
-        node: Any = self._tree
-        for key in path.split("."):
-            node = self._follow(node.get(key) if isinstance(node, dict) else None, path, depth)
-        return node
+        """Return the entry at ``path``; what was found is kept, or references to references would multiply."""
+        if path.count(".") > _MAX_DEPTH:
+            raise ValueError(f"cfg: {path[:80]}: expected a path of at most {_MAX_DEPTH} levels")
+        if path not in self._found:
+            node: Any = self._tree
+            for key in path.split("."):
+                node = self._follow(node.get(key) if isinstance(node, dict) else None, path, depth)
+            self._found[path] = node
+        return self._found[path]
 
     def _follow(self, node: Any, path: str, depth: int) -> Any:
         reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
@@ -95,6 +118,10 @@ class PublishedConfig:
         if depth == 0:
             raise ValueError(f"cfg: {path}: expected a value, got references that go round in a circle")
         return self._find(reference.group(1), depth - 1)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _MAX_TEXT and "${" not in value
 
 
 def _plain(node: Any, done: dict[int, Any], depth: int) -> Any:

@@ -17,17 +17,14 @@ import torch
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.diffusion import StoredPolicy
 from torchrl_sparse.storage.published.config import KNOWN_NAMES, PublishedConfig
+from torchrl_sparse.storage.published.faults import naming_faults
 from torchrl_sparse.storage.published.inert_pickle import read_pickle
 from torchrl_sparse.storage.published.network import read_affine, read_network, read_sampler
 from torchrl_sparse.storage.published.torch_archive import StoredTensor, TorchArchive
 from torchrl_sparse.storage.published.vision import ImageLayout, read_vision
 from torchrl_sparse.storage.tensors import take
 
-__all__ = ["CheckpointError", "read_diffusion_policy"]
-
-
-class CheckpointError(ValueError):
-    """A file is no checkpoint that can be read; the message names the file, what was expected and what came."""
+__all__ = ["read_diffusion_policy"]
 
 
 def read_diffusion_policy(path: str | Path) -> StoredPolicy:
@@ -40,11 +37,8 @@ def read_diffusion_policy(path: str | Path) -> StoredPolicy:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"checkpoint: expected a file {path}")
-    try:
-        with TorchArchive(path) as archive:
-            return _read(archive)
-    except ValueError as error:
-        raise CheckpointError(f"{path}: {error}") from error
+    with naming_faults(path), TorchArchive(path) as archive:
+        return _read(archive)
 
 
 def _read(archive: TorchArchive) -> StoredPolicy:
@@ -54,15 +48,10 @@ def _read(archive: TorchArchive) -> StoredPolicy:
     if kind not in _READERS:
         raise ValueError(f"cfg: policy._target_: expected one of {sorted(_READERS)}, got {kind}")
     weights, tensors = _weights(config, payload)
-    counters = {
-        name: read_pickle(data)
-        for name, data in _mapping("pickles", payload.get("pickles", {})).items()
-        if isinstance(data, bytes)
-    }
     source = {
         "weights": weights,
         "task": config.get("task.name", str, None),
-        "epoch": counters.get("epoch"),
+        "epoch": _epoch(payload),
         "n_action_steps": config.get("n_action_steps", int),
     }
     policy = _READERS[kind](archive, config, tensors, source)
@@ -80,7 +69,7 @@ def _read_low_dim(
         *read_affine(archive, entries, "action", network.input_dim),
     )
     _nothing_left(entries)
-    source["state_keys"] = config.get("task.obs_keys", list, None)
+    source["state_keys"] = config.names("task.obs_keys")
     return StoredPolicy(network, normalizer, read_sampler(config), source=source)
 
 
@@ -90,11 +79,12 @@ def _read_images(
     layout = ImageLayout.of(config)
     network = read_network(archive, config, "policy", take(tensors, "model."))
     vision = read_vision(archive, config, layout, take(tensors, "obs_encoder.obs_nets."))
-    columns = layout.columns()
-    if len(columns) != network.cond_dim:
-        raise ValueError(f"cfg: shape_meta has {len(columns)} features, the tensors say {network.cond_dim}")
+    if layout.features != network.cond_dim:
+        raise ValueError(
+            f"cfg: shape_meta has {layout.features} features, the tensors say {network.cond_dim}"
+        )
     with torch.no_grad():
-        network.cond_obs_emb.weight.copy_(network.cond_obs_emb.weight[:, columns])
+        network.cond_obs_emb.weight.copy_(network.cond_obs_emb.weight[:, layout.columns()])
     entries = take(tensors, "normalizer.params_dict.")
     for key in layout.cameras.values():
         scale, offset = read_affine(archive, entries, key, 1)
@@ -116,6 +106,15 @@ _READERS = {
     "DiffusionTransformerLowdimPolicy": _read_low_dim,
     "DiffusionTransformerHybridImagePolicy": _read_images,
 }
+
+
+def _epoch(payload: Mapping) -> int | None:
+    """Return the epoch of the weights, which has a pickle of its own; None if there is none."""
+    data = _mapping("pickles", payload.get("pickles", {})).get("epoch")
+    epoch = read_pickle(data) if isinstance(data, bytes) else data
+    if epoch is not None and type(epoch) is not int:
+        raise ValueError(f"pickles: epoch: expected a whole number, got {type(epoch).__name__}")
+    return epoch
 
 
 def _weights(config: PublishedConfig, payload: Mapping) -> tuple[str, dict[str, StoredTensor]]:

@@ -15,6 +15,8 @@ from typing import Any
 __all__ = ["PLAIN", "Name", "Record", "read_pickle"]
 
 _KEYS = (str, int, float, bytes, type(None))
+_MAX_OPERATIONS = 1_000_000  # the tensors of the largest published policies take a quarter
+_MAX_BITS = 64
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ def read_pickle(
         persistent: makes an object of a persistent id; without it there may be none.
 
     Raises:
-        ValueError: if the pickle is damaged, mentions another name or needs any other operation.
+        ValueError: if the pickle is damaged, mentions another name, needs any other operation or more than a million, or
+            makes whole numbers of more than 64 bits or more bytes than it has itself.
 
     Examples:
         >>> import pickle
@@ -72,10 +75,14 @@ def read_pickle(
             ...
         ValueError: expected plain data, got a pickle that asks for builtins.print
     """
-    machine = _Machine(known, persistent)
+    machine = _Machine(known, persistent, len(data))
     try:
-        for opcode, argument in _operations(data):
-            machine.execute(opcode, argument)
+        for number, operation in enumerate(_operations(data)):
+            if number == _MAX_OPERATIONS:
+                raise ValueError(
+                    f"expected a pickle of at most {_MAX_OPERATIONS} operations, got a longer one"
+                )
+            machine.execute(*operation)
         return machine.result()
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
         # A damaged program underflows the stack, or applies operations to values that do not have them.
@@ -91,10 +98,10 @@ def _operations(data: bytes) -> Iterator[tuple[str, Any]]:
 
 
 class _Machine:
-    """Stack, marks and memo of one pickle."""
+    """Stack, marks and memo of one pickle, and how many bytes it may still make."""
 
-    def __init__(self, known: Mapping, persistent: Callable | None) -> None:
-        self._known, self._persistent = known, persistent
+    def __init__(self, known: Mapping, persistent: Callable | None, room: int) -> None:
+        self._known, self._persistent, self._room = known, persistent, room
         self._stack: list[Any] = []
         self._below_marks: list[list[Any]] = []
         self._memo: dict[int, Any] = {}
@@ -103,7 +110,7 @@ class _Machine:
         if opcode in _CONSTANTS:
             self._push(_CONSTANTS[opcode])
         elif opcode in _LITERALS:
-            self._push(argument)
+            self._push_literal(argument)
         elif opcode in _STORES:
             self._memo[len(self._memo) if argument is None else argument] = self._stack[-1]
         elif opcode in _FETCHES:
@@ -136,6 +143,13 @@ class _Machine:
     def _push(self, value: Any) -> None:
         self._stack.append(value)
 
+    def _push_literal(self, value: Any) -> None:
+        if isinstance(value, int) and value.bit_length() > _MAX_BITS:
+            raise ValueError(
+                f"expected whole numbers of at most {_MAX_BITS} bits, got one of {value.bit_length()}"
+            )
+        self._push(value)
+
     def _extend(self, items: list[Any]) -> None:
         if not isinstance(self._stack[-1], list):
             raise ValueError(f"expected a list to append to, got {type(self._stack[-1]).__name__}")
@@ -166,7 +180,14 @@ class _Machine:
             raise ValueError(
                 f"expected plain data, got a pickle that calls {getattr(name, 'path', 'a value')}"
             )
-        self._push(make(*arguments))
+        made = make(*arguments)
+        if isinstance(
+            made, bytes
+        ):  # of one string that it remembers, a pickle could have them made again and again
+            self._room -= len(made)
+            if self._room < 0:
+                raise ValueError("expected plain data, got a pickle that makes more bytes than it has")
+        self._push(made)
 
     def _set_state(self) -> None:
         (state,) = self._pop(1)

@@ -12,7 +12,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.published.config import PublishedConfig
 from torchrl_sparse.storage.published.torch_archive import StoredTensor, TorchArchive
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, take
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, shapes_of, take
 
 __all__ = ["read_affine", "read_network", "read_sampler", "read_tensors"]
 
@@ -24,7 +24,6 @@ _SAMPLER_SETTINGS = {
     "prediction_type": ("epsilon", "epsilon"),
 }
 _DDPM_SETTINGS = {"variance_type": ("fixed_small", "fixed_small")}
-_MAX_STEPS = 10_000
 _DDIM_SETTINGS = {"set_alpha_to_one": (True, True), "steps_offset": (0, 0)}
 
 
@@ -56,12 +55,18 @@ def read_network(
         "p_drop_attn": config.get(f"{section}.p_drop_attn", float, 0.0),
         "causal_attn": bool(masks),
     }
-    with torch.device("meta"):  # sizes are checked before memory is taken for them
-        shapes = {k: tuple(v.shape) for k, v in TransformerForDiffusion(**arguments).state_dict().items()}
-    check_shapes("model", stored, shapes)
+    with torch.device("meta"):  # everything is compared with the tensors before memory is taken for it
+        declared = TransformerForDiffusion(**arguments)
+    expected = {"mask": declared.mask, "memory_mask": declared.memory_mask} if masks else {}
+    check_shapes("model", shapes_of(masks), shapes_of(expected))
+    check_shapes("model", shapes_of(stored), shapes_of(declared.state_dict()))
+    _check_options(config, section, declared)
+    tensors = read_tensors(archive, "model", stored)
     network = TransformerForDiffusion(**arguments)
-    _check_options(archive, config, section, network, masks)
-    network.load_state_dict(read_tensors(archive, "model", stored))
+    for name, value in masks.items():
+        if not torch.equal(archive.tensor(value), network.get_buffer(name)):
+            raise ValueError(f"model.{name}: expected the causal mask, got another")
+    network.load_state_dict(tensors)
     return network.eval()
 
 
@@ -93,7 +98,7 @@ def _describe(stored: Mapping[str, StoredTensor], name: str) -> str:
     return f"shape {stored[name].shape}" if name in stored else "none"
 
 
-def _check_options(archive, config, section: str, network: TransformerForDiffusion, masks: Mapping) -> None:
+def _check_options(config: PublishedConfig, section: str, network: TransformerForDiffusion) -> None:
     """Compare what the tensors tell with what the configuration says."""
     said = {
         f"{section}.causal_attn": (
@@ -106,11 +111,6 @@ def _check_options(archive, config, section: str, network: TransformerForDiffusi
     for name, (configured, found) in said.items():
         if configured != found:
             raise ValueError(f"cfg: {name} is {configured}, the tensors say {found}")
-    expected = {"mask": network.mask, "memory_mask": network.memory_mask} if masks else {}
-    check_shapes("model", masks, {name: tuple(value.shape) for name, value in expected.items()})
-    for name, value in expected.items():
-        if not torch.equal(archive.tensor(masks[name]), value):
-            raise ValueError(f"model.{name}: expected the causal mask, got another")
 
 
 def read_sampler(config: PublishedConfig) -> Sampler:
@@ -131,11 +131,10 @@ def read_sampler(config: PublishedConfig) -> Sampler:
         if found != supported:
             raise ValueError(f"cfg: {section}.{option}: expected {supported!r}, got {found!r}")
     train_steps = config.get(f"{section}.num_train_timesteps", int)
-    if train_steps > _MAX_STEPS:
-        raise ValueError(
-            f"cfg: {section}.num_train_timesteps: expected at most {_MAX_STEPS}, got {train_steps}"
-        )
-    return Sampler(kind, config.get("policy.num_inference_steps", int, train_steps), train_steps)
+    try:
+        return Sampler(kind, config.get("policy.num_inference_steps", int, train_steps), train_steps)
+    except ValueError as error:
+        raise ValueError(f"cfg: {section}: {error}") from error
 
 
 def read_affine(
@@ -148,9 +147,8 @@ def read_affine(
     """
     entry = {k: v for k, v in take(stored, f"{name}.").items() if not k.startswith("input_stats.")}
     single = "scale" in entry and entry["scale"].shape == (1,)  # one number for all dimensions
-    check_shapes(
-        f"normalizer: {name}", entry, dict.fromkeys(("scale", "offset"), (1,) if single else (size,))
-    )
+    expected = dict.fromkeys(("scale", "offset"), (1,) if single else (size,))
+    check_shapes(f"normalizer: {name}", shapes_of(entry), expected)
     tensors = read_tensors(archive, f"normalizer: {name}", entry)
     return tensors["scale"].expand(size).clone(), tensors["offset"].expand(size).clone()
 

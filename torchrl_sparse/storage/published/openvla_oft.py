@@ -24,7 +24,9 @@ from torchrl_sparse.networks.vla.network import make_network
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
 from torchrl_sparse.storage.json import read_json
-from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, take
+from torchrl_sparse.storage.published.faults import naming_faults
+from torchrl_sparse.storage.published.torch_archive import TorchArchive
+from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, shapes_of, take
 from torchrl_sparse.storage.vla import StoredVLA
 
 __all__ = ["read_openvla_oft"]
@@ -60,8 +62,16 @@ def read_openvla_oft(
     """Read the policy in the folder ``path``; see `VLAPolicy.from_openvla_oft`.
 
     Raises:
-        FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+        FileNotFoundError: if a file is not there.
+        CheckpointError: naming the file, what was expected in it and what was found.
     """
+    with naming_faults(path):
+        return _read(path, unnorm_key, cameras, heads, dtype)
+
+
+def _read(
+    path: Path, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype
+) -> StoredVLA:
     if list(path.glob("vision_backbone*checkpoint*")):
         raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
     image_size = _image_size(path / "config.json")
@@ -69,10 +79,11 @@ def read_openvla_oft(
     config = _config(path, tensors, heads, image_size, VLAConfig().cameras[:cameras])
     statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
     normalizer = _normalizer(path / "dataset_statistics.json", statistics, config)
-    network = make_network(config, dtype=dtype)
     weights = _rename(tensors, config)
-    check_shapes(str(path), weights, {name: tuple(v.shape) for name, v in network.state_dict().items()})
+    expected = make_network(config, device="meta").state_dict()  # compared before memory is taken for it
+    check_shapes(str(path), shapes_of(weights), shapes_of(expected))
     check_finite(str(path), weights)
+    network = make_network(config, dtype=dtype)
     network.load_state_dict(weights)
     return StoredVLA(network.eval(), normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
 
@@ -117,8 +128,9 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
         found = [file.name for file in files]
         raise ValueError(f"{path}: expected exactly one file {pattern}, got {found}")
     try:
-        tensors = torch.load(files[0], map_location="cpu", weights_only=True)
-    except Exception as error:  # torch reports damaged and unsafe files through many exception types
+        with TorchArchive(files[0]) as archive:
+            tensors = {name: archive.tensor(value) for name, value in archive.contents().items()}
+    except (AttributeError, ValueError) as error:  # AttributeError: it holds anything but tensors by name
         raise ValueError(f"{files[0]}: expected a file of tensors, got: {error}") from error
     return {prefix + name.removeprefix("module."): value for name, value in tensors.items()}
 

@@ -39,6 +39,8 @@ _DAMAGED = (
     NotImplementedError,
     RuntimeError,
 )
+_MAX_AXES = 8
+_READS = 4  # how often, on average, an archive's bytes may be read: tensors that share a storage each read it
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class StoredTensor:
 
 class TorchArchive:
     """A file of ``torch.save``, open for reading. Nothing in it is executed, and tensors are read one by one.
+
+    What it says of a tensor is compared with its record before anything is made of it, and all tensors that are read take
+    no more than a few times the room of the file.
 
     Args:
         path: the file.
@@ -90,6 +95,8 @@ class TorchArchive:
             self._zip.close()
             raise ValueError(f"expected one entry <name>/data.pkl in the archive, got {len(pickles)}")
         self._folder = pickles[0].removesuffix("data.pkl")
+        self._size = path.stat().st_size
+        self._unread = _READS * self._size
 
     def __enter__(self) -> TorchArchive:
         return self
@@ -104,14 +111,14 @@ class TorchArchive:
             known: names that the pickle may mention besides those of tensors, see `read_pickle`.
 
         Raises:
-            ValueError: if the pickle is damaged or asks for anything else.
+            ValueError: if the pickle is damaged or asks for anything else, or a tensor's record has another length.
         """
         if f"{self._folder}byteorder" in self._zip.namelist():
             order = self._read("byteorder")
             if order != b"little":
                 raise ValueError(f"byteorder: expected little, got {order[:20]!r}")
         names = {"torch._utils._rebuild_tensor_v2": _rebuild, **dict.fromkeys(_DTYPES)}
-        return read_pickle(self._read("data.pkl"), {**known, **names}, _storage)
+        return read_pickle(self._read("data.pkl"), {**known, **names}, self._storage)
 
     def tensor(self, stored: StoredTensor) -> Tensor:
         """Read one tensor.
@@ -121,36 +128,49 @@ class TorchArchive:
         """
         storage = stored.storage
         data = self._read(f"data/{storage.record}")
-        if len(data) != storage.numel * storage.dtype.itemsize:
-            raise ValueError(
-                f"data/{storage.record}: expected {storage.numel * storage.dtype.itemsize} bytes, got {len(data)}"
-            )
         if not data:
             return torch.empty(stored.shape, dtype=storage.dtype)
         flat = torch.frombuffer(bytearray(data), dtype=storage.dtype)
         return flat.as_strided(stored.shape, stored.stride, stored.offset).clone()
 
     def _read(self, record: str) -> bytes:
+        entry = self._entry(record)
+        self._unread -= entry.file_size
+        if self._unread < 0:
+            raise ValueError(
+                f"{record}: expected tensors with storages of their own, got some that share {entry.file_size} bytes"
+            )
         try:
-            entry = self._zip.getinfo(self._folder + record)
-            # torch stores; a compressed entry could unfold into more than there is memory for.
-            if entry.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{record}: expected an entry that is not compressed")
             return self._zip.read(entry)
-        except KeyError as error:
-            raise ValueError(f"{record}: expected an entry of this name, got none") from error
         except _DAMAGED as error:
             raise ValueError(f"{record}: cannot be read: {error}") from error
 
+    def _entry(self, record: str) -> zipfile.ZipInfo:
+        """Return the entry of a record, checked to be stored as it is and to lie within the file."""
+        try:
+            entry = self._zip.getinfo(self._folder + record)
+        except KeyError as error:
+            raise ValueError(f"{record}: expected an entry of this name, got none") from error
+        # torch stores; a compressed entry could unfold into more than there is memory for.
+        if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
+            raise ValueError(f"{record}: expected an entry that is not compressed")
+        if entry.file_size > self._size:
+            raise ValueError(
+                f"{record}: expected at most the file's {self._size} bytes, got {entry.file_size}"
+            )
+        return entry
 
-def _storage(identity: Any) -> _Storage:
-    if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
-        raise ValueError("expected references to storages, got another persistent id")
-    _, kind, record, _, numel = identity
-    dtype = _DTYPES.get(kind.path) if isinstance(kind, Name) else None
-    if dtype is None or not isinstance(record, str) or not _is_size(numel):
-        raise ValueError("expected a storage of a known type, with the name of its record and its size")
-    return _Storage(record, dtype, numel)
+    def _storage(self, identity: Any) -> _Storage:
+        if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
+            raise ValueError("expected references to storages, got another persistent id")
+        _, kind, record, _, numel = identity
+        dtype = _DTYPES.get(kind.path) if isinstance(kind, Name) else None
+        if dtype is None or not isinstance(record, str) or not _is_size(numel):
+            raise ValueError("expected a storage of a known type, with the name of its record and its size")
+        length = self._entry(f"data/{record}").file_size
+        if length != numel * dtype.itemsize:
+            raise ValueError(f"data/{record}: expected {numel * dtype.itemsize} bytes, got {length}")
+        return _Storage(record, dtype, numel)
 
 
 def _rebuild(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> StoredTensor:
@@ -158,6 +178,7 @@ def _rebuild(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> Sto
     if (
         not isinstance(storage, _Storage)
         or not sizes_fit
+        or len(shape) > _MAX_AXES
         or not all(map(_is_size, (offset, *shape, *stride)))
     ):
         raise ValueError("expected a tensor as storage, offset, shape and stride")

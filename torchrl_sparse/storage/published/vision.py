@@ -14,7 +14,7 @@ from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.storage.published.config import PublishedConfig
 from torchrl_sparse.storage.published.network import read_tensors
 from torchrl_sparse.storage.published.torch_archive import StoredTensor, TorchArchive
-from torchrl_sparse.storage.tensors import check_shapes, take
+from torchrl_sparse.storage.tensors import check_shapes, shapes_of, take
 
 __all__ = ["ImageLayout", "read_vision"]
 
@@ -50,7 +50,7 @@ class ImageLayout:
         order: dict[str, int] = {}
         cameras: dict[str, str] = {}
         sizes = set()
-        for key in config.get("policy.shape_meta.obs", dict):
+        for key in config.names("policy.shape_meta.obs") or ():
             shape = _sizes(config, f"policy.shape_meta.obs.{key}.shape")
             if config.get(f"policy.shape_meta.obs.{key}.type", str, "low_dim") == "rgb":
                 cameras[_camera_name(key, cameras)] = key
@@ -66,6 +66,11 @@ class ImageLayout:
                 f"cfg: shape_meta: expected states and RGB images of one size, got {list(order)}"
             )
         return cls(order, cameras, states, size[1:])
+
+    @property
+    def features(self) -> int:
+        """Size of the condition."""
+        return sum(self.order.values())
 
     def columns(self) -> list[int]:
         """Return the indices, in the published condition, of each number of the condition here, cameras first."""
@@ -108,8 +113,8 @@ def read_vision(
         )
     arguments: dict[str, Any] = {"image_size": layout.image_size, "crop_size": crop, "width": widths.pop()}
     with torch.device("meta"):
-        shapes = VisionEncoder(list(layout.cameras), **arguments).state_dict()
-    check_shapes("obs_encoder", tensors, {name: tuple(value.shape) for name, value in shapes.items()})
+        expected = VisionEncoder(list(layout.cameras), **arguments).state_dict()
+    check_shapes("obs_encoder", shapes_of(tensors), shapes_of(expected))
     vision = VisionEncoder(list(layout.cameras), **arguments)
     vision.load_state_dict(tensors)
     return vision.eval()
@@ -158,6 +163,10 @@ def _check_pool(key: str, pool: Mapping[str, Tensor | None]) -> None:
             f"obs_encoder: {key}: expected temperature 1, got {temperature.flatten()[:3].tolist()}"
         )
     height, width = len(y.unique()), len(x.unique())
+    if height * width != x.numel():  # the grid could be as large as the square of what the file holds
+        raise ValueError(
+            f"obs_encoder: {key}: expected a regular grid from -1 to 1, got {height} x {width} in {x.numel()}"
+        )
     grid = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     for name, found, expected in (("pos_y", y, grid[0]), ("pos_x", x, grid[1])):
         if found.shape != (1, expected.numel()) or not torch.allclose(

@@ -1,12 +1,14 @@
 """A search for the timesteps at which a chain of few denoising steps does best.
 
-DDIM (arXiv:2010.02502) may stop at any timesteps. diffusers spaces them evenly, which in a few steps begins too low for
-a sample of pure noise and spends the last step at timestep 0, where hardly any noise is left. Which timesteps suit a
-trained policy can be measured without training: the error of its actions against demonstrated ones says it, and a
-descent over single timesteps finds a minimum (for the same idea with a likelihood instead, see arXiv:2106.03802).
+A sampler may stop at any timesteps. The spacing ``"leading"`` in a few steps begins too low for a sample of pure noise
+and spends the last step at timestep 0, where hardly any noise is left; ``"logsnr"`` is a rule that mends both without
+looking at the policy (`torchrl_sparse.networks.diffusion.spacing`). Which timesteps suit a trained policy can be
+measured without training: the error of its actions against demonstrated ones says it, and a descent over single
+timesteps finds a minimum (for the same idea with a likelihood instead, see arXiv:2106.03802).
 
-The error ranks chains of one length only: an average of several good answers also has a small error, and the shorter a
-chain, the more it averages. Episodes have the last word.
+The error ranks chains of one length and one kind only: an average of several good answers also has a small error, the
+shorter a chain, the more it averages, and fresh noise adds to the error what it takes from the average. Episodes have
+the last word.
 """
 
 from __future__ import annotations
@@ -66,21 +68,21 @@ def search_timesteps(
 
 
 def demonstration_error(
-    policy: DiffusionPolicy, targets: TensorDict, timesteps: Sequence[int], *, n_action_steps: int = 8
+    policy: DiffusionPolicy, targets: TensorDict, sampler: Sampler, *, n_action_steps: int = 8
 ) -> float:
-    """Return the mean absolute error, normalised, of the executed actions of a DDIM chain against demonstrated ones.
+    """Return the mean absolute error, normalised, of the actions executed under a sampler against demonstrated ones.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
         targets: [N], from data, see `torchrl_sparse.training.diffusion.targets.make_targets`.
-        timesteps: of the chain.
+        sampler: of the chain; its noise is that of the targets' seeds, the same in every call.
         n_action_steps: actions executed of a chunk.
     """
     chain = DiffusionPolicy(
         policy.network,
         policy.normalizer,
         vision=policy.vision,
-        sampler=Sampler("ddim", num_train_timesteps=policy.sampler.num_train_timesteps, timesteps=timesteps),
+        sampler=sampler,
         engine=policy.engine,
     )
     first = policy.n_obs_steps - 1

@@ -18,6 +18,10 @@ class PrunerConfig:
     """Options of a training; defaults as published.
 
     Attributes:
+        objective: what the gates are to change little: ``"actions"``, the final actions of the pruned chain (SAG; static
+            gates trained so are ``l2c``), or ``"noise"``, the noise predicted in a single step after a dense one, from
+            noised targets (Learning-to-Cache's own; ``l2c_noise``): ``reuse`` is then ``"block"``, only every other
+            step is pruned, and ``norm`` (published: ``"l2"``) is all that shapes the error.
         rate: target prune rate rho, in (0, 1), of what ``cost`` counts.
         rate_range: lowest and highest target; with it every sample of a batch gets a target of its own, uniform
             in that range, and the gates must take it as an input. They then keep it exactly, and the sparsity loss
@@ -47,6 +51,7 @@ class PrunerConfig:
         ValueError: if a value is out of its range.
     """
 
+    objective: Literal["actions", "noise"] = "actions"
     rate: float = 0.91
     rate_range: tuple[float, float] | None = None
     epochs: int = 30
@@ -68,6 +73,7 @@ class PrunerConfig:
 
     def __post_init__(self) -> None:
         for name, allowed in (
+            ("objective", ("actions", "noise")),
             ("norm", ("l1", "l2")),
             ("estimator", ("ste", "gumbel")),
             ("sparsity", ("global", "block")),
@@ -77,6 +83,8 @@ class PrunerConfig:
             if (value := getattr(self, name)) not in allowed:
                 raise ValueError(f"{name}: expected one of {list(allowed)}, got {value!r}")
         check_reuse(self.reuse)
+        if self.objective == "noise" and self.reuse != "block":
+            raise ValueError(f"reuse: expected 'block' with objective 'noise', got {self.reuse!r}")
         check_rates(self.rate, self.rate_range)
         if self.rate_range is not None:  # YAML brings a list
             object.__setattr__(self, "rate_range", tuple(self.rate_range))

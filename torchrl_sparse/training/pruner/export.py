@@ -17,8 +17,9 @@ __all__ = ["export_planner"]
 def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping[str, Any]) -> Path:
     """Write the planner that was trained so far; return where.
 
-    That is a cache schedule, ``l2c.json``, for static gates. For those that read the observation it is a folder ``pruner``
-    for `SAGPruner.from_pretrained`, with the schedule of their mean mask, the ablation, beside it: ``fixed.json``.
+    That is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
+    objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the
+    schedule of their mean mask, the ablation, beside it: ``fixed.json``.
 
     Args:
         trainer: the gates, and what they were trained for.
@@ -28,17 +29,19 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
     folder, config, policy = Path(folder), trainer.config, trainer.policy
     settings = {**asdict(config), **settings, "updates": trainer.step}
     is_static = trainer.gates.is_static
+    static_name = "l2c_noise" if config.objective == "noise" else "l2c"
     schedule = CacheSchedule.from_mask(
         trainer.fixed_mask(),
-        method="l2c" if is_static else "sag_fixed",
+        method=static_name if is_static else "sag_fixed",
         policy=policy.fingerprint,
         sampler=policy.sampler.name,
         reuse=config.reuse,
         settings=settings,
     )
     if is_static:
-        schedule.save_pretrained(folder / "l2c.json")
-        return folder / "l2c.json"
+        path = folder / f"{static_name}.json"
+        schedule.save_pretrained(path)
+        return path
     schedule.save_pretrained(folder / "fixed.json")
     info = PrunerInfo(
         policy=policy.fingerprint,

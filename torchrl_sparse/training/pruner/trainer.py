@@ -5,7 +5,8 @@ The frozen policy answers observations of a small calibration set under the pred
     L = |a(M) - a*|_p + beta * |mean(M) - rho|
 
 a(M) being the normalised actions of the whole chain and a* the targets: those of the dense policy on the same noise, or of the
-demonstration. The mean can count blocks, as in the paper, or weigh them by what they cost.
+demonstration. The mean can count blocks, as in the paper, or weigh them by what they cost. The first term can also be
+Learning-to-Cache's own (arXiv:2406.01733), of the noise predicted in one step (`PrunerConfig.objective`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.l2c import noise_errors
 from torchrl_sparse.blocks.sag.planner import rate_threshold
 from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -55,9 +57,12 @@ class PrunerTrainer(Trainer):
                 f"rate_range: expected one if and only if the gates read the rate, "
                 f"got {config.rate_range} and rate_input={gates.rate_input}"
             )
-        highest = 1 - 1 / policy.num_inference_steps
+        steps = torch.arange(policy.num_inference_steps)
+        self._may_prune = (steps % 2 == 1 if config.objective == "noise" else steps > 0)[:, None]
+        highest = self._may_prune.double().mean().item()
         if (asked := max(config.rate_range or (config.rate,))) > highest:
-            raise ValueError(f"rate: expected at most {highest:g}, since the first step is kept, got {asked}")
+            kept = "every other step" if config.objective == "noise" else "the first step"
+            raise ValueError(f"rate: expected at most {highest:g}, since {kept} is kept, got {asked}")
         if len(targets) < 2:
             raise ValueError(f"targets: expected at least 2 observations, got {len(targets)}")
         self.gates, self.policy = gates, policy
@@ -142,8 +147,7 @@ class PrunerTrainer(Trainer):
         """Return the masks bool [B, K, 3L] as they will be used, at the rate that is trained for."""
         self.gates.eval()
         masks = self._logits(cond, torch.full((len(cond), 1), self.config.rate)) > 0
-        masks[:, 0] = False
-        return masks
+        return masks & self._may_prune
 
     def _logits(self, cond: Tensor, rate: Tensor) -> Tensor:
         if not self.gates.rate_input:
@@ -154,8 +158,10 @@ class PrunerTrainer(Trainer):
     def _gate(self, cond: Tensor, rate: Tensor) -> Tensor:
         logits = self._logits(cond, rate)
         if self.config.estimator == "gumbel":
-            return gumbel_gate(logits, self.config.temperature)
-        return straight_through_gate(logits)
+            gate = gumbel_gate(logits, self.config.temperature)
+        else:
+            gate = straight_through_gate(logits)
+        return gate * self._may_prune
 
     def _draw_rates(self, batch: int) -> Tensor:
         if self.config.rate_range is None:
@@ -165,20 +171,27 @@ class PrunerTrainer(Trainer):
 
     def _fidelity(self, batch: TensorDict, gate: Tensor) -> Tensor:
         config, policy = self.config, self.policy
-        query = (
-            policy.network,
-            policy.sampler,
-            policy.sample_noise(batch[keys.SEED].squeeze(-1)),
-            batch[keys.COND],
-        )
-        options = {
-            "reuse": config.reuse,
-            "explore": config.explore,
-            "checkpointed": config.checkpointed,
-        }
-        if config.gradient == "step":
-            error = step_errors(*query, gate, **options)
+        if config.objective == "noise":
+            error = self._noise_errors(batch, gate)
         else:
-            actions = denoise_relaxed(*query, gate, **options)
-            error = (actions - batch["target"]).abs()
-        return error.mean() if config.norm == "l1" else error.square().mean()
+            noise = policy.sample_noise(batch[keys.SEED].squeeze(-1))
+            query = policy.network, policy.sampler, noise, batch[keys.COND], gate
+            options = {
+                "reuse": config.reuse,
+                "explore": config.explore,
+                "checkpointed": config.checkpointed,
+            }
+            if config.gradient == "step":
+                error = step_errors(*query, **options)
+            else:
+                error = denoise_relaxed(*query, **options) - batch["target"]
+        return error.abs().mean() if config.norm == "l1" else error.square().mean()
+
+    def _noise_errors(self, batch: TensorDict, gate: Tensor) -> Tensor:
+        """Return the errors of one step for the whole batch, drawn with its noise, as L2C's release does."""
+        clean, policy = batch["target"], self.policy
+        step = 1 + 2 * int(torch.randint(policy.num_inference_steps // 2, ()))
+        noise = torch.randn(len(clean), 2, *clean.shape[1:])
+        return noise_errors(
+            policy.network, policy.sampler, clean, noise, batch[keys.COND], gate[:, step], step
+        )

@@ -55,7 +55,7 @@ def exact(network, sampler, noise, cond, mask=None, reuse="block"):
 
 
 @pytest.mark.parametrize("instruction_set", SETS)
-@pytest.mark.parametrize(("kind", "steps"), [("ddpm", 12), ("ddim", 10), ("ddpm", 1)])
+@pytest.mark.parametrize(("kind", "steps"), [("ddpm", 12), ("ddim", 10), ("ddpm", 1), ("unipc", 6)])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_equals_the_reference_for_random_masks(shape, kind, steps, instruction_set):
     network, sampler = make_network(shape), Sampler(kind, steps)
@@ -70,7 +70,7 @@ def test_equals_the_reference_for_random_masks(shape, kind, steps, instruction_s
 def test_property_any_rate_and_rule(seed):
     generator = torch.Generator().manual_seed(seed)
     rate = torch.rand((), generator=generator).item() ** 0.3
-    kind, reuse = ("ddpm", "ddim")[seed % 2], ("block", "type", "single")[seed // 2 % 3]
+    kind, reuse = ("ddpm", "ddim", "sde2m", "unipc")[seed % 4], ("block", "type", "single")[seed % 3]
     shape = list(SHAPES)[torch.randint(len(SHAPES), (), generator=generator)]
     network, sampler = make_network(shape, action_dim=1 + seed), Sampler(kind, 9)
     noise, cond, mask = make_query(network, sampler, batch=3, rate=rate, seed=seed)
@@ -79,12 +79,26 @@ def test_property_any_rate_and_rule(seed):
     assert (actual - expected).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("timesteps", [[90, 50, 49, 10], [7], [99, 0]])
-def test_chosen_timesteps(timesteps):
-    network, sampler = make_network(), Sampler("ddim", timesteps=timesteps)
-    noise, cond, mask = make_query(network, sampler)
-    actual = NativeEngine(network, sampler).denoise(noise, cond, mask)
-    assert (actual - exact(network, sampler, noise, cond, mask)).abs().max() < 1e-5
+@pytest.mark.parametrize(
+    "name",
+    ["ddim_90_50_49_10", "ddim_7", "ddim_99_0", "ddpm_82_14", "ddpm10_trailing", "ddim_90_50_10_eta0.5",
+     "dpmpp2m5", "dpmpp2m2", "sde2m6_logsnr", "unipc_90_50_49_10"],
+)  # fmt: skip
+def test_every_sampler(name):
+    network, sampler = make_network(), Sampler.from_name(name)
+    engine = NativeEngine(network, sampler)
+    for seed in range(2):  # the second query finds what the first one left in memory
+        noise, cond, mask = make_query(network, sampler, seed=seed)
+        expected = exact(network, sampler, noise, cond, mask)
+        assert (engine.denoise(noise, cond, mask) - expected).abs().max() < 1e-5
+
+
+def test_a_query_without_finite_noise_leaves_nothing_behind():
+    network, sampler = make_network(), Sampler("unipc", 5)
+    engine, (noise, cond, _) = NativeEngine(network, sampler), make_query(network, sampler, batch=1)
+    expected = engine.denoise(noise, cond)
+    engine.denoise(torch.full_like(noise, torch.nan), cond)
+    assert torch.equal(engine.denoise(noise, cond), expected)
 
 
 def test_published_sizes_over_the_whole_chain():

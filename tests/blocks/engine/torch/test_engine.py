@@ -19,7 +19,7 @@ SHAPES = {
     "not causal": {"horizon": 4, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32, "causal_attn": False},
     "condition layers": {"horizon": 4, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32, "n_cond_layers": 1},
 }  # fmt: skip
-SCHEDULES = [("ddpm", 12), ("ddpm", 1), ("ddim", 10)]
+SCHEDULES = [("ddpm", 12), ("ddpm", 1), ("ddim", 10), ("sde2m", 5), ("unipc", 6)]
 
 
 def make_network(shape, std=0.2):

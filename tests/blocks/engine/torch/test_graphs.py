@@ -44,7 +44,7 @@ def test_a_captured_program_plays_its_computed_blocks_in_order():
 
 
 @pytest.mark.parametrize("shape", ["small", "condition layers"])
-@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+@pytest.mark.parametrize("kind", ["ddpm", "ddim", "unipc"])
 def test_a_dense_loop_is_one_graph(shape, kind):
     network, sampler, graphs = make_network(shape), Sampler(kind, 4), RecordedGraph()
     engine = captured_engine(network, sampler, graphs)

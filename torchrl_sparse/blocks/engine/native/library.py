@@ -13,12 +13,15 @@ from ctypes import c_int32, c_int64, c_void_p
 from functools import lru_cache
 from pathlib import Path
 
+from torchrl_sparse.blocks.engine.native.packing import Model
+
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
 
 INSTRUCTION_SETS = ("portable", "avx2", "avx512", "avx512_bf16")
 # Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),
+    "sparse_model_size": (c_int64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
     "sparse_denoise": (None, [c_int32, c_void_p, c_void_p, c_int32, *[c_void_p] * 4]),
     "sparse_blocks": (None, [c_int32, c_void_p, c_int32, c_void_p]),
@@ -42,9 +45,12 @@ def _load(folder: Path) -> ctypes.CDLL | str:
     if path is None:
         return f"{paths[0].name} was not built (install a C++17 compiler, g++ or clang++, then this package again)"
     try:
-        return _declare(ctypes.CDLL(str(path)))
+        found = _declare(ctypes.CDLL(str(path)))
     except (OSError, AttributeError) as error:
         return f"{path.name} cannot be loaded ({error}); install the package again"
+    if found.sparse_model_size() != ctypes.sizeof(Model):
+        return f"{path.name} was built from other sources; install the package again"
+    return found
 
 
 def _declare(found: ctypes.CDLL) -> ctypes.CDLL:

@@ -42,13 +42,14 @@ struct Layer {
 
 struct Model {
     int32_t horizon, width, layers, heads, obs_steps, action_dim, cond_dim, steps, causal;
+    int32_t history;            // 0 unless the sampler reads earlier clean predictions
     float clip;
     const Layer* layer;
     Matrix embed, head, encode_up, encode_down;  // embed and encode_up have a bias for each row: it holds the positions
     const float* time_key;      // [steps][layers][heads][padded width], the folded keys of the time tokens
     const float* time_value;    // likewise
     const float* time_bias;     // [steps][layers][heads]
-    const float* coefficients;  // [steps][6], see coefficients.py
+    const float* coefficients;  // [steps][8], see coefficients.py
     const float* valid;         // [padded width]: 1 for each column, 0 for the padding
 };
 
@@ -81,6 +82,7 @@ struct Buffers {
     // Of folded vectors, of activations, of one and of all padded heads, of hidden activations, of scores.
     const int width, ld, head, inner, ldh, lanes;
     float *x, *y, *qkv, *mixed, *hidden, *rounded, *eps, *sample, *constant, *latest;
+    float* cleans;  // [2][horizon]: the clean predictions of the step before and of the one before it
     float *token, *key, *value, *key_bias, *scores;  // memory tokens of cross-attention: [layers][1 + obs_steps][heads]
     size_t size;
     Buffers(const Model& m, int slots, float* at)
@@ -97,6 +99,7 @@ struct Buffers {
         rounded = take(tokens * ldh);
         eps = take(m.horizon * stride(m.action_dim));
         sample = take(m.horizon * stride(m.action_dim));
+        cleans = take(2 * m.horizon * stride(m.action_dim));
         constant = take(m.horizon * width);
         latest = take((size_t)slots * m.horizon * ld);
         token = take(m.obs_steps * ld);
@@ -161,6 +164,9 @@ int32_t sparse_levels() {
     return 1;
 #endif
 }
+
+// For the caller to compare with its own: a library that was built from other sources reads other structures.
+int64_t sparse_model_size() { return (int64_t)sizeof(Model); }
 
 // Floats that a call needs as scratch, which must start on a cache line (64 bytes).
 int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(*m, slots, nullptr).size; }
@@ -537,20 +543,29 @@ struct Query {
         }
     }
 
-    // Predicts the noise from the residual stream and takes the scheduler's step.
+    // Predicts the noise from the residual stream and takes the sampler's step, with MEMORY of earlier clean predictions.
+    template <bool MEMORY>
     void advance(int step, const float* noise) const {
         normalise(b.x, b.y);
         const int lda = stride(m.action_dim);
         product(b.y, b.ld, m.horizon, m.head, b.eps, lda);
-        const float* c = m.coefficients + 6 * step;
+        const float* c = m.coefficients + 8 * step;
+        float* const previous = b.cleans;
+        float* const earlier = previous + m.horizon * lda;
         for (int t = 0; t < m.horizon; t++)
             for (int j = 0; j < m.action_dim; j++) {
                 float& sample = b.sample[t * lda + j];
                 const float eps = b.eps[t * lda + j];
                 float clean = (sample - c[0] * eps) / c[1];
                 clean = clean > m.clip ? m.clip : clean < -m.clip ? -m.clip : clean;
-                const float next = c[2] * clean + c[3] * sample + c[4] * eps;
-                sample = noise ? next + c[5] * noise[t * m.action_dim + j] : next;
+                float next = c[2] * clean + c[3] * sample + c[4] * eps;
+                if constexpr (MEMORY) {
+                    const int at = t * lda + j;
+                    next += c[5] * previous[at] + c[6] * earlier[at];
+                    earlier[at] = previous[at];
+                    previous[at] = clean;
+                }
+                sample = noise ? next + c[7] * noise[t * m.action_dim + j] : next;
             }
     }
 
@@ -561,6 +576,8 @@ struct Query {
         constant.bias = b.constant;
         bool known = false;  // whether b.constant is of the latest outputs
         for (int t = 0; t < m.horizon; t++) copy(noise + t * m.action_dim, m.action_dim, b.sample + t * lda);
+        if (m.history)
+            for (int i = 0; i < 2 * m.horizon * lda; i++) b.cleans[i] = 0;
         for (int step = 0; step < m.steps; step++, pruned += blocks) {
             const bool empty = run_end(pruned, 0, blocks) == blocks;
             if (empty && !known) reuse(m.embed.bias, b.width, b.constant, b.width, 0, blocks);
@@ -571,7 +588,8 @@ struct Query {
                 if (end > block) reuse(b.x, b.ld, b.x, b.ld, block, end);
                 if (end < blocks) compute(step, end);
             }
-            advance(step, step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr);
+            const float* const gaussian = step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr;
+            m.history ? advance<true>(step, gaussian) : advance<false>(step, gaussian);
         }
         for (int t = 0; t < m.horizon; t++) copy(b.sample + t * lda, m.action_dim, actions + t * m.action_dim);
     }

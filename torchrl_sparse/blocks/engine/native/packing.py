@@ -50,9 +50,9 @@ class _Layer(ctypes.Structure):
 class Model(ctypes.Structure):
     """``struct Model`` of native.cpp."""
 
-    _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps", "causal"]
+    _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps"]
     _fields_ = [
-        *((name, c_int32) for name in _SIZES),
+        *((name, c_int32) for name in (*_SIZES, "causal", "history")),
         ("clip", c_float),
         ("layer", POINTER(_Layer)),
         *((name, Matrix) for name in ("embed", "head", "encode_up", "encode_down")),
@@ -98,6 +98,7 @@ class PackedNetwork:
             cond_dim=network.cond_dim,
             steps=sampler.num_inference_steps,
             causal=network.causal_attn,
+            history=sampler.coefficients.history,
             clip=sampler.coefficients.clip,
             layer=self._array(_Layer, packed),
             embed=self._arena.matrix(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -51,7 +52,9 @@ class Workspace:
         self._tables, self._batch = tables, batch
         self._memory, self._scratch = Memory(tables, batch), BlockScratch(network, batch)
         self._parts: dict[int, _Part] = {}
-        self._sample, self._clean, self._eps = new(3, rows, network.input_dim).unbind(0)
+        self._sample, self._clean, self._eps, *self._earlier = new(
+            3 + tables.history, rows, network.input_dim
+        ).unbind(0)
         self._step_table = new(tables.num_steps, tables.coefficients.shape[1] + self._sample.numel())
         self._step_table[:, : tables.coefficients.shape[1]] = tables.coefficients
         self._step_row = torch.empty_like(self._step_table[0])
@@ -92,6 +95,8 @@ class Workspace:
     def denoise(self, loop: Loop, noise: Tensor, cond: Tensor) -> Tensor:
         """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
         self._sample.copy_(noise[:, 0].flatten(0, 1))
+        for earlier in self._earlier:
+            earlier.zero_()
         # What step k adds is the gaussian of the transition to step k + 1; the last step adds none.
         gaussians = noise[:, 1:].transpose(0, 1)
         target = self._step_table[:-1, len(self._coefficients) :].view(gaussians.shape)
@@ -188,7 +193,7 @@ class Workspace:
     def _finish_step(self) -> None:
         """Predict the noise and take the sampler's step (``StepCoefficients.update`` says what it computes)."""
         tables, sample, clean = self._tables, self._sample, self._clean
-        noise_scale, signal_scale, clean_weight, sample_weight, eps_weight = self._coefficients
+        noise_scale, signal_scale, clean_weight, sample_weight, eps_weight, *weights = self._coefficients
         eps = torch.addmm(
             tables.head_bias, self._scratch.normalise(self._x), tables.head_weight, out=self._eps
         )
@@ -198,6 +203,10 @@ class Workspace:
         sample.addcmul_(clean, clean_weight)
         if tables.weighs_eps:
             sample.addcmul_(eps, eps_weight)
+        for earlier, weight in zip(self._earlier, weights, strict=False):
+            sample.addcmul_(earlier, weight)
+        for newer, older in reversed(list(pairwise([clean, *self._earlier]))):
+            older.copy_(newer)
 
 
 class _Part:

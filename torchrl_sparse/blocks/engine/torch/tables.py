@@ -39,9 +39,10 @@ class Tables:
         blocks: one callable for each column of a mask.
         time: the folded time token of each denoising step; None if the condition encoder must see all tokens at
             once.
-        coefficients: [K, 5], those of :mod:`torchrl_sparse.networks.diffusion.coefficients` but the last, the first
+        coefficients: [K, 7], those of :mod:`torchrl_sparse.networks.diffusion.coefficients` but the last, the first
             with a minus.
-        weighs_eps: the last of them is not 0 throughout.
+        weighs_eps: the weight of the predicted noise is not 0 throughout.
+        history: earlier clean predictions that the steps read.
         spread: [K].
         counts: ``counts[slots][first][last]``, how often the blocks first .. last-1 read each of the buffers that
             blocks share.
@@ -67,7 +68,7 @@ class Tables:
         columns = coefficients.table()[:, :-1].clone()
         columns[:, 0].neg_()
         self.coefficients = columns.to(self.stem_weight)
-        self.weighs_eps = bool(coefficients.eps_weight.any())
+        self.weighs_eps, self.history = bool(coefficients.eps_weight.any()), coefficients.history
         self.counts = {n: _count_table(network.num_blocks, n, self.stem_weight) for n in _SHARED_BUFFERS}
 
     def _fold_time(self, layers: list[FoldedLayer]) -> list[FoldedMemory]:

@@ -1,0 +1,33 @@
+"""Simulate benchmarks that stop when they are decided: how often they claim what is not so, and how many episodes they save.
+
+python recipes/simulate_stopping.py out=assets/statistics
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.evaluation.figures.stopping import plot_stopping
+from torchrl_sparse.evaluation.results.stopping import save_stopping, simulate_stopping
+
+
+@recipe("simulate_stopping")
+def main(config: DictConfig) -> None:
+    results = simulate_stopping(config.max_episodes, config.looks, config.trials, config.seed)
+    out = Path(config.out)
+    save_stopping(results, out / "stopping.json")
+    plot_stopping(results, out / "stopping.png")
+    for case in results.type_one:
+        print(f"{case.task}, {case.margin}: {100 * case.rate:.1f} % claimed at the margin")
+    for case in results.savings:
+        saved, decided = 100 * case.savings.saved, 100 * (case.savings.non_inferior + case.savings.inferior)
+        print(
+            f"{case.task}, {100 * case.difference:+.0f} points: {saved:.0f} % saved, {decided:.0f} % decided"
+        )
+
+
+if __name__ == "__main__":
+    main()

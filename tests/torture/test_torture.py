@@ -1,0 +1,116 @@
+"""The campaign, shortened to two minutes, and its page."""
+
+import os
+import random
+import sys
+
+import pytest
+
+from tests.torture.archives import torture_archives
+from tests.torture.contents import contents, difference
+from tests.torture.engine_fuzz import torture_engines
+from tests.torture.files import fault_of, torture_files
+from tests.torture.folders import torture_folder
+from tests.torture.kills import KILL, RESUMED, Killer
+from tests.torture.limits import Outcome, run_limited
+from tests.torture.recipes import tiny_recipes
+from tests.torture.report import PAGE, Campaign, Verdict, format_report, load_report, render_page
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills and limits are Linux's own")
+SEED = 0
+
+
+def assert_survived(verdicts, at_least):
+    verdicts = list(verdicts)
+    assert len(verdicts) >= at_least
+    faults = [verdict for verdict in verdicts if verdict.fault is not None]
+    assert not faults, "\n".join(map(str, faults))
+
+
+def test_malformed_files_are_refused_by_name_and_in_time():
+    assert_survived(torture_files(SEED, share=0.18), at_least=300)
+
+
+def test_hostile_archives_execute_and_exhaust_nothing():
+    assert_survived(torture_archives(), at_least=100)
+
+
+def test_engines_answer_or_refuse():
+    assert_survived(torture_engines(SEED, queries=80, library=None, seconds=300), at_least=3 * 80)
+
+
+@pytest.fixture(scope="module")
+def killer(tmp_path_factory):
+    """Of the recipe that takes least."""
+    work = tmp_path_factory.mktemp("torture")
+    return Killer(next(tiny_recipes(work)), work / "runs", random.Random(SEED))
+
+
+def test_a_killed_recipe_goes_on_as_if_never_killed(killer):
+    verdicts = list(killer.chain(kills=3))
+    assert [verdict.part for verdict in verdicts[-2:]] == [KILL, RESUMED]
+    assert_survived(verdicts, at_least=2)
+
+
+def test_a_shared_folder_and_a_full_disk(killer, tmp_path):
+    assert_survived(torture_folder(killer, tmp_path, random.Random(SEED)), at_least=2)
+
+
+def test_what_breaks_limits_is_told_from_errors():
+    assert run_limited(lambda: None) == Outcome(None, "")
+    assert run_limited(lambda: int("x")).error == "ValueError"
+    assert run_limited(lambda: bytearray(3 << 30)).error == "MemoryError"
+    assert run_limited(lambda: sum(iter(int, 1)), seconds=1).text == "took more than its seconds"
+    assert "SIGABRT" in run_limited(os.abort).text
+
+
+@pytest.mark.parametrize(
+    ("outcome", "keys", "fault"),
+    [
+        (Outcome(None, ""), None, None),
+        (Outcome(None, ""), ("rate",), "got an answer"),
+        (Outcome("ValueError", "a.json: rate: expected"), ("rate",), None),
+        (Outcome("ValueError", "rate: expected"), ("rate",), "the file to be named"),
+        (Outcome("ValueError", "a.json: expected"), ("rate",), "rate to be named"),
+        (Outcome("ValueError", "a.json: rate\nmore"), ("rate",), "expected one line"),
+        (Outcome("KeyError", "a.json: rate"), None, "expected a refusal"),
+        (Outcome("died", "did not end"), None, "expected a refusal"),
+    ],
+)
+def test_faults_of_outcomes(outcome, keys, fault):
+    found = fault_of(outcome, "a.json", keys)
+    assert (found is None) == (fault is None)
+    assert fault is None or fault in found
+
+
+def test_differences_of_runs_are_found_and_times_are_none(tmp_path):
+    line = '{"seed": 1, "length": 30, "latency": [0.1]}\n'
+    for name, text in {
+        "one": line,
+        "later": line.replace("0.1", "0.2"),
+        "other": line.replace("30", "31"),
+        "twice": 2 * line,
+    }.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "dense.jsonl").write_text(text)
+    left = {folder.name: contents(folder) for folder in tmp_path.iterdir()}
+    assert difference(left["later"], left["one"]) is None
+    assert "dense.jsonl differs" in difference(left["other"], left["one"])
+    assert "dense.jsonl differs" in difference(left["twice"], left["one"])
+    (tmp_path / "one" / ".dense.tmp.jsonl").write_text("half")
+    assert ".dense.tmp.jsonl" in difference(contents(tmp_path / "one"), left["later"])
+
+
+def test_a_report_counts_and_names():
+    campaign = Campaign(seed=3, command="make torture")
+    campaign.add(Verdict("kill", "sweep", "SIGINT after 1.0 s", tags=("SIGINT",)))
+    campaign.add(Verdict("kill", "sweep", "SIGINT after 2.0 s", "hung", ("SIGINT",)))
+    text = format_report(campaign.report(minutes=1.0))
+    assert "2 cases, 1 survived" in text
+    assert "- kill, sweep, SIGINT after 2.0 s: hung" in text
+    with pytest.raises(ValueError, match="expected one <!-- report -->"):
+        render_page("no place", campaign.report(minutes=1.0))
+
+
+def test_the_page_and_its_json_agree():
+    assert render_page(PAGE.read_text(), load_report()) == PAGE.read_text()

@@ -1,0 +1,56 @@
+"""What every task offers, whichever simulator it runs in."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from torchrl.envs import EnvBase
+
+__all__ = ["Task"]
+
+
+class Task(Protocol):
+    """One task; `RobosuiteTask` and `StateTask` are the two kinds here.
+
+    Attributes:
+        name: of the task in results.
+        alias: short name for folders and command lines.
+        early_cut: steps within which a policy of the expert's speed is done; None where that was not measured.
+        state_dim, action_dim: sizes of the low-dimensional observation and of the action.
+        state_keys: names, in demonstration files, of the observations whose concatenation is the state.
+        proprioception_keys: those of them that remain where cameras show the objects; ValueError for a task without cameras.
+        acts_in_poses: whether actions are absolute poses of arms.
+        demonstrator: class whose instances act out one demonstration, see `torchrl_sparse.envs.experts.demonstrators`.
+    """
+
+    name: str
+    alias: str
+    early_cut: int | None
+
+    @property
+    def state_dim(self) -> int: ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    @property
+    def state_keys(self) -> tuple[str, ...]: ...
+
+    @property
+    def proprioception_keys(self) -> tuple[str, ...]: ...
+
+    @property
+    def acts_in_poses(self) -> bool: ...
+
+    @property
+    def demonstrator(self) -> type: ...
+
+    def make(self, **kwargs: Any) -> EnvBase:
+        """Make the task's environment; its class documents ``kwargs`` and errors."""
+
+    def load_expert(self) -> type:
+        """Import the class of the task's scripted expert.
+
+        Raises:
+            ValueError: if there is none; the message lists the tasks that have one.
+        """

@@ -1,0 +1,76 @@
+"""The episodes of a benchmark: a fixed number of each method, or as many as its verdict takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import closing
+
+from torchrl.envs import EnvBase
+
+from torchrl_sparse.evaluation.results.build import Terms
+from torchrl_sparse.evaluation.results.schema import DENSE
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
+from torchrl_sparse.evaluation.statistics.sequential import Design
+
+__all__ = ["episode_horizon", "make_design", "play_rounds"]
+
+_LOOKS = 30  # of a benchmark that goes on until it is decided
+_UNTIL = ("episodes", "decided")
+
+
+def make_design(until: str, episodes: int, max_episodes: int) -> Design:
+    """Return when a benchmark looks at its episodes.
+
+    Args:
+        until: "episodes" for a fixed number, "decided" to go on until a method's verdicts are reached.
+        episodes: that fixed number.
+        max_episodes: cap of the others; part of the design, and so not to be raised once episodes were seen.
+
+    Raises:
+        ValueError: for another ``until``, or a number below 1.
+
+    >>> make_design("episodes", 400, 1300).ends, make_design("decided", 400, 1300).ends[:2]
+    ((400,), (43, 86))
+    """
+    if until not in _UNTIL:
+        raise ValueError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
+    if until == "episodes":
+        return Design(episodes)
+    return Design(max_episodes, min(_LOOKS, max_episodes))
+
+
+def episode_horizon(make_env: Callable[..., EnvBase]) -> int:
+    """Return the steps after which the environment that `make_env` makes truncates an episode."""
+    with closing(make_env(seeds=[0])) as env:
+        return env.base_env.horizon
+
+
+def play_rounds(
+    names: Iterable[str], play: Callable[[str, int], list[EpisodeResult]], terms: Terms
+) -> dict[str, list[EpisodeResult]]:
+    """Play every method until its verdict is reached or the cap is, and dense as far as any of them.
+
+    Nothing but the episodes decides, look by look, so a benchmark that was killed stops where it would have stopped.
+
+    Args:
+        names: of methods, dense among them or not.
+        play: called as ``play(name, n)``, returns the method's first n episodes; those that it has are not run again.
+        terms: of the comparison.
+
+    Returns:
+        name -> its episodes, in the order in which methods were played, dense first.
+    """
+    episodes: dict[str, list[EpisodeResult]] = {DENSE: []}
+    for name in names:
+        if name == DENSE:
+            continue
+        for n in terms.design.ends:
+            if len(episodes[DENSE]) < n:
+                episodes[DENSE] = play(DENSE, n)
+            episodes[name] = play(name, n)
+            if terms.decided(pair_episodes(name, episodes[name], DENSE, episodes[DENSE][:n])):
+                break
+    if not episodes[DENSE]:
+        episodes[DENSE] = play(DENSE, terms.design.max_episodes)
+    return episodes

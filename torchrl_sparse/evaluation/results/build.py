@@ -1,0 +1,196 @@
+"""From what was measured of a benchmark to the content of its ``results.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl_sparse.evaluation.latency.measure import Latency, Machine
+from torchrl_sparse.evaluation.results.parts import (
+    ActionError,
+    Difference,
+    Flops,
+    Interval,
+    Percentiles,
+    PolicyShape,
+    PValues,
+    Success,
+    TimeDifference,
+    TokensKept,
+)
+from torchrl_sparse.evaluation.results.schema import DENSE, SCHEMA, MethodEntry, Results, Stopping
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals, totals
+from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_episodes
+from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
+from torchrl_sparse.evaluation.statistics.durations import (
+    DEFAULT_TIME_MARGIN,
+    TimeRatio,
+    allowed_steps,
+    correlation,
+    success_within,
+    time_ratio,
+)
+from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, paired_difference
+from torchrl_sparse.evaluation.statistics.sequential import Design
+
+__all__ = ["MethodRun", "Terms", "build_results", "compare_episodes"]
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """Everything measured of one method.
+
+    Attributes:
+        episodes: its episodes, the same seeds as every other method's, in any order; where benchmarks stop when they are
+            decided, some of dense's.
+        latency: of one query, measured interleaved with the other methods.
+        action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
+            observations and the same noise; (0, 0) for the dense policy.
+        planning: of the planner alone, within a query; where it looks at the observation.
+    """
+
+    episodes: Sequence[EpisodeResult]
+    latency: Latency
+    action_error: tuple[float, float]
+    planning: Latency | None = None
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a comparison goes by, agreed on before its episodes ran.
+
+    Attributes:
+        design: when the episodes are looked at.
+        episode_horizon: steps after which an episode is truncated.
+        early_cut: of the task, see `torchrl_sparse.envs.tasks`; None for a task without one.
+        margin: of success: a difference of rates.
+        time_margin: of the restricted mean time: a share of dense's.
+    """
+
+    design: Design
+    episode_horizon: int
+    early_cut: int | None = None
+    margin: float = DEFAULT_MARGIN
+    time_margin: float = DEFAULT_TIME_MARGIN
+
+    def statistics(self, pairs: EpisodePairs) -> tuple[float, float]:
+        """Return by how many standard errors success and time are better than their margins."""
+        return pairs.statistics(self.episode_horizon, self.margin, self.time_margin)
+
+    def decided(self, pairs: EpisodePairs) -> bool:
+        """Tell whether the verdict of a method on these episodes, at a look of the design, is reached."""
+        return self.design.decides(len(pairs.method), *self.statistics(pairs))
+
+
+def build_results(
+    runs: Mapping[str, MethodRun],
+    *,
+    task: str,
+    split: str,
+    seed: int,
+    terms: Terms,
+    machine: Machine,
+    policy: PolicyShape,
+) -> Results:
+    """Make the content of ``results.json`` from what was measured.
+
+    Args:
+        runs: method name -> its run; ``"dense"``, which all are compared with, must be there.
+        task: name of the task.
+        split: of the seeds, see `torchrl_sparse.envs.seeds`.
+        seed: of the whole benchmark.
+        terms: of the comparisons.
+        machine: see `describe_machine`.
+        policy: the dense policy.
+
+    Raises:
+        ValueError: if dense is missing, methods ran on different seeds, or a value is out of range.
+    """
+    if DENSE not in runs:
+        raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
+    design = terms.design
+    return Results(
+        SCHEMA,
+        task,
+        split,
+        seed,
+        terms.episode_horizon,
+        machine,
+        policy,
+        {name: _entry(name, run, runs[DENSE], terms) for name, run in runs.items()},
+        early_cut=terms.early_cut,
+        until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
+    )
+
+
+def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms) -> MethodEntry:
+    cost, tokens = totals(run.episodes), token_totals(run.episodes)
+    return MethodEntry(
+        success=Success.of([episode.success for episode in run.episodes]),
+        **compare_episodes(name, run.episodes, dense.episodes, terms),
+        prune_rate=cost.prune_rate,
+        flops=Flops(cost.flops_per_query, cost.flops_per_query / totals(dense.episodes).flops_per_query),
+        latency_s=Percentiles.of(run.latency),
+        speedup_vs_dense=dense.latency.p50 / run.latency.p50,
+        speedup_ci95=_speedup_interval(run.latency, dense.latency),
+        action_error_vs_dense=ActionError(*map(float, run.action_error)),
+        episode_length=cost.episode_length,
+        planning_s=None if run.planning is None else Percentiles.of(run.planning),
+        tokens=None if tokens is None else TokensKept(tokens.mean, tokens.fine, tokens.coarse),
+    )
+
+
+def compare_episodes(
+    name: str, episodes: Sequence[EpisodeResult], dense: Sequence[EpisodeResult], terms: Terms
+) -> dict[str, Any]:
+    """Return the fields of a `MethodEntry` that follow from a method's episodes and dense's alone.
+
+    Args:
+        name: of the method.
+        episodes: its own.
+        dense: the dense policy's; where the design has several looks, perhaps more of them.
+        terms: of the comparison.
+
+    Raises:
+        ValueError: if the seeds do not fit.
+    """
+    if terms.design.looks > 1:
+        seeds = {episode.seed for episode in episodes}
+        dense = [episode for episode in dense if episode.seed in seeds]
+    pairs = pair_episodes(name, episodes, DENSE, dense)
+    ours, theirs = pairs.times(terms.episode_horizon)
+    steps = allowed_steps(terms.episode_horizon, terms.early_cut)
+    shares = success_within(pairs.solved[0], ours, steps)
+    return {
+        **(_to_itself(len(ours), terms) if name == DENSE else _to_dense(pairs, terms)),
+        "restricted_mean_time": float(ours.mean()),
+        "success_within": {str(step): share for step, share in shares.items()},
+        "correlation_with_dense": correlation(ours, theirs),
+    }
+
+
+def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
+    n, design, horizon = len(pairs.method), terms.design, terms.episode_horizon
+    confidence = design.confidence(n)
+    solved = paired_difference(*pairs.solved, terms.margin, confidence)
+    times = time_ratio(*pairs.times(horizon), horizon, terms.time_margin, confidence)
+    p_values = (design.p_value(abs(z), n) for z in terms.statistics(pairs))
+    return {
+        "paired_vs_dense": Difference.of(solved),
+        "time_vs_dense": TimeDifference.of(times),
+        "p_values": PValues(*p_values),
+    }
+
+
+def _to_itself(n: int, terms: Terms) -> dict[str, Any]:
+    """Dense equals itself by definition: nothing is estimated, and nothing is tested."""
+    solved = PairedDifference(0.0, (0.0, 0.0), terms.margin, "non-inferior", 0, 0, n)
+    times = TimeRatio(1.0, (1.0, 1.0), terms.time_margin, "non-inferior", n)
+    return {"paired_vs_dense": Difference.of(solved), "time_vs_dense": TimeDifference.of(times)}
+
+
+def _speedup_interval(latency: Latency, dense: Latency) -> Interval | None:
+    if not latency.samples:
+        return None
+    return median_ratio_interval(dense.samples, latency.samples)

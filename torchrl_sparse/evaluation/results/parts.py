@@ -1,0 +1,199 @@
+"""What files of results are made of: rates, differences, percentiles, each checked on reading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl_sparse.evaluation.latency.measure import Latency
+from torchrl_sparse.evaluation.statistics.durations import TimeRatio
+from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Verdict, wilson_interval
+
+__all__ = [
+    "ActionError",
+    "Difference",
+    "Flops",
+    "Interval",
+    "PValues",
+    "Percentiles",
+    "PolicyShape",
+    "Success",
+    "TimeDifference",
+    "TokensKept",
+    "require",
+]
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PolicyShape:
+    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed."""
+
+    params: int
+    num_inference_steps: int
+    horizon: int
+    n_obs_steps: int
+    n_action_steps: int
+
+
+@dataclass(frozen=True)
+class Success:
+    """Episodes solved, with Wilson's 95 % interval of the rate.
+
+    >>> Success.of([True, False]).rate
+    0.5
+    """
+
+    k: int
+    n: int
+    rate: float
+    ci95: Interval
+
+    def __post_init__(self) -> None:
+        require(self.n >= 1, "n", "at least 1", self.n)
+        require(0 <= self.k <= self.n, "k", f"0 to {self.n}", self.k)
+        rate = self.k / self.n
+        require(math.isclose(self.rate, rate, abs_tol=1e-9), "rate", f"k / n = {rate}", self.rate)
+        check_interval(self.ci95)
+        require(self.ci95[0] >= 0 and self.ci95[1] <= 1, "ci95", "limits in [0, 1]", self.ci95)
+
+    @classmethod
+    def of(cls, outcomes: Sequence[bool]) -> Success:
+        """Count the successes of episodes."""
+        k, n = sum(outcomes), len(outcomes)
+        return cls(k, n, k / n, wilson_interval(k, n))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Success minus dense success on the same seeds, with Tango's 95 % interval and the verdict against a margin.
+
+    The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
+    """
+
+    diff: float
+    ci95: Interval
+    margin: float
+    verdict: Verdict
+
+    def __post_init__(self) -> None:
+        require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
+        check_interval(self.ci95)
+        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
+
+    @classmethod
+    def of(cls, paired: PairedDifference) -> Difference:
+        """Keep what a file holds of a comparison."""
+        return cls(paired.diff, paired.ci, paired.margin, paired.verdict)
+
+    @property
+    def worse(self) -> bool:
+        """Whether the whole interval lies below zero, wherever the margin is."""
+        return self.ci95[1] < 0
+
+
+@dataclass(frozen=True)
+class TimeDifference:
+    """Restricted mean time over dense's on the same seeds, with its 95 % interval and the verdict against a margin.
+
+    The dense policy's own is 1 without width and "non-inferior", as of `Difference`.
+    """
+
+    ratio: float
+    ci95: Interval
+    margin: float
+    verdict: Verdict
+
+    def __post_init__(self) -> None:
+        require(self.ratio > 0, "ratio", "a number above 0", self.ratio)
+        check_interval(self.ci95)
+        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
+
+    @classmethod
+    def of(cls, paired: TimeRatio) -> TimeDifference:
+        """Keep what a file holds of a comparison."""
+        return cls(paired.ratio, paired.ci, paired.margin, paired.verdict)
+
+    @property
+    def worse(self) -> bool:
+        """Whether the whole interval lies above one, wherever the margin is."""
+        return self.ci95[0] > 1
+
+
+@dataclass(frozen=True)
+class PValues:
+    """One-sided p-values of both verdicts, of being non-inferior or inferior, whichever is nearer; for Holm's correction."""
+
+    success: float
+    time: float
+
+    def __post_init__(self) -> None:
+        for name in ("success", "time"):
+            value = getattr(self, name)
+            require(0 <= value <= 0.5, name, "0 to 0.5", value)
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Median and 95th percentile of ``n`` timed calls, seconds."""
+
+    p50: float
+    p95: float
+    n: int
+
+    def __post_init__(self) -> None:
+        require(0 < self.p50 <= self.p95, "p50", "0 < p50 <= p95", (self.p50, self.p95))
+        require(self.n >= 1, "n", "at least 1", self.n)
+
+    @classmethod
+    def of(cls, latency: Latency) -> Percentiles:
+        """Keep what a file holds of a measurement."""
+        return cls(latency.p50, latency.p95, latency.n)
+
+
+@dataclass(frozen=True)
+class Flops:
+    """FLOPs of a query, and over those of a dense one."""
+
+    per_query: float
+    ratio_to_dense: float
+
+    def __post_init__(self) -> None:
+        require(self.per_query >= 0, "per_query", "at least 0", self.per_query)
+        require(self.ratio_to_dense >= 0, "ratio_to_dense", "at least 0", self.ratio_to_dense)
+
+
+@dataclass(frozen=True)
+class ActionError:
+    """Absolute difference of an action entry to the dense policy's, on the same observations and the same noise."""
+
+    mean: float
+    max: float
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "max"):
+            value = getattr(self, name)
+            require(0 <= value < math.inf, name, "a finite number >= 0", value)
+
+
+@dataclass(frozen=True)
+class TokensKept:
+    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, in fine and in coarse mode."""
+
+    kept_mean: float
+    kept_fine: float | None
+    kept_coarse: float | None
+
+
+def check_interval(interval: Interval) -> None:
+    low, high = interval
+    require(low <= high, "ci95", "low <= high", list(interval))
+
+
+def require(condition: bool, key: str, expected: str, got: Any) -> None:
+    """Raise ValueError naming the key unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{key}: expected {expected}, got {got!r}")

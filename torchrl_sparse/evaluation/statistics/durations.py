@@ -1,0 +1,221 @@
+"""Time to success: what a slower method costs even where it solves as many episodes.
+
+An episode that is not solved took the whole horizon: the *restricted mean time* is the mean of these times, and two methods
+that ran on the same seeds are compared by the ratio of theirs. Its interval inverts a paired test, as Fieller's does (E. C.
+Fieller, JRSS B 16, 1954): a ratio r is in it unless the sum of ``method - r * other`` over the seeds is too many standard
+errors from zero. No resampling, since a sequential design asks for levels of 99.99 %, whose tails no bootstrap of a few dozen
+seeds reaches, and since its verdicts then are those of one statistic, `time_z`.
+
+What the observed spread cannot show is the failure that has not been seen yet: on Lift one episode in a hundred at the horizon
+costs more than a tenth of the mean, and a hundred seeds without one have almost no spread. So the variance gains ``z² L²``, L
+being what one seed costs that one method solves and the other does not. It is what Tango's variance under the hypothesised
+difference does for success: without any spread the interval is as wide as ``±z²/n`` such seeds, and it vanishes against the
+observed variance where failures are common. `tests/evaluation/statistics/test_durations.py` simulates the coverage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import norm
+
+from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level
+
+__all__ = [
+    "DEFAULT_TIME_MARGIN",
+    "TimeRatio",
+    "allowed_steps",
+    "correlation",
+    "restricted_times",
+    "success_within",
+    "time_ratio",
+    "time_verdict",
+    "time_z",
+]
+
+DEFAULT_TIME_MARGIN = 0.10
+_PER_OCTAVE, _OCTAVES = 6, 5  # of the allowed times that a curve shows
+
+
+@dataclass(frozen=True)
+class TimeRatio:
+    """Restricted mean time of a method over that of the one that it is compared with, on the same seeds.
+
+    Attributes:
+        ratio: above 1 where the method is slower.
+        ci: two-sided confidence interval of ``ratio``.
+        margin: of ``verdict``: the share by which a method may be slower.
+        verdict: see :func:`time_verdict`.
+        n: pairs.
+    """
+
+    ratio: float
+    ci: tuple[float, float]
+    margin: float
+    verdict: Verdict
+    n: int
+
+
+def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: int) -> NDArray[np.float64]:
+    """Return the steps to success of each episode, the horizon where there is none.
+
+    Args:
+        success: whether each episode was solved.
+        length: steps of each episode, which ends when it is solved.
+        horizon: steps until truncation.
+
+    Raises:
+        ValueError: if an episode is longer than the horizon, or ended before it unsolved.
+
+    >>> restricted_times([True, False], [31, 400], 400).tolist()
+    [31.0, 400.0]
+    """
+    for solved, steps in zip(success, length, strict=True):
+        if steps > horizon or not (solved or steps == horizon):
+            raise ValueError(
+                f"horizon: expected at most {horizon} steps of an episode, fewer only of solved ones, got {steps}"
+            )
+    return np.asarray(length, dtype=np.float64)
+
+
+def time_ratio(
+    method: ArrayLike,
+    other: ArrayLike,
+    horizon: int,
+    margin: float = DEFAULT_TIME_MARGIN,
+    confidence: float = 0.95,
+) -> TimeRatio:
+    """Compare the restricted mean times of two methods on the same seeds.
+
+    Args:
+        method: its `restricted_times`, [n].
+        other: those of the other, on the same seeds in the same order, [n].
+        horizon: the largest that a time can be.
+        margin: of the verdict, a share of the other's time.
+        confidence: two-sided level, strictly between 0 and 1.
+
+    Raises:
+        ValueError: if the lengths differ or are zero, or a number is out of range.
+
+    >>> result = time_ratio([30.0] * 500, [30.0] * 500, 400)
+    >>> result.ratio, result.verdict, [round(limit, 2) for limit in result.ci]
+    (1.0, 'non-inferior', [0.91, 1.09])
+    """
+    check_level(confidence)
+    method, other = _pairs(method, other)
+    n, z2 = len(method), float(norm.ppf((1 + confidence) / 2)) ** 2
+    y, x = method.sum(), other.sum()
+    yy, xx, xy = _spread(method, method), _spread(other, other), _spread(method, other)
+    ci = _fieller(
+        x * x - z2 * xx, x * y - z2 * xy, y * y - z2 * (yy + z2 * _one_seed(method, other, horizon) ** 2)
+    )
+    low, high = (min(max(limit, 1 / horizon), float(horizon)) for limit in ci)
+    return TimeRatio(float(y / x), (low, high), margin, time_verdict((low, high), margin), n)
+
+
+def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
+    """Return where ``a r² - 2 b r + c`` is negative; all positive ratios where the other's mean could be zero."""
+    if a <= 0:
+        return 0.0, math.inf
+    root = math.sqrt(max(b * b - a * c, 0.0))
+    return (b - root) / a, (b + root) / a
+
+
+def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> float:
+    """Return how many standard errors the method is faster than ``ratio`` times the other; negative where it is slower.
+
+    The two-sided interval of `time_ratio` excludes ``ratio`` where this is beyond its normal quantile.
+
+    Args:
+        method, other, horizon: see `time_ratio`.
+        ratio: the hypothesis, 1 + margin for non-inferiority.
+
+    Raises:
+        ValueError: as `time_ratio`.
+
+    >>> round(time_z([30.0] * 500, [30.0] * 500, 400, 1.1), 2)
+    2.01
+    """
+    method, other = _pairs(method, other)
+    gain = float((ratio * other - method).sum())
+    spread = _spread(method - ratio * other, method - ratio * other)
+    floor = _one_seed(method, other, horizon) ** 2
+    # The variance holds z² itself: floor * z⁴ + spread * z² = gain².
+    z2 = (math.sqrt(spread * spread + 4 * floor * gain * gain) - spread) / (2 * floor)
+    return math.copysign(math.sqrt(z2), gain)
+
+
+def _one_seed(method: NDArray, other: NDArray, horizon: int) -> float:
+    """Return the steps that a seed costs which one method solves in the mean time and the other not at all."""
+    solved = np.concatenate([method[method < horizon], other[other < horizon]])
+    return horizon - float(solved.mean()) if len(solved) else float(horizon)
+
+
+def _spread(a: NDArray, b: NDArray) -> float:
+    """Return n times the covariance, of one pair none."""
+    n = len(a)
+    return float(((a - a.mean()) * (b - b.mean())).sum()) * n / (n - 1) if n > 1 else 0.0
+
+
+def _pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
+    method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    if method.shape != other.shape or method.ndim != 1 or not len(method):
+        raise ValueError(
+            f"pairs need as many episodes of both, and at least one, got {method.size} and {other.size}"
+        )
+    return method, other
+
+
+def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -> Verdict:
+    """Judge an interval of a ratio of times: all of it below ``1 + margin``, all above, or neither.
+
+    >>> time_verdict((0.97, 1.06)), time_verdict((1.2, 1.4)), time_verdict((0.95, 1.15))
+    ('non-inferior', 'inferior', 'undecided')
+    """
+    if not 0 < margin < 1:
+        raise ValueError(f"time margin must lie strictly between 0 and 1, got {margin}")
+    low, high = ci
+    if high < 1 + margin:
+        return "non-inferior"
+    return "inferior" if low > 1 + margin else "undecided"
+
+
+def allowed_steps(horizon: int, early_cut: int | None = None) -> list[int]:
+    """Return the allowed times at which `success_within` is told: five octaves below the horizon, and the early cut.
+
+    They follow from horizon and cut alone, so that nobody chooses them by the result.
+
+    >>> allowed_steps(400, 36)[:5], allowed_steps(400)[-2:]
+    ([12, 14, 16, 18, 20], [356, 400])
+    """
+    steps = {round(horizon * 2 ** (-index / _PER_OCTAVE)) for index in range(_PER_OCTAVE * _OCTAVES + 1)}
+    return sorted({step for step in steps if step} | ({early_cut} if early_cut else set()))
+
+
+def success_within(success: Sequence[bool], times: ArrayLike, steps: Sequence[int]) -> Mapping[int, float]:
+    """Return the share of episodes that are solved within each number of steps.
+
+    >>> success_within([True, True, False], [31, 80, 400], [30, 40, 400])
+    {30: 0.0, 40: 0.3333333333333333, 400: 0.6666666666666666}
+    """
+    solved = np.asarray(times)[np.asarray(success, dtype=bool)]
+    return {step: float((solved <= step).sum()) / len(success) for step in steps}
+
+
+def correlation(method: ArrayLike, other: ArrayLike) -> float | None:
+    """Return Pearson's correlation of two methods' times over the seeds; None where one of them never differs.
+
+    Pairing shortens an interval only as far as this is above zero. Methods that draw the same noise at every denoising step
+    share much of it with dense; those with other steps cannot.
+
+    >>> correlation([1, 2, 3], [2, 4, 6]), correlation([1, 2, 3], [5, 5, 5])
+    (1.0, None)
+    """
+    method, other = _pairs(method, other)
+    if method.std() == 0 or other.std() == 0:
+        return None
+    return float(np.clip(np.corrcoef(method, other)[0, 1], -1, 1))

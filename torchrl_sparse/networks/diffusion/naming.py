@@ -1,0 +1,83 @@
+"""How samplers are written, in methods, in saved schedules and pruners, and in options: one grammar.
+
+::
+
+    KIND [STEPS] [_SPACING] [_etaETA]     ddpm10   ddpm10_trailing   ddpm2_logsnr   ddim10_eta0.5   unipc10
+    KIND _T _T ...          [_etaETA]     ddpm_82_14   ddim_90_50_10   ddim_82_14_eta1
+
+KIND is one of :data:`KINDS`, SPACING one of `torchrl_sparse.networks.diffusion.spacing.SPACINGS`, ``leading`` where
+none is written. The timesteps T fall. ETA in [0, 1] is DDIM's. Files that keep the number of steps beside the name
+leave STEPS out (``ddim``, ``ddpm_logsnr``).
+"""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_sparse.networks.diffusion.spacing import SPACINGS
+
+__all__ = ["CHAIN_PATTERN", "KINDS", "SamplerName"]
+
+KINDS = ("ddpm", "ddim", "dpmpp2m", "sde2m", "unipc")
+_KIND, _SPACING = (rf"(?:{'|'.join(words)})" for words in (KINDS, SPACINGS))
+_STEPS, _TIMESTEPS, _ETA = r"[1-9]\d{0,4}", r"(?:_\d{1,5})+", r"_eta\d(?:\.\d{1,20})?"
+
+CHAIN_PATTERN = rf"{_KIND}(?:{_STEPS}(?:_{_SPACING})?|{_TIMESTEPS})(?:{_ETA})?"
+"""Regular expression of the names that say how many steps there are; it has no groups."""
+
+_NAME = re.compile(rf"({_KIND})(?:({_STEPS})?(?:_({_SPACING}))?|({_TIMESTEPS}))({_ETA})?")
+
+
+@dataclass(frozen=True)
+class SamplerName:
+    """A sampler as it is written, taken apart.
+
+    Attributes:
+        kind: one of :data:`KINDS`.
+        num_inference_steps: STEPS; None where they are not written.
+        timesteps: chosen ones; None where a spacing decides.
+        spacing: ``"leading"`` where none is written.
+        eta: 0 where none is written.
+
+    Examples:
+        >>> SamplerName.parse("ddim10_eta0.5")
+        SamplerName(kind='ddim', num_inference_steps=10, timesteps=None, spacing='leading', eta=0.5)
+        >>> str(SamplerName("ddpm", timesteps=(82, 14))), str(SamplerName("ddpm", 2, spacing="logsnr"))
+        ('ddpm_82_14', 'ddpm2_logsnr')
+    """
+
+    kind: str
+    num_inference_steps: int | None = None
+    timesteps: tuple[int, ...] | None = None
+    spacing: str = "leading"
+    eta: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str) -> SamplerName:
+        """Raise ValueError unless ``text`` is written as the module says."""
+        match = _NAME.fullmatch(text) if isinstance(text, str) else None
+        if match is None:
+            raise ValueError(
+                f"sampler: expected KIND[STEPS][_SPACING][_etaETA] or KIND_T_T...[_etaETA] of kind {', '.join(KINDS)} "
+                f"and spacing {', '.join(SPACINGS)}, got {reprlib.repr(text)}"
+            )
+        kind, steps, spacing, timesteps, eta = match.groups()
+        return cls(
+            kind,
+            steps and int(steps),
+            timesteps and tuple(map(int, timesteps.split("_")[1:])),
+            spacing or "leading",
+            float(eta.removeprefix("_eta")) if eta else 0.0,
+        )
+
+    def __str__(self) -> str:
+        parts = [f"{self.kind}{self.num_inference_steps or ''}", *map(str, self.timesteps or ())]
+        if self.spacing != "leading":
+            parts.append(self.spacing)
+        if self.eta:
+            parts.append(f"eta{np.format_float_positional(self.eta, trim='-')}")
+        return "_".join(parts)

@@ -1,0 +1,72 @@
+"""Which timesteps a sampler takes when it is only told how many.
+
+``"leading"``, ``"trailing"`` and ``"linspace"`` are diffusers' (arXiv:2305.08891, Table 2), whose solvers leave out
+timestep 0 where DDPM and DDIM end on it. ``"logsnr"`` is the rule that needs no search::
+
+    first    = how many timesteps have lambda = log(sqrt(abar) / sqrt(1 - abar)), half the log-SNR, >= -2.1
+    timestep = round(first - k T / K) - 1        k = 0 .. K-1
+
+so diffusers' ``"trailing"`` with ``lambda_min_clipped=-2.1``. Of a hundred: 91, 41; 91, 58, 24; 91, 66, 41, 16.
+
+It follows from where few steps lose. *The first step* is asked about pure noise. Its clean prediction
+``(sample - sigma eps) / alpha`` amplifies whatever is wrong with the predicted noise by ``sigma / alpha = e^-lambda``:
+by 8 at timestep 91, by 16 at 95, by 2,000 at 99, where ``"trailing"`` begins and clipping leaves little but signs.
+Further down, pure noise lacks the signal, of amplitude ``alpha``, that the network was trained to find: 0.12 at
+timestep 91, 0.49 at 66, where ``"leading"`` begins with three steps. The rule begins where the second is still small
+and the first not yet large. That it begins at -2.1 is a choice, at the noisy end of where searches for single policies
+end (80 to 91 of 100, see `torchrl_sparse.training.diffusion.timesteps`); no theory gives the number. *The last step*
+jumps to the clean sample from wherever it is, and at timestep 0, where ``"leading"`` ends, there is hardly anything
+left to do: the spacing therefore counts from above.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+__all__ = ["SPACINGS", "spaced_timesteps"]
+
+SPACINGS = ("leading", "trailing", "linspace", "logsnr")
+_SMALLEST_LOG_RATIO = -2.1
+
+
+def spaced_timesteps(
+    spacing: str, num_steps: int, alphas_cumprod: Tensor, *, without_last: bool = False
+) -> list[int]:
+    """Return the timesteps of a spacing, in execution order; they may repeat or leave 0 .. T-1 where K is large.
+
+    Args:
+        spacing: one of :data:`SPACINGS`.
+        num_steps: K.
+        alphas_cumprod: abar of every diffusion timestep, f32 [T].
+        without_last: leave out the last timestep of ``"leading"`` and ``"linspace"``, as diffusers' solvers do.
+
+    Raises:
+        ValueError: on an unknown spacing.
+
+    Examples:
+        >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
+        >>> abar = Sampler().alphas_cumprod
+        >>> [spaced_timesteps(spacing, 4, abar) for spacing in SPACINGS[:3]]
+        [[75, 50, 25, 0], [99, 74, 49, 24], [99, 66, 33, 0]]
+        >>> spaced_timesteps("logsnr", 2, abar), spaced_timesteps("logsnr", 3, abar)
+        ([91, 41], [91, 58, 24])
+    """
+    if spacing not in SPACINGS:
+        raise ValueError(f"spacing: expected one of {', '.join(SPACINGS)}, got {spacing!r}")
+    num_train, points = len(alphas_cumprod), num_steps + without_last
+    if spacing == "leading":
+        rising = np.arange(points) * (num_train // points)
+    elif spacing == "linspace":
+        rising = np.linspace(0, num_train - 1, points).round()
+    else:
+        first = num_train if spacing == "trailing" else _first_clear(alphas_cumprod)
+        gap = num_train / num_steps
+        rising = np.arange(first, first - (num_steps - 0.5) * gap, -gap).round()[::-1] - 1
+    return rising[::-1][:num_steps].astype(int).tolist()
+
+
+def _first_clear(alphas_cumprod: Tensor) -> int:
+    """Return how many timesteps are clear enough to begin at."""
+    log_ratio = 0.5 * (alphas_cumprod / (1 - alphas_cumprod)).log()
+    return int((log_ratio >= _SMALLEST_LOG_RATIO).sum())
