@@ -76,7 +76,7 @@ OPTIONS: dict[str, Any] = {
     "kind": Word,
     "eta": Annotated[float, Field(ge=0, le=1)],
     "spacings": Words,
-    "sampler": Section | None,
+    "sampler": Word | Section | None,
     "specprune": Section,
     "options": Section,
     "preset": Word,
