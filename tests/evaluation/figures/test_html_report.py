@@ -88,7 +88,12 @@ def test_a_damaged_file_is_named_and_the_others_are_shown(runs, tmp_path):
     (runs / "bytes").mkdir()
     (runs / "bytes" / "realtime.json").write_bytes(b"\xff\xfe")
     faults = write_report(runs, tmp_path / "report.html")
-    assert sorted(faults) == ["broken/results.json", "bytes/realtime.json", "cut/results.json", "realtime.json"]
+    assert sorted(faults) == [
+        "broken/results.json",
+        "bytes/realtime.json",
+        "cut/results.json",
+        "realtime.json",
+    ]
     text = (tmp_path / "report.html").read_text()
     assert "schema: expected 1 or 2, got 7" in text
     assert text.count("<table>") == 2
