@@ -112,7 +112,8 @@ def _demo_changes() -> Iterator[Change]:
             "complex": np.zeros((4, width), dtype=np.complex64),
             "of records": np.zeros(4, dtype=[("a", "f4"), ("b", "i4")]),
         }.items():
-            yield Change(f"{array} is {how}", "demo_1", partial(_put_array, path, value))
+            key = "" if how == "without columns" else "demo_1"  # whose sizes alone contradict
+            yield Change(f"{array} is {how}", key, partial(_put_array, path, value))
         yield Change(f"{array} is missing", "demo_1", partial(_drop, path))
         yield Change(f"{array} is a group", "demo_1", partial(_put_group, path))
         yield Change(f"{array} is 4 billion rows of nothing", "demo_1", partial(_put_unfilled, path, width))
@@ -195,7 +196,10 @@ def _checkpoint_changes() -> Iterator[Change]:
     for path, values in entries.items():
         for value in values:
             edit = partial(_rewrite, put_config(path, value))
-            yield Change(f"cfg.{path} is {value!r}", path.rpartition(".")[2], edit)
+            key = (
+                "" if value == OUT_OF_BOUNDS[-1] else path.rpartition(".")[2]
+            )  # the pickle's reader knows no keys
+            yield Change(f"cfg.{path} is {value!r}", key, edit)
     for tensor in ("model.head.bias", "model.pos_emb", "normalizer.params_dict.obs.scale"):
         key = tensor.rpartition(".")[2]
         for how, value in {
@@ -206,7 +210,8 @@ def _checkpoint_changes() -> Iterator[Change]:
             "a list": [0.0],
             "sparse": torch.zeros(10, 10).to_sparse(),
         }.items():
-            yield Change(f"{tensor} is {how}", key, partial(_rewrite, partial(_put_weight, tensor, value)))
+            edit = partial(_rewrite, partial(_put_weight, tensor, value))
+            yield Change(f"{tensor} is {how}", "" if how == "sparse" else key, edit)
 
 
 def _rewrite(change: Callable, path: Path) -> None:

@@ -18,8 +18,8 @@ from tests.torture.limits import Outcome, run_limited
 from tests.torture.report import Verdict
 
 PART = "a malformed file is read"
-_TORN = ("cut", "empty")
-REFUSALS = ("ValueError", "FileNotFoundError", "CheckpointError", "MaskError")
+_TORN = ("cut", "empty", "two documents")
+REFUSALS = ("ValueError", "FileNotFoundError", "IsADirectoryError", "CheckpointError", "MaskError")
 
 
 @dataclass(frozen=True)

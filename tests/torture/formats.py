@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import torch
 
@@ -20,8 +20,8 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule
-from torchrl_sparse.evaluation.results.realtime import load_realtime, save_realtime
-from torchrl_sparse.evaluation.results.schema import load_results, save_results
+from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, save_realtime
+from torchrl_sparse.evaluation.results.schema import Results, load_results, save_results
 from torchrl_sparse.evaluation.results.sweeps import LocalSweep, SavedSweep, Trial
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -75,6 +75,16 @@ class Format:
             lines[self.line] = text
             text = "\n".join(lines) + "\n"
         path.write_text(text)
+
+
+def defaulted(kind: Any) -> set[str]:
+    """Return the keys with a default in a dataclass that is a file's schema, and in those that it holds."""
+    if not is_dataclass(kind):
+        return set().union(*map(defaulted, get_args(kind)))
+    own = {
+        entry.name for entry in fields(kind) if (entry.default, entry.default_factory) != (MISSING, MISSING)
+    }
+    return own.union(*map(defaulted, get_type_hints(kind).values()))
 
 
 def small_policy(engine: str = "auto") -> DiffusionPolicy:
@@ -139,7 +149,6 @@ def _read_planner(name: str, folder: Path) -> Planner:
 
 _POLICY_DEFAULTS = {"n_layer", "n_head", "n_emb", "p_drop_emb", "p_drop_attn", "causal_attn", "n_cond_layers"}
 _PRUNER_DEFAULTS = {"width", "obs_width", "hidden", "n_layer", "n_head", "rate_input"}
-_EPISODE = {"name": "episode log", "write": _log, "file": "dense.jsonl"}
 
 JSON_FORMATS = [
     Format(
@@ -150,14 +159,15 @@ JSON_FORMATS = [
         optional={*_POLICY_DEFAULTS, "kind", "num_inference_steps", "num_train_timesteps"},
         sections={"network", "schedule"},
     ),
-    Format("cache schedule", _schedule, partial(_read_planner, "bac.json"), "bac.json", free={"settings"}),
+    Format("cache schedule", _schedule, partial(_read_planner, "bac.json"), "bac.json", free={"settings"},
+           sections={"computed_steps"}),
     Format(
         "config.json of a pruner",
         lambda folder: small_pruner().save_pretrained(folder / "sag"),
         partial(_read_planner, "sag"),
         "sag/config.json",
         free={"settings"},
-        optional={*_PRUNER_DEFAULTS, "rate_range", "reuse", "settings"},
+        optional={*_PRUNER_DEFAULTS, *defaulted(PrunerInfo)},
         sections={"network"},
     ),
     Format(
@@ -165,14 +175,15 @@ JSON_FORMATS = [
         lambda folder: save_results(make_results(20, names=("dense", "bac")), folder / "results.json"),
         lambda folder: load_results(folder / "results.json"),
         "results.json",
-        optional={"bac", "planning_s", "tokens"},
+        free={"success_within"},
+        optional={"bac", *defaulted(Results)},
     ),
     Format(
         "realtime.json",
         lambda folder: save_realtime(build(dense=DENSE, bac=FAST), folder / "realtime.json"),
         lambda folder: load_realtime(folder / "realtime.json"),
         "realtime.json",
-        optional={"bac"},
+        optional={"dense", "bac", *defaulted(Realtime)},
     ),
     Format(
         "sweep.json",
@@ -180,12 +191,12 @@ JSON_FORMATS = [
         lambda folder: LocalSweep(SWEEP, folder),
         "sweep.json",
         free={"config", "parameters"},
-        optional={"finished"},
+        optional=defaulted(SavedSweep),
     ),
     Format("head of an episode log", _log, lambda f: EpisodeLog(f / "dense.jsonl", IDENTITY), "dense.jsonl",
            free={"identity"}, line=0),
     Format("episode in a log", _log, lambda f: EpisodeLog(f / "dense.jsonl", IDENTITY), "dense.jsonl",
-           optional={"latency", "kept", "fine"}, line=2),
+           optional=defaulted(EpisodeResult), line=2),
 ]  # fmt: skip
 
 

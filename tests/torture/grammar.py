@@ -54,7 +54,7 @@ def changes(document: Any, *, free: set[str], optional: set[str]) -> Iterator[Ch
         if isinstance(path[-1], str):
             yield Change(f"{name} dropped", None if key in optional else key, _without(document, path))
         yield Change(f"{name} is null", None if key in optional else key, _with(document, path, None))
-        for wrong in WRONG_TYPES[type(value)]:
+        for wrong in (wrong for wrong in WRONG_TYPES[type(value)] if wrong != value):  # true is 1
             yield Change(f"{name} is {wrong!r}", key, _with(document, path, wrong))
         if type(value) is int:
             for number in OUT_OF_BOUNDS:
