@@ -181,7 +181,7 @@ def test_a_finished_file_is_reported_and_never_mixed(published, converted, tmp_p
     other = tmp_path / "other.hdf5"
     other.write_bytes(published.read_bytes())
     with pytest.raises(
-        ValueError, match=r"lift\.h5 was made with .*source is 'low_dim_v15\.hdf5', not 'other\.hdf5'"
+        ValueError, match=r"lift\.h5: made with .*source is 'other\.hdf5' here and 'low_dim_v15\.hdf5' there"
     ):
         convert_demos(other, converted)
 

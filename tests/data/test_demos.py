@@ -223,7 +223,7 @@ def test_other_settings_never_mix(fake, tmp_path):
     with pytest.raises(Interrupted):
         collect(stopped, Collection("Lift", episodes=2), on_episode=interrupt)
     for path in (finished, stopped):
-        with pytest.raises(ValueError, match="quality is 'proficient', not 'mixed'"):
+        with pytest.raises(ValueError, match="quality is 'mixed' here and 'proficient' there"):
             collect(path, Collection("Lift", episodes=2, quality="mixed"))
 
 

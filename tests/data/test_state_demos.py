@@ -69,7 +69,7 @@ def test_every_dimension_of_actions_is_normalised_to_its_range(collected):
 
 
 def test_what_cannot_be_collected_is_named(tmp_path):
-    with pytest.raises(ValueError, match="quality: expected 'proficient' for BlockPush, got 'mixed'"):
+    with pytest.raises(ValueError, match="quality: expected one of proficient for BlockPush, got 'mixed'"):
         collect(tmp_path / "mixed.h5", Collection("block_push", 1, quality="mixed"))
     with pytest.raises(ValueError, match=r"task: expected one of .*BlockPush.* got 'Fly'"):
         collect(tmp_path / "fly.h5", Collection("Fly", 1))

@@ -59,6 +59,9 @@ OPTIONS: dict[str, Any] = {
     # methods
     "method": Word,
     "methods": Words,
+    "calibrate_bac.methods": Annotated[
+        list[Literal["bac", "bac_blockwise", "bac_unified"]], Field(min_length=1)
+    ],
     "pairs": list[Pair],
     "videos": list[Word],
     "num_updates": Count,

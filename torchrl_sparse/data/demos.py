@@ -45,6 +45,9 @@ class Collection:
         quality: "proficient", "recovering" or "mixed", see `torchrl_sparse.envs.experts.operators`.
         seed: the first episode's; the others follow in order.
         keep_failures: keep failed episodes too.
+
+    Raises:
+        ValueError: if a value is out of its range, or the task has no expert or not of that quality.
     """
 
     task: str
@@ -52,6 +55,18 @@ class Collection:
     quality: str = "proficient"
     seed: int = 0
     keep_failures: bool = False
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
+        if self.seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+        task = find_task(self.task)
+        task.load_expert()
+        if self.quality not in (known := task.demonstrator.qualities):
+            raise ValueError(
+                f"quality: expected one of {', '.join(known)} for {task.name}, got {self.quality!r}"
+            )
 
 
 @dataclass(frozen=True)
@@ -154,7 +169,6 @@ def collect(
         ValueError: if ``path`` or its parts were collected with other settings, or an option is out of range.
     """
     path = Path(path)
-    _check(collection)
     check_backend(backend, workers)
     settings = asdict(collection)
     if path.exists():
@@ -223,13 +237,6 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
             seed=int(demo.attrs.get("seed", -1)),
             instruction=read_instruction(demo),
         )
-
-
-def _check(collection: Collection) -> None:
-    if collection.episodes < 1:
-        raise ValueError(f"episodes: expected at least 1, got {collection.episodes}")
-    if collection.seed < 0:
-        raise ValueError(f"seed: expected 0 or more, got {collection.seed}")
 
 
 def _check_yield(tally: Summary) -> None:

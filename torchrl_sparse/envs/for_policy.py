@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from torchrl_sparse.envs.tasks import find_robosuite_task, find_task
+from torchrl_sparse.envs.tasks import Task, find_robosuite_task, find_task
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -27,13 +27,15 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
         horizon: steps until an episode is truncated; None for the task's own.
 
     Raises:
-        ValueError: if the policy has cameras and its ``source`` does not say which.
+        ValueError: if the policy has cameras and its ``source`` does not say which, or it observes or acts in other sizes than
+            the task's.
 
     Examples:
         >>> make = diffusion_env("lift", DiffusionPolicy.from_pretrained("assets/lift"))
         >>> make(seeds=[7]).reset()["history", "state"].shape
         torch.Size([2, 19])
     """
+    _check_sizes(find_task(task), policy)
     return partial(
         make_env,
         find_task(task).name,
@@ -64,6 +66,19 @@ def instructed_env(
         horizon=horizon,
         **_camera_options(cameras),
     )
+
+
+def _check_sizes(task: Task, policy: DiffusionPolicy) -> None:
+    found = (policy.normalizer.state_scale.numel(), policy.normalizer.action_scale.numel())
+    expected = (
+        found[0] if policy.vision else task.state_dim,
+        task.action_dim,
+    )  # cameras replace a part of the state
+    if found != expected:
+        raise ValueError(
+            f"policy: expected one of {expected[0]} observed numbers and {expected[1]} of an action, for {task.name}, "
+            f"got one of {found[0]} and {found[1]}"
+        )
 
 
 def _image_options(policy: DiffusionPolicy) -> dict[str, Any]:

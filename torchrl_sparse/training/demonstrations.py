@@ -60,6 +60,11 @@ class TrainConfig:
                 f"expected max_steps and batch_size >= 1, "
                 f"got max_steps={self.max_steps}, batch_size={self.batch_size}"
             )
+        for name in ("lr_warmup_steps", "weight_decay", "max_grad_norm"):
+            if not (value := getattr(self, name)) >= 0:
+                raise ValueError(f"{name}: expected 0 or more, got {value}")
+        if not self.lr > 0:
+            raise ValueError(f"lr: expected a positive number, got {self.lr}")
         if self.precision not in ("fp32", "bf16"):
             raise ValueError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
         if not 0 <= self.val_ratio < 1:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.experts.disturbance import Disturbance, next_noise
-from torchrl_sparse.envs.experts.operators import draw_operator
+from torchrl_sparse.envs.experts.operators import OPERATORS, draw_operator
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask, StateTask
@@ -27,11 +27,13 @@ class Demonstrator(Protocol):
     """Acts out one episode of an environment that was just reset.
 
     Attributes:
+        qualities: those that it knows; of the class.
         operator: name of who demonstrates.
         instruction: what the episode asks for; None where there is no choice.
         model_file: the simulator's model, to restore the episode's start; empty where the state is enough.
     """
 
+    qualities: ClassVar[tuple[str, ...]]
     operator: str
     instruction: str | None
     model_file: str
@@ -58,6 +60,8 @@ class RobosuiteDemonstrator:
     Raises:
         ValueError: if the task has no expert or the quality is unknown.
     """
+
+    qualities = tuple(OPERATORS)
 
     def __init__(self, task: RobosuiteTask, env: RobosuiteEnv, rng: np.random.Generator, quality: str):
         operator = draw_operator(quality, rng)
@@ -131,9 +135,12 @@ class StateDemonstrator:
 
     instruction, model_file = None, ""
 
+    qualities = ("proficient",)
+
     def __init__(self, task: StateTask, env: EnvBase, rng: np.random.Generator, quality: str):
-        if quality != "proficient":
-            raise ValueError(f"quality: expected 'proficient' for {task.name}, got {quality!r}")
+        if quality not in self.qualities:
+            known = ", ".join(self.qualities)
+            raise ValueError(f"quality: expected one of {known} for {task.name}, got {quality!r}")
         self.operator = quality
         self._expert: StateExpert = task.load_expert()(rng)
         self._rng, self._noise = rng, np.zeros(task.action_dim)

@@ -13,6 +13,7 @@ leave STEPS out (``ddim``, ``ddpm_logsnr``).
 from __future__ import annotations
 
 import re
+import reprlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ __all__ = ["CHAIN_PATTERN", "KINDS", "SamplerName"]
 
 KINDS = ("ddpm", "ddim", "dpmpp2m", "sde2m", "unipc")
 _KIND, _SPACING = (rf"(?:{'|'.join(words)})" for words in (KINDS, SPACINGS))
-_STEPS, _TIMESTEPS, _ETA = r"[1-9]\d*", r"(?:_\d+)+", r"_eta\d+(?:\.\d+)?"
+_STEPS, _TIMESTEPS, _ETA = r"[1-9]\d{0,4}", r"(?:_\d{1,5})+", r"_eta\d(?:\.\d{1,20})?"
 
 CHAIN_PATTERN = rf"{_KIND}(?:{_STEPS}(?:_{_SPACING})?|{_TIMESTEPS})(?:{_ETA})?"
 """Regular expression of the names that say how many steps there are; it has no groups."""
@@ -62,7 +63,7 @@ class SamplerName:
         if match is None:
             raise ValueError(
                 f"sampler: expected KIND[STEPS][_SPACING][_etaETA] or KIND_T_T...[_etaETA] of kind {', '.join(KINDS)} "
-                f"and spacing {', '.join(SPACINGS)}, got {text!r}"
+                f"and spacing {', '.join(SPACINGS)}, got {reprlib.repr(text)}"
             )
         kind, steps, spacing, timesteps, eta = match.groups()
         return cls(

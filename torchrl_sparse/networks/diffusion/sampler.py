@@ -29,7 +29,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Sequence
 from itertools import pairwise
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -91,9 +91,9 @@ class Sampler:
     num_train_timesteps: int
     eta: float
     spacing: str
-    alphas_cumprod: Tensor
     timesteps: Tensor
     previous_timesteps: tuple[int, ...]
+    alphas_cumprod: Tensor
     coefficients: StepCoefficients
 
     def __init__(
@@ -112,27 +112,28 @@ class Sampler:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
         check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
         check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
-        if not 0 <= eta <= 1 or (eta and kind != "ddim"):
+        if not isinstance(eta, Real) or not 0 <= eta <= 1 or (eta and kind != "ddim"):
             raise ValueError(
-                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta} of kind "{kind}"'
+                f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
-        abar = DDPMScheduler(num_train_timesteps, beta_schedule="squaredcos_cap_v2").alphas_cumprod
-        chosen = None if timesteps is None else _checked(timesteps, num_inference_steps, num_train_timesteps)
-        if chosen is not None and spacing != "leading":
-            raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
-        order = chosen or _spaced(kind, spacing, num_inference_steps, abar)
+        scheduler = DDPMScheduler(num_train_timesteps, beta_schedule="squaredcos_cap_v2")
+        alphas_cumprod: Tensor = scheduler.alphas_cumprod
+        if timesteps is None:
+            order = _spaced(kind, spacing, num_inference_steps, alphas_cumprod)
+        else:
+            order = _chosen(timesteps, spacing, num_inference_steps, num_train_timesteps)
         previous = (*order[1:], -1)
         vars(self).update(
             kind=kind,
-            eta=float(eta),
-            spacing=spacing,
             num_inference_steps=num_inference_steps,
             num_train_timesteps=num_train_timesteps,
-            alphas_cumprod=abar,
+            eta=float(eta),
+            spacing=spacing,
             timesteps=torch.tensor(order),
             previous_timesteps=previous,
-            coefficients=step_coefficients(kind, abar, list(order), list(previous), eta=float(eta)),
-            _chosen=chosen,
+            alphas_cumprod=alphas_cumprod,
+            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=float(eta)),
+            _chosen=None if timesteps is None else tuple(order),
         )
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -239,7 +240,17 @@ class Sampler:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
 
 
-def _checked(timesteps: Sequence[int], steps: int, num_train_timesteps: int) -> tuple[int, ...]:
+def _spaced(kind: str, spacing: str, steps: int, alphas_cumprod: Tensor) -> list[int]:
+    found = spaced_timesteps(spacing, steps, alphas_cumprod, without_last=kind in MULTISTEP)
+    num_train = len(alphas_cumprod)
+    if not timesteps_fall(found, num_train):
+        raise ValueError(
+            f"num_inference_steps: expected fewer, {spacing!r} has no {steps} falling timesteps of {num_train} for {kind!r}"
+        )
+    return found
+
+
+def _chosen(timesteps: Sequence[int], spacing: str, steps: int, num_train_timesteps: int) -> list[int]:
     chosen = list(timesteps)
     whole = all(isinstance(timestep, Integral) for timestep in chosen)
     if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != steps:
@@ -247,16 +258,9 @@ def _checked(timesteps: Sequence[int], steps: int, num_train_timesteps: int) -> 
             f"timesteps: expected {steps} (num_inference_steps) whole numbers that fall from at most "
             f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
         )
-    return tuple(int(timestep) for timestep in chosen)
-
-
-def _spaced(kind: str, spacing: str, steps: int, abar: Tensor) -> list[int]:
-    found = spaced_timesteps(spacing, steps, abar, without_last=kind in MULTISTEP)
-    if not timesteps_fall(found, len(abar)):
-        raise ValueError(
-            f"num_inference_steps: expected fewer, {spacing!r} has no {steps} falling timesteps of {len(abar)} for {kind!r}"
-        )
-    return found
+    if spacing != "leading":
+        raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
+    return [int(timestep) for timestep in chosen]
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:

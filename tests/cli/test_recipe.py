@@ -1,0 +1,131 @@
+"""Whatever is wrong with a recipe's options is one line on stderr and exit code 2, and leaves nothing behind."""
+
+import os
+import sys
+
+import pytest
+
+from tests.recipe_modules import load_recipe, run
+from torchrl_sparse.runtime.lock import lock_output
+
+
+@pytest.fixture
+def fail(monkeypatch, capsys):
+    """Runs a recipe that has to fail, and returns the line that it leaves."""
+
+    def fail(recipe, *options):
+        monkeypatch.setattr(sys, "argv", [f"{recipe}.py", *map(str, options)])
+        with pytest.raises(SystemExit) as ended:
+            load_recipe(recipe).main()
+        assert ended.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("recipe", "options", "message"),
+    [
+        ("benchmark", ["episodes=abc"], "episodes: expected a valid integer, got 'abc'"),
+        ("benchmark", ["episodez=3"], "episodez: expected an option of this recipe, such as episodes"),
+        ("benchmark", ["train.lr=3"], "train: expected an option of this recipe"),
+        ("benchmark", ["episodes"], "Error parsing override 'episodes' missing EQUAL"),
+        ("benchmark", ["task=juggle"], "task: expected one of Lift, "),
+        ("benchmark", ["methods=[dense,magic]"], "methods: expected dense, ddim10, "),
+        ("benchmark", ["videos=[nope]"], "videos: expected dense, ddim10, "),
+        ("benchmark", ["pairs=[[dense,nope]]"], "pairs: expected two of dense, ddim10, uniform, "),
+        ("benchmark", ["engine=steam"], "engine: expected one of"),
+        ("benchmark", ["task=can", "policy=assets/lift"], "policy: expected one of 23 observed numbers"),
+        (
+            "benchmark",
+            ["policy=lerobot/diffusion_pusht"],
+            "expected a file lerobot/diffusion_pusht/config.json, got none",
+        ),
+        ("collect_demos", ["task=kitchen"], "task: expected one with an expert"),
+        (
+            "collect_demos",
+            ["quality=nope"],
+            "quality: expected one of proficient, recovering, mixed for Lift, got 'nope'",
+        ),
+        ("convert_robomimic", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
+        ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
+        ("train_policy", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
+        ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_nothing_is_written(fail, tmp_path, recipe, options, message):
+    assert fail(recipe, *options, f"out={tmp_path}/new/out").startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_option_that_has_to_be_given_is_named(fail):
+    assert fail("convert_robomimic", "out=a.h5").startswith("demos: expected a value, got ")
+
+
+@pytest.mark.parametrize("content", ["parameters: [", "parameters: {a: {}}", "7", "- " * 5000, "a: \udcff"])
+def test_a_damaged_sweep_is_named(fail, tmp_path, content):
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content.encode("utf-8", "surrogateescape"))
+    assert fail("sweep", f"sweep={path}", f"out={tmp_path}/out").startswith(
+        f"{path}: expected a wandb sweep, got "
+    )
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_the_second_on_one_output_is_told_who_the_first_is(fail, tmp_path):
+    options = {
+        "collect_demos": "a.h5",
+        "train_policy": "a",
+        "benchmark": "a",
+        "train_pruner": "a",
+        "sweep": "a",
+    }
+    for recipe, name in options.items():
+        with lock_output(tmp_path / name, is_file=name.endswith(".h5")):
+            before = sorted(tmp_path.rglob("*"))
+            line = fail(recipe, f"out={tmp_path / name}")
+            assert sorted(tmp_path.rglob("*")) == before
+        told = f"out: expected one that nobody works on, got {tmp_path / name}, held by process {os.getpid()} on "
+        assert line.startswith(told)
+
+
+def test_the_whole_traceback_can_be_had(monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(sys, "argv", ["benchmark.py", "margin=2"])
+    with pytest.raises(ValueError, match="margin: expected less than 1, got 2"):
+        load_recipe("benchmark").main()
+
+
+RECIPE = """
+from pathlib import Path
+
+from torchrl_sparse.cli.recipe import recipe
+
+
+@recipe("toy")
+def main(config):
+    if config.title == "disk":
+        raise OSError(28, "no space left on the volume /data", "results.json")
+    if config.title == "worker":
+        raise ValueError("seed: expected 1,\\n   got 2\\n\\nWorker traceback: ...")
+    if config.title == "bug":
+        raise AssertionError("a bug")
+    Path(config.out, "made").touch()
+
+
+main()
+"""
+
+
+def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
+    (tmp_path / "toy.py").write_text(RECIPE)
+    (tmp_path / "toy.yaml").write_text("title: ok\nout: ???\nhydra: {run: {dir: .}, output_subdir: null}\n")
+    toy, out = tmp_path / "toy", f"out={tmp_path}/out"
+    assert run(toy, out, "title=disk", expect=2) == "results.json: no space left on the volume /data\n"
+    assert run(toy, out, "title=worker", expect=2) == "seed: expected 1, got 2\n"
+    assert "AssertionError: a bug" in run(toy, out, "title=bug", expect=1)
+    assert not (tmp_path / "out").exists()
+    assert run(toy, out) == ""
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["made"]
+    assert "toy is powered by Hydra" in run(toy, "--help")
