@@ -32,9 +32,9 @@ def fail(monkeypatch, capsys):
         ("benchmark", ["train.lr=3"], "train: expected an option of this recipe"),
         ("benchmark", ["episodes"], "Error parsing override 'episodes' missing EQUAL"),
         ("benchmark", ["task=juggle"], "task: expected one of Lift, "),
-        ("benchmark", ["methods=[dense,magic]"], "methods: expected dense, ddim10, "),
-        ("benchmark", ["videos=[nope]"], "videos: expected dense, ddim10, "),
-        ("benchmark", ["pairs=[[dense,nope]]"], "pairs: expected two of dense, ddim10, uniform, "),
+        ("benchmark", ["methods=[dense,magic]"], "methods: expected dense, "),
+        ("benchmark", ["videos=[nope]"], "videos: expected dense, "),
+        ("benchmark", ["pairs=[[dense,nope]]"], "pairs: expected two of dense, "),
         ("benchmark", ["engine=steam"], "engine: expected one of"),
         ("benchmark", ["task=can", "policy=assets/lift"], "policy: expected one of 23 observed numbers"),
         (

@@ -1,12 +1,16 @@
 """Work of several workers comes out in order, and a death on the way loses nothing."""
 
 import os
+import random
 import signal
+import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from tests.worker_killer import Killer
+from torchrl_sparse.data import demo_workers
 from torchrl_sparse.data.demo_workers import in_order
 
 
@@ -16,6 +20,13 @@ def note(folder, deadly, number):
     if deadly < 0 or (number == deadly and not died.exists()):
         died.touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    (Path(folder) / str(number)).touch()
+
+
+def hold(folder, number):
+    """Waits for a file, then writes one."""
+    while not (Path(folder) / "go").exists():
+        time.sleep(0.01)
     (Path(folder) / str(number)).touch()
 
 
@@ -34,6 +45,24 @@ def test_a_dead_worker_is_reported_and_its_work_redone(tmp_path, backend):
     with pytest.warns(RuntimeWarning, match=r"worker died.*; going on from number \d"):
         assert take(in_order(partial(note, tmp_path, 2), 0, workers=2, backend=backend), 4) == [0, 1, 2, 3]
     assert all((tmp_path / str(number)).exists() for number in range(4))
+
+
+def kill_while_starting(folder, backend, monkeypatch, delays):
+    monkeypatch.setattr(demo_workers, "_FAILURES", len(delays) + 1)
+    Killer(backend, delays, folder / "go").start()
+    with pytest.warns(RuntimeWarning, match=r"worker died.*; going on from number 0"):
+        assert take(in_order(partial(hold, folder), 0, workers=2, backend=backend), 4) == [0, 1, 2, 3]
+    assert all((folder / str(number)).exists() for number in range(4))
+
+
+def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path, backend, monkeypatch):
+    kill_while_starting(tmp_path, backend, monkeypatch, [0.0, 0.2, 1.0])
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_at_ten_moments_are_replaced(tmp_path, backend, monkeypatch):
+    drawn = random.Random(0)
+    kill_while_starting(tmp_path, backend, monkeypatch, [3 * drawn.random() for _ in range(10)])
 
 
 def test_workers_that_keep_dying_end_it(tmp_path, backend):

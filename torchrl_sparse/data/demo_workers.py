@@ -6,6 +6,7 @@ collector.
 
 from __future__ import annotations
 
+import signal
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -28,7 +29,7 @@ def in_order(
 ) -> Iterator[int]:
     """Call ``task(first)``, ``task(first + 1)``, ... in workers and yield each number once it is done, in order.
 
-    A worker that dies is reported as a warning; what it and the others had under way is done again.
+    A worker that dies, be it while it starts, is reported as a warning; what it and the others had under way is done again.
 
     Args:
         task: picklable; calling it again for the same number must do no harm.
@@ -77,7 +78,11 @@ def in_order(
 def _pool(backend: str, workers: int) -> Executor:
     if backend == "ray":
         return _RayPool()
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    # An interrupt then ends a worker as a kill does, instead of as an error of its task.
+    default = (signal.SIGINT, signal.SIG_DFL)
+    return ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=signal.signal, initargs=default
+    )
 
 
 def _death(backend: str, error: Exception) -> str:

@@ -9,7 +9,11 @@ from pathlib import Path
 
 __all__ = ["naming_full_disk"]
 
-_FULL = {errno.ENOSPC: "no space left", errno.EDQUOT: "quota exceeded"}
+_FULL = {
+    errno.ENOSPC: "no space left",
+    errno.EDQUOT: "quota exceeded",
+    errno.EFBIG: "file larger than may be",
+}
 _ROOM = 1 << 20  # bytes; a writer that reports a full disk as something else leaves less
 
 

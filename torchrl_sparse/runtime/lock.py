@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
+from torchrl_sparse.runtime.disk import naming_full_disk
+
 __all__ = ["lock_output"]
 
 
@@ -46,7 +48,8 @@ def lock_output(out: str | os.PathLike, *, is_file: bool = False) -> Iterator[in
     path = out.with_name(f".{out.name}.lock") if is_file else out / ".lock"
     made = [folder for folder in path.parents if not folder.exists()]
     try:
-        descriptor = _acquire(path, out)
+        with naming_full_disk(path):
+            descriptor = _acquire(path, out)
         try:
             yield descriptor
         finally:

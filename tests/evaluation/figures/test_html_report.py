@@ -83,8 +83,17 @@ def test_names_are_text_and_never_markup(tmp_path):
 def test_a_damaged_file_is_named_and_the_others_are_shown(runs, tmp_path):
     (runs / "broken").mkdir()
     (runs / "broken" / "results.json").write_text(json.dumps({"schema": 7}))
+    (runs / "cut" / "results.json").mkdir(parents=True)
+    (runs / "realtime.json").symlink_to("nowhere")
+    (runs / "bytes").mkdir()
+    (runs / "bytes" / "realtime.json").write_bytes(b"\xff\xfe")
     faults = write_report(runs, tmp_path / "report.html")
-    assert list(faults) == ["broken/results.json"]
+    assert sorted(faults) == [
+        "broken/results.json",
+        "bytes/realtime.json",
+        "cut/results.json",
+        "realtime.json",
+    ]
     text = (tmp_path / "report.html").read_text()
     assert "schema: expected 1 or 2, got 7" in text
     assert text.count("<table>") == 2

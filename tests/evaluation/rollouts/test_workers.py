@@ -16,7 +16,7 @@ import torch
 from torchrl.data import NonTensor
 
 from tests.evaluation.rollouts.fakes import FakeActor, FakeEnv
-from tests.evaluation.rollouts.killer import Killer
+from tests.worker_killer import Killer
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.rollouts import paired, process_collector
 from torchrl_sparse.evaluation.rollouts.paired import rollout_episodes
@@ -106,7 +106,7 @@ class HeldEnv(FakeEnv):
 def kill_while_starting(monkeypatch, backend, go, delays):
     """Runs all episodes while workers are killed before their first batch, each so many seconds after its fork."""
     monkeypatch.setattr(paired, "_FAILURES", len(delays) + 1)
-    killer = Killer(delays, go)
+    killer = Killer(backend, delays, go)
     killer.start()
     with pytest.warns(RuntimeWarning, match="episodes are run anew") as warned:
         episodes = run(partial(HeldEnv, go=go), workers=2, num_envs=2, backend=backend)

@@ -77,7 +77,7 @@ class Run:
         load, make_rows, make_note, find_plots = _KINDS[file.name]
         try:
             results = load(file)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             return cls(name, fault=str(error))
         with tempfile.TemporaryDirectory() as folder:
             figures = [

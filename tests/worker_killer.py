@@ -7,7 +7,10 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SIGNALS = {
+    "process": (signal.SIGKILL, signal.SIGTERM, signal.SIGINT),
+    "ray": (signal.SIGKILL, signal.SIGTERM),  # which takes an interrupt for a task that is cancelled
+}
 
 
 class Killer(threading.Thread):
@@ -16,9 +19,9 @@ class Killer(threading.Thread):
     Makes the file ``done`` after the last.
     """
 
-    def __init__(self, delays, done):
+    def __init__(self, backend, delays, done):
         super().__init__(daemon=True)
-        self.delays, self.done = delays, done
+        self.signals, self.delays, self.done = SIGNALS[backend], delays, done
 
     def run(self):
         doomed = set()  # the others go with the one that is killed
@@ -27,7 +30,7 @@ class Killer(threading.Thread):
             time.sleep(delay)
             alive = _wait_for_workers(doomed)
             with suppress(ProcessLookupError):
-                os.kill(min(alive), SIGNALS[number % len(SIGNALS)])
+                os.kill(min(alive), self.signals[number % len(self.signals)])
             doomed |= alive
         self.done.touch()
 
