@@ -230,7 +230,7 @@ def _put_weight(name: str, value: Any, payload: dict) -> None:
 
 
 def _sweep_changes() -> Iterator[Change]:
-    for key in ("program", "method", "parameters"):
+    for key in ("program", "method", "parameters", "command"):
         for how, value in {"missing": None, "a number": 3, "a list": [1], "unknown": "unheard of"}.items():
             sweep = (
                 {**SWEEP, key: value} if how != "missing" else {k: v for k, v in SWEEP.items() if k != key}
@@ -238,7 +238,7 @@ def _sweep_changes() -> Iterator[Change]:
             name = f"{key} is {how}"
             yield Change(
                 name,
-                None if (key, how) == ("program", "unknown") else key,
+                None if (key, how) in {("program", "unknown"), ("command", "a list")} else key,
                 partial(_put_text, yaml.dump(sweep)),
             )
     bomb = "\n".join(

@@ -25,7 +25,7 @@ KILL, WORKER, RESUMED = (
     "run again, it ends as if never killed",
 )
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-_SLOWER = 12  # times the length of an undisturbed run after which a run has hung
+_SLOWER = 4  # times the length of an undisturbed run after which a run has hung
 _LEAST = 120.0  # seconds that are always granted
 _CHAIN = 5  # kills of one folder
 

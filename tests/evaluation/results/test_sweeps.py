@@ -23,6 +23,7 @@ BAYES = {
     "method": "bayes",
     "metric": {"name": "tested/success", "goal": "maximize"},
     "parameters": {"num_updates": {"min": 2, "max": 50}},
+    "command": ["python", "${program}", "${args_no_hyphens}"],
 }
 
 
@@ -72,9 +73,16 @@ def test_another_sweep_in_the_folder_is_refused(tmp_path):
 
 
 def test_what_wandb_would_refuse_is_named(tmp_path):
-    (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, "method": "guess"}))
-    with pytest.raises(ValueError, match=r"bad.yaml: expected a wandb sweep, got .*guess"):
-        read_sweep(tmp_path / "bad.yaml")
+    for change, fault in (
+        ({"method": "guess"}, "method: expected one of grid, random, bayes, got 'guess'"),
+        ({"program": 3}, "program: expected a str, got 3"),
+        ({"parameters": [1]}, r"parameters: expected a dict, got \[1\]"),
+        ({"command": None}, "command: expected a list, got None"),
+        ({"parameters": {"n": {"value": 1, "values": [1]}}}, "expected a wandb sweep, got .*"),
+    ):
+        (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, **change}))
+        with pytest.raises(ValueError, match=f"bad.yaml: {fault}$"):
+            read_sweep(tmp_path / "bad.yaml")
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ class PrunerNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input = bool(rate_input)
+        self.rate_input = rate_input
         self.config: dict[str, Any] = {
             "timesteps": self.timesteps,
             "num_blocks": num_blocks,
@@ -215,6 +215,8 @@ def _check(timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool,
         raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
     if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
         raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
+    if not isinstance(rate_input, bool):
+        raise ValueError(f"rate_input: expected true or false, got {reprlib.repr(rate_input)}")
     check_size("timesteps", len(timesteps), _MAX_CELLS)
     check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
     check_size("width", sizes["width"], _MAX_TOKEN)

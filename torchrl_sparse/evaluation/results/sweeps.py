@@ -29,6 +29,9 @@ __all__ = [
 ]
 
 
+_METHODS = ("grid", "random", "bayes")
+
+
 @dataclass(frozen=True)
 class Trial:
     """One trial: the id of its wandb run, which also names its folder, its parameters, and whether it is through."""
@@ -62,16 +65,32 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     try:
         config = yaml.safe_load(Path(path).read_bytes())
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # of bytes that are no text, and of depth
-        raise ValueError(f"{path}: expected a wandb sweep, got {error or 'one that is too deep'}") from error
+        reason = " ".join(str(error).split()) or "one that is too deep"
+        raise ValueError(f"{path}: expected a wandb sweep, got {reason}") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
-    violations = _engine().config.cfg.schema_violations_from_proposed_config(config)
+    _check_entries(path, config)
+    check = _engine().config.cfg.schema_violations_from_proposed_config
+    try:
+        violations = check(config)
+    except ValueError as error:
+        violations = [str(error)]
     if violations:
         raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
     split = config["parameters"].get("split", {})
     if "split=test" in config.get("command", []) or "test" in [split.get("value"), *split.get("values", [])]:
         raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
     return config
+
+
+def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
+    """Refuse entries that a trial is made from and that are of no use, by name, which wandb's own messages lack."""
+    kinds = {"program": str, "method": str, "parameters": dict, "command": list}
+    for name, kind in kinds.items():
+        if not isinstance(config.get(name), kind):
+            raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
+    if config["method"] not in _METHODS:
+        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
 
 
 class LocalSweep:

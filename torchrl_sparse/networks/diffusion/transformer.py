@@ -293,6 +293,8 @@ def _check_config(config: dict) -> None:
         check_size(name, config[name], _MAX_TOKENS)
     check_size("n_layer", config["n_layer"], MAX_LAYERS)
     check_size("n_cond_layers", config["n_cond_layers"], MAX_LAYERS, least=0)
+    if not isinstance(config["causal_attn"], bool):
+        raise ValueError(f"causal_attn: expected true or false, got {config['causal_attn']!r}")
     if config["n_emb"] % config["n_head"]:
         raise ValueError(
             f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"

@@ -117,7 +117,7 @@ class VLAConfig:
             )
         if not 1 <= len(self.cameras) <= 2 or not all(map(_is_key, self.cameras)):
             raise ValueError(f"cameras: expected one or two keys, got {reprlib.repr(list(self.cameras))}")
-        if not 0 < self.crop_area <= 1:
+        if type(self.crop_area) not in (int, float) or not 0 < self.crop_area <= 1:
             raise ValueError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
 
     @classmethod
@@ -172,6 +172,8 @@ class VLAConfig:
             found = sorted(fields) if isinstance(fields, Mapping) else type(fields).__name__
             raise ValueError(f"expected the fields {sorted(names)}, got {found}")
         towers = {name: _size(name, fields[name]) for name in ("dino", "siglip", "llm")}
+        if not isinstance(fields["cameras"], list):
+            raise ValueError(f"cameras: expected a list of keys, got {reprlib.repr(fields['cameras'])}")
         cameras = tuple(tuple(key) if isinstance(key, list) else key for key in fields["cameras"])
         return cls(**{**fields, **towers, "cameras": cameras})
 

@@ -150,11 +150,15 @@ def tokenizer_from_config(config: Any) -> InstructionTokenizer:
         ValueError: if it is none.
     """
     match config:
-        case {"kind": "words", "words": list(words)} if all(isinstance(word, str) for word in words):
+        case {"kind": "words", "words": list(words), **rest} if not rest and _are_words(words):
             return WordTokenizer(words)
-        case {"kind": "llama", "definition": dict(definition)}:
+        case {"kind": "llama", "definition": dict(definition), **rest} if not rest:
             return LlamaTokenizer(json.dumps(definition))
     raise ValueError(f"tokenizer: expected kind 'words' or 'llama' and its field, got {str(config)[:80]}")
+
+
+def _are_words(values: list[Any]) -> bool:
+    return all(isinstance(value, str) for value in values)
 
 
 def _pieces(text: str) -> list[str]:
