@@ -1,6 +1,7 @@
 """The compiled library: found, broken, missing; and what it depends on."""
 
 import ctypes
+from pathlib import Path
 
 import pytest
 
@@ -28,6 +29,12 @@ def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monke
         assert native_supports(make_network()) == (False, "it was not built")
     finally:
         library.library.cache_clear()
+
+
+def test_a_library_of_other_sources_is_refused(monkeypatch):
+    """Its structures would be read wrongly, without a word."""
+    monkeypatch.setattr(library, "Model", ctypes.c_int32)
+    assert "was built from other sources; install" in library._load(Path(library.__file__).parent)
 
 
 def test_the_library_depends_on_nothing_but_the_c_runtime():
