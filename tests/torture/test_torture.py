@@ -1,4 +1,4 @@
-"""The campaign, shortened to two minutes, and its page."""
+"""The campaign, shortened (`-m slow`), and what it is made of."""
 
 import os
 import random
@@ -14,7 +14,7 @@ from tests.torture.folders import torture_folder
 from tests.torture.kills import KILL, RESUMED, Killer
 from tests.torture.limits import Outcome, run_limited
 from tests.torture.recipes import tiny_recipes
-from tests.torture.report import PAGE, Campaign, Verdict, format_report, load_report, render_page
+from tests.torture.report import Campaign, Verdict, format_report, render_page
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills and limits are Linux's own")
 SEED = 0
@@ -27,14 +27,17 @@ def assert_survived(verdicts, at_least):
     assert not faults, "\n".join(map(str, faults))
 
 
+@pytest.mark.slow
 def test_malformed_files_are_refused_by_name_and_in_time():
     assert_survived(torture_files(SEED, share=0.18), at_least=300)
 
 
+@pytest.mark.slow
 def test_hostile_archives_execute_and_exhaust_nothing():
     assert_survived(torture_archives(), at_least=100)
 
 
+@pytest.mark.slow
 def test_engines_answer_or_refuse():
     assert_survived(torture_engines(SEED, queries=80, library=None, seconds=300), at_least=3 * 80)
 
@@ -46,12 +49,14 @@ def killer(tmp_path_factory):
     return Killer(next(tiny_recipes(work)), work / "runs", random.Random(SEED))
 
 
+@pytest.mark.slow
 def test_a_killed_recipe_goes_on_as_if_never_killed(killer):
     verdicts = list(killer.chain(kills=3))
     assert [verdict.part for verdict in verdicts[-2:]] == [KILL, RESUMED]
     assert_survived(verdicts, at_least=2)
 
 
+@pytest.mark.slow
 def test_a_shared_folder_and_a_full_disk(killer, tmp_path):
     assert_survived(torture_folder(killer, tmp_path, random.Random(SEED)), at_least=2)
 
@@ -110,7 +115,3 @@ def test_a_report_counts_and_names():
     assert "- kill, sweep, SIGINT after 2.0 s: hung" in text
     with pytest.raises(ValueError, match="expected one <!-- report -->"):
         render_page("no place", campaign.report(minutes=1.0))
-
-
-def test_the_page_and_its_json_agree():
-    assert render_page(PAGE.read_text(), load_report()) == PAGE.read_text()

@@ -7,9 +7,8 @@ observations. Its trunk is a pre-norm decoder; every layer holds three *blocks*,
     x = x + CA(LN2(x), memory)      cross-attention to [timestep, observations]
     x = x + FFN(LN3(x))             feed-forward, hidden size 4 * n_emb
 
-Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods skip, so the forward pass is
-written as a loop over :meth:`TransformerForDiffusion.block`. Parameter names equal those of the published
-checkpoints (without ``model.``).
+Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods skip, so the forward pass is a loop over
+:meth:`TransformerForDiffusion.block`. Parameter names equal those of the published checkpoints (without ``model.``).
 """
 
 from __future__ import annotations
