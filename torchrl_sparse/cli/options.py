@@ -59,6 +59,7 @@ OPTIONS: dict[str, Any] = {
     # methods
     "method": Word,
     "methods": Words,
+    "benchmark_vla.methods": list[Word],  # none: dense alone
     "calibrate_bac.methods": Annotated[
         list[Literal["bac", "bac_blockwise", "bac_unified"]], Field(min_length=1)
     ],
@@ -76,7 +77,8 @@ OPTIONS: dict[str, Any] = {
     "kind": Word,
     "eta": Annotated[float, Field(ge=0, le=1)],
     "spacings": Words,
-    "sampler": Word | Section | None,
+    "sampler": Section | None,
+    "calibrate_bac.sampler": Word | None,
     "specprune": Section,
     "options": Section,
     "preset": Word,

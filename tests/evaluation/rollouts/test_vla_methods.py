@@ -140,6 +140,6 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
 
 
 def test_a_reference_that_is_not_run_is_refused(policy_folder, tmp_path):
-    done = run(policy_folder, tmp_path, "methods=[fastv@specprune]")
+    done = run(policy_folder, tmp_path, "methods=[fastv@specprune]", "pairs=[]", "videos=[]")
     assert "fastv@specprune: expected one of dense after @, got 'specprune'" in done.stderr
     assert not list(tmp_path.iterdir())

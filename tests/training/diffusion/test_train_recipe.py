@@ -46,7 +46,7 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     # Started from that policy, a training that learns nothing gives it back.
     tuned = tmp_path / "tuned"
     train_unbroken(
-        "train_policy", tuned, [f"demos={demos}", f"init={broken}/policy", "max_steps=1", "lr=0.0"]
+        "train_policy", tuned, [f"demos={demos}", f"init={broken}/policy", "max_steps=1", "lr=1e-20"]
     )
     again = DiffusionPolicy.from_pretrained(tuned / "policy").state_dict()
     assert all(torch.equal(again[name], value) for name, value in policy.state_dict().items())
