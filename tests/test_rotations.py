@@ -34,10 +34,22 @@ def test_any_two_independent_rows_become_a_rotation():
     np.testing.assert_allclose(np.linalg.det(matrices), 1.0)
 
 
-@pytest.mark.parametrize("rot6d", [np.zeros(6), np.array([1.0, 0, 0, 2, 0, 0])])
+@pytest.mark.parametrize("rot6d", [np.zeros(6), np.array([1.0, 0, 0, 2, 0, 0]), np.full(6, 1e300)])
 def test_rows_that_fix_no_rotation_are_refused(rot6d):
     with pytest.raises(ValueError, match="parallel, zero or beyond"):
         rot6d_to_matrix(rot6d)
+
+
+@pytest.mark.parametrize("angle", [1e30, 101.0, np.inf, np.nan])
+def test_rotation_vectors_of_no_angle_are_refused(angle):
+    pose = np.zeros((2, 7))
+    pose[1, 4] = angle
+    with pytest.raises(ValueError, match="rotation vector: expected at most 100 rad, got"):
+        pose_to_absolute(pose)
+
+
+def test_no_poses_become_no_actions():
+    assert pose_to_absolute(np.zeros((0, 7))).shape == (0, 10)
 
 
 def test_actions_of_two_arms_round_trip():

@@ -71,14 +71,14 @@ def pose_to_absolute(pose: np.ndarray) -> np.ndarray:
     """Convert [..., 7 * arms] (position, rotation vector, gripper) to [..., 10 * arms] (position, 6-D rotation, gripper)."""
     arms = _split_arms(pose, POSE_DIM)
     absolute = np.concatenate([arms[..., :3], rotvec_to_rot6d(arms[..., 3:6]), arms[..., 6:]], axis=-1)
-    return absolute.reshape(*pose.shape[:-1], -1)
+    return absolute.reshape(*pose.shape[:-1], arms.shape[-2] * ABSOLUTE_DIM)
 
 
 def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
     """Convert [..., 10 * arms] (position, 6-D rotation, gripper) to [..., 7 * arms] (position, rotation vector, gripper)."""
     arms = _split_arms(absolute, ABSOLUTE_DIM)
     pose = np.concatenate([arms[..., :3], rot6d_to_rotvec(arms[..., 3:9]), arms[..., 9:]], axis=-1)
-    return pose.reshape(*absolute.shape[:-1], -1)
+    return pose.reshape(*absolute.shape[:-1], arms.shape[-2] * POSE_DIM)
 
 
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ def downward_quaternion(quat: np.ndarray) -> np.ndarray:
 def _split_arms(flat: np.ndarray, dim: int) -> np.ndarray:
     if flat.shape[-1] == 0 or flat.shape[-1] % dim:
         raise ValueError(f"action: expected {dim} numbers per arm, got a last axis of {flat.shape[-1]}")
-    return flat.reshape(*flat.shape[:-1], -1, dim)
+    return flat.reshape(*flat.shape[:-1], flat.shape[-1] // dim, dim)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -170,6 +170,10 @@ def resample(file):
             replace("data/demo_1/obs/object", np.zeros((4, 3))),
             r"one size of state and action.*\(5, 10\), \(6, 10\)",
         ),
+        (
+            replace("data/demo_1/actions", np.full((4, 7), 1e30)),
+            "demo_1, actions: rotation vector: expected at most 100 rad, got 1e",
+        ),
         (replace("data/demo_1", np.zeros(3)), "demo_1: expected a group"),
         (resample, r"demo_1, actions: expected shape \[5 = num_samples > 0, n\], got \[4, 7\]"),
     ],

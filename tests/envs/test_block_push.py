@@ -44,6 +44,16 @@ class TestWithSimulator:
         assert env.action_spec.shape == (2,)
         assert env.horizon == 350
 
+    def test_a_delta_beyond_its_bounds_counts_as_the_bound(self, env):
+        ends = []
+        for far in (0.1, 5.0):
+            env.set_seed(3)
+            td = env.reset()
+            ends.append(
+                env.step(td.set(keys.ACTION, torch.tensor([far, -far])))["next", "observation", "state"]
+            )
+        assert torch.equal(*ends)
+
     def test_seeds_fix_episodes(self):
         published.check_seeds_fix_episodes(BlockPushEnv, torch.tensor([0.03, 0.05]))
 

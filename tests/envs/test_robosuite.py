@@ -157,6 +157,36 @@ def test_instruction_is_written_when_asked_for():
     assert env.reset()[keys.INSTRUCTION] == "lift the red cube"
 
 
+@pytest.mark.parametrize("far", [1.5, 1e30])
+def test_a_delta_beyond_its_bounds_counts_as_the_bound(lift, far):
+    direction = torch.tensor([1.0, 0.0, -1.0, 0.0, 1.0, 0.0, 1.0])
+    states = []
+    for action in (direction, far * direction):
+        lift.set_seed(5)
+        td = lift.reset()
+        states.append(lift.step(td.set("action", action))["next", "observation", "state"])
+    assert torch.equal(*states)
+
+
+@pytest.mark.parametrize("seeds", [[1.7], [torch.tensor(1.7)], ["7"], [None], [-1], [2**63]])
+def test_seeds_that_are_no_whole_numbers_are_refused(seeds):
+    with pytest.raises(ValueError, match="seed: expected a whole number from 0"):
+        RobosuiteEnv("Lift", seeds=seeds)
+
+
+def test_a_seed_that_is_a_fraction_is_refused_and_changes_nothing(lift):
+    lift.set_seed(5)
+    with pytest.raises(ValueError, match=r"seed: expected a whole number from 0 to .*, got 1\.7"):
+        lift._set_seed(1.7)
+    assert lift.reset()[keys.EPISODE_SEED] == 5
+
+
+def test_whole_numbers_of_any_type_are_seeds():
+    seeds = [np.int64(3), torch.tensor(4), 5]
+    env = RobosuiteEnv("Lift", seeds=seeds)
+    assert [env.reset()[keys.EPISODE_SEED].item() for _ in seeds] == [3, 4, 5]
+
+
 def test_bad_input_is_named(lift):
     with pytest.raises(ValueError, match=r"expected one of Lift, .*PickPlaceCan.*got 'Fly'"):
         find_robosuite_task("Fly")

@@ -102,6 +102,9 @@ def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[in
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         came = f"dtype {mask.dtype}" if isinstance(mask, Tensor) else type(mask).__name__
         raise MaskError(f"prune mask: expected a tensor of dtype torch.bool, got {came}")
+    if mask.is_meta or mask.layout != torch.strided:
+        came = "the meta device" if mask.is_meta else f"layout {mask.layout}"
+        raise MaskError(f"prune mask: expected a dense tensor with values, got {came}")
     lead = "*B, " if batch is None else "".join(f"{size}, " for size in batch)
     if mask.shape[-2:] != tail or (batch is not None and mask.shape[:-2] != tuple(batch)):
         raise MaskError(

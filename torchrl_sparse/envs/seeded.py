@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.seeds import whole_seed
 
 
 class SeededEnv(EnvBase):
@@ -35,7 +36,7 @@ class SeededEnv(EnvBase):
         tells_way: write ``("episode", "way")``, which of its ways the task is being done, from `_way`.
 
     Raises:
-        ValueError: for an empty ``seeds``, or an action of a wrong size or that is not finite.
+        ValueError: for an empty ``seeds``, a seed that is no whole number, or an action of a wrong size or that is not finite.
     """
 
     action_mode: str = "absolute"
@@ -54,7 +55,7 @@ class SeededEnv(EnvBase):
             raise ValueError("seeds: expected at least one seed, got none")
         self.horizon = horizon
         self._counts_parts, self._tells_way = counts_parts, tells_way
-        self._seeds = None if seeds is None else itertools.cycle(int(seed) for seed in seeds)
+        self._seeds = None if seeds is None else itertools.cycle([whole_seed(seed) for seed in seeds])
         self._next_seed = int(torch.randint(2**31, ()))
         self._episode_seed = self._next_seed
         self._elapsed = 0
@@ -109,7 +110,7 @@ class SeededEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._next_seed = int(seed)
+            self._next_seed = whole_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         self._episode_seed = self._take_seed()

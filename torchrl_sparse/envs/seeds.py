@@ -8,7 +8,8 @@ the seeds of that time, from 1 000 000 and 2 000 000 on, are not remade: no tabl
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import operator
+from typing import Any, Literal, get_args
 
 __all__ = [
     "CALIBRATION_SEED",
@@ -18,6 +19,7 @@ __all__ = [
     "Split",
     "evaluation_seeds",
     "tuning_seeds",
+    "whole_seed",
 ]
 
 Split = Literal["test", "development"]
@@ -75,3 +77,23 @@ def tuning_seeds(first: int, episodes: int) -> range:
         last = first + episodes - 1
         raise ValueError(f"seed: expected seeds below {FIRST_TEST_SEED} for tuning, got the test seed {last}")
     return range(first, first + episodes)
+
+
+def whole_seed(seed: Any) -> int:
+    """Return a seed as an integer, of any type that stands for one.
+
+    Raises:
+        ValueError: if it is a fraction, which would silently be another episode, negative, or of more than 63 bits.
+
+    >>> whole_seed(1.7)
+    Traceback (most recent call last):
+    ...
+    ValueError: seed: expected a whole number from 0 to 2**63 - 1, got 1.7
+    """
+    try:
+        value = operator.index(seed)
+    except TypeError:
+        value = -1
+    if not 0 <= value < 1 << 63:
+        raise ValueError(f"seed: expected a whole number from 0 to 2**63 - 1, got {seed!r}")
+    return value

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
 from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
@@ -212,6 +213,43 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, how, error, message):
     damaged(json.loads((tmp_path / "config.json").read_text()), tmp_path, how)
     with pytest.raises(error, match=f"(?s){message}"):
         SAGPruner.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.uint8, torch.bool])
+def test_weights_that_are_no_floating_point_numbers_are_refused_by_name(tmp_path, dtype):
+    make_pruner().save_pretrained(tmp_path)
+    tensors = load_file(tmp_path / "pruner.safetensors")
+    save_file(tensors | {"obs.bias": tensors["obs.bias"].to(dtype)}, tmp_path / "pruner.safetensors")
+    with pytest.raises(ValueError, match=r"pruner\.safetensors: obs\.bias: expected a type of .*'F32'"):
+        SAGPruner.from_pretrained(tmp_path)
+
+
+def load(network, state):
+    network.load_state_dict(state)
+
+
+def assign(network, state):
+    network.load_state_dict(state, assign=True)
+
+
+def exchange(network, state):
+    for name, value in state.items():
+        module, _, weight = name.rpartition(".")
+        setattr(network.get_submodule(module), weight, torch.nn.Parameter(value))
+    network.eval()  # what follows from the weights is kept until then
+
+
+@pytest.mark.parametrize("change", [load, assign, exchange])
+def test_weights_that_changed_are_not_answered_with_the_old_ones(change):
+    pruner, cond = make_pruner(), observations()
+    before = plan(pruner, cond)
+    other = {name: torch.randn_like(value) for name, value in pruner.network.state_dict().items()}
+    change(pruner.network, other)
+    fresh = make_pruner()
+    fresh.network.load_state_dict(other)
+    after = plan(pruner, cond)
+    assert torch.equal(after, plan(fresh, cond))
+    assert not torch.equal(after, before)
 
 
 def test_rate_range_and_network_have_to_agree():

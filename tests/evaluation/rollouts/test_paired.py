@@ -43,6 +43,12 @@ def test_what_tasks_tell_is_kept_where_they_tell_it():
         assert episode.way == episode.seed % 4
 
 
+@pytest.mark.parametrize("seed", [1.7, "7", -1])
+def test_seeds_that_are_no_whole_numbers_are_refused(seed):
+    with pytest.raises(ValueError, match="seed: expected a whole number from 0"):
+        rollout_episodes(FakeActor(), FakeEnv, [3, seed])
+
+
 def test_costs_count_only_where_the_policy_was_queried():
     for episode in rollout_episodes(FakeActor(prune_rate=0.3), FakeEnv, SEEDS, num_envs=4):
         count = queries(episode.length)

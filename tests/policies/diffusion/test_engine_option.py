@@ -55,6 +55,32 @@ def test_weights_that_change_change_the_actions(policy, engine, through_data):
     torch.testing.assert_close(changed, policy(request(2))[keys.CHUNK], atol=1e-5, rtol=0)
 
 
+def assign_state(network):
+    network.load_state_dict({name: 1.5 * value for name, value in network.state_dict().items()}, assign=True)
+
+
+def replace_a_parameter(network):
+    network.head.bias = torch.nn.Parameter(network.head.bias.detach() + 1.0)
+
+
+def replace_a_module(network):
+    other = copy.deepcopy(network.decoder.layers[1])
+    other.linear2.bias.data[20:] += 1.0
+    network.decoder.layers[1] = other
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("change", [assign_state, replace_a_parameter, replace_a_module])
+def test_weights_that_are_exchanged_change_the_actions(policy, engine, change):
+    policy.engine = engine
+    before = policy(request(2))[keys.CHUNK]
+    change(policy.network)
+    changed = policy(request(2))[keys.CHUNK]
+    policy.engine = "reference"
+    torch.testing.assert_close(changed, policy(request(2))[keys.CHUNK], atol=1e-5, rtol=0)
+    assert (changed - before).abs().max() > 1e-3
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_refresh_reads_weights_that_were_written_behind_all_records(policy, engine):
     policy.engine = engine

@@ -14,7 +14,7 @@ from torchrl_sparse.networks.diffusion.noise import query_seed, sample_noise
 def request(*batch, seed=0):
     generator = torch.Generator().manual_seed(seed)
     td = TensorDict({keys.HISTORY_STATE: torch.randn(*batch, 2, 5, generator=generator)}, batch)
-    td[keys.EPISODE_SEED] = torch.arange(td.numel()).reshape(*batch, 1)
+    td[keys.EPISODE_SEED] = torch.arange(td.batch_size.numel()).reshape(*batch, 1)
     td[keys.EPISODE_STEP] = torch.zeros(*batch, 1, dtype=torch.int64)
     return td
 

@@ -49,6 +49,15 @@ TENSOR_FAULTS = {
         r"expected shape \(4,\), got \(9,\)",
     ),
     "nan": (lambda t: t.update({"network.head.bias": torch.full((4,), float("nan"))}), "finite"),
+    "integers": (
+        lambda t: t.update({"network.head.bias": torch.zeros(4, dtype=torch.int32)}),
+        r"network.head.bias: expected a type of \['F16', 'BF16', 'F32', 'F64'\], got I32",
+    ),
+    "bytes": (lambda t: t.update({"normalizer.state_scale": torch.ones(5).byte()}), "state_scale: .*got U8"),
+    "no scale": (
+        lambda t: t.update({"normalizer.state_scale": torch.zeros(5)}),
+        "normalizer: .* without zeros",
+    ),
     "normalizer": (lambda t: t.pop("normalizer.state_scale"), r"missing \['normalizer.state_scale'\]"),
 }
 

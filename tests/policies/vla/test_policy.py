@@ -262,3 +262,8 @@ def test_the_input_is_not_changed_by_a_pruner_that_writes_a_mask(policy, query):
 def test_one_instruction_serves_a_batch(policy, query):
     td = TensorDict({"observation": query(2)["observation"], "language_instruction": "stack"}, [2])
     torch.testing.assert_close(policy(td)[keys.CHUNK], policy(query(2, ["stack"]))[keys.CHUNK])
+
+
+def test_an_empty_batch_is_refused_by_name(policy, query):
+    with pytest.raises(ValueError, match=r"batch: expected at least one query, got batch size \[0\]"):
+        policy(query(2)[:0])

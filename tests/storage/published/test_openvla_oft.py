@@ -5,11 +5,13 @@ import pickle
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
 from tests.storage.published import openvla as published
 from torchrl_sparse import keys
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.published.faults import CheckpointError
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +119,57 @@ def film(folder):
     (folder / "vision_backbone--150000_checkpoint.pt").write_bytes(b"")
 
 
+def endless_head(folder):
+    """A weight that repeats one number: nothing of it is in the file."""
+    path = folder / "action_head--150000_checkpoint.pt"
+    weights = torch.load(path, weights_only=True)
+    torch.save(weights | {"module.model.fc2.weight": torch.zeros(1).expand(10**9, 48)}, path)
+
+
+def endless_image(folder):
+    edit(folder, "config.json", lambda c: c.update(image_sizes=[10**9, 10**9]))
+
+
+def image_of_lists(folder):
+    edit(folder, "config.json", lambda c: c.update(image_sizes=[[28], [28]]))
+
+
+def text_of_no_config(folder):
+    edit(folder, "config.json", lambda c: c.update(text_config=[1]))
+
+
+def ragged_statistics(folder):
+    edit(
+        folder,
+        "dataset_statistics.json",
+        lambda c: c["libero_spatial_no_noops"]["action"].update(mask=[[1], []]),
+    )
+
+
+def a_thousand_layers(folder):
+    path = folder / "model-00001-of-00002.safetensors"
+    block = {f"vision_backbone.featurizer.blocks.{i}.more": torch.zeros(1) for i in range(1000)}
+    save_file(load_file(path) | block, path)
+
+
+def whole_numbers(folder):
+    path = folder / "model-00001-of-00002.safetensors"
+    save_file({name: value.int() for name, value in load_file(path).items()}, path)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
+        (
+            endless_head,
+            r"checkpoint.pt: expected a file of tensors, got: expected a tensor within its storage of 1",
+        ),
+        (endless_image, r"image_size: expected a whole number from 1 to 4096"),
+        (image_of_lists, r"expected a checkpoint, got TypeError"),
+        (text_of_no_config, r"expected a checkpoint, got AttributeError"),
+        (ragged_statistics, r"expected .*"),
+        (a_thousand_layers, r"layers: expected a whole number from 1 to 256, got 1000"),
+        (whole_numbers, r"expected a type of .*'F16'.*got I32"),
         (drop_shard, r"expected a file .*model-00002-of-00002"),
         (cut_shard, r"model-00002-of-00002.safetensors: expected a complete safetensors file"),
         (second_head, r"expected exactly one file action_head\*checkpoint\*, got \['action_head--150000"),
@@ -133,7 +183,7 @@ def film(folder):
 )
 def test_damage_is_named(folder, damage, message):
     damage(folder)
-    with pytest.raises((FileNotFoundError, ValueError), match=message):
+    with pytest.raises((FileNotFoundError, CheckpointError), match=message):
         load(folder)
 
 

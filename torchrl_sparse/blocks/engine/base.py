@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import Reuse, check_reuse, validate_mask
@@ -34,8 +35,8 @@ class Engine(Protocol):
         """Return normalised actions f32 [B, H, A], those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
         Args:
-            noise: f32 [B, K, H, A], standard normal.
-            cond: f32 [B, To, D], encoded observations.
+            noise: f32 [B, K, H, A], standard normal; of the network's type and device. There may be no rows.
+            cond: f32 [B, To, D], encoded observations, the same.
             mask: bool [B, K, 3L], True = pruned, row 0 all False; None prunes nothing. It is checked here, once a
                 query.
             reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`.
@@ -72,13 +73,27 @@ def check_query(
         MaskError: a ValueError, if the mask is no prune mask for the query.
         ValueError: naming what was expected and what came.
     """
-    num_steps, batch = sampler.num_inference_steps, len(cond)
+    num_steps, batch = (
+        sampler.num_inference_steps,
+        cond.shape[0] if isinstance(cond, Tensor) and cond.ndim else 1,
+    )
     for name, tensor, expected in (
-        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
         ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),
+        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
     ):
-        if tuple(tensor.shape) != expected:
-            raise ValueError(f"{name}: expected shape {list(expected)}, got {list(tensor.shape)}")
+        _check_input(name, tensor, expected, network.pos_emb)
     if mask is not None:
         validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
     check_reuse(reuse)
+
+
+def _check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+    if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested:
+        came = f"layout {tensor.layout}" if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise ValueError(f"{name}: expected a dense tensor, got {came}")
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
+    if tensor.dtype != like.dtype or tensor.device != like.device:
+        raise ValueError(
+            f"{name}: expected {like.dtype} on {like.device}, as the network, got {tensor.dtype} on {tensor.device}"
+        )

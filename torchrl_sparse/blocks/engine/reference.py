@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.timing import time_blocks
-from torchrl_sparse.blocks.engine.weights import refuse_meta
+from torchrl_sparse.blocks.engine.weights import check_weights
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -155,21 +155,21 @@ class ReferenceEngine:
         sampler: the sampler.
 
     Raises:
-        ValueError: if the network has weights without values, on the meta device.
+        ValueError: if the network has weights without values, on the meta device, or such as are no floating-point numbers.
     """
 
     name = "reference"
     detail = "eager and differentiable"
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
-        refuse_meta(network)
+        check_weights(network)
         self._network, self._sampler = network, sampler
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
     ) -> Tensor:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.denoise`; gradients flow."""
-        refuse_meta(self._network)
+        check_weights(self._network)
         return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse)
 
     def refresh(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["WeightWatch", "refuse_meta"]
+__all__ = ["WeightWatch", "check_weights"]
 
 _SAMPLES = 4
 
@@ -53,18 +53,19 @@ class WeightWatch:
         """Return what compares equal as long as the weights are the same.
 
         Raises:
-            ValueError: naming a weight that has no values, on the meta device.
+            ValueError: naming a weight that has no values, on the meta device, or that is no floating-point number.
         """
         members = self._members
         if members.identities() != members.known:
             members = self._members = _Members.of(self._network)
         addresses = [p.data_ptr() for p in members.parameters]
+        addresses += [p.is_contiguous() for p in members.parameters]  # a matrix may be turned where it lies
         # Tensors made in inference mode count no versions.
         versions = [0 if p.is_inference() else p._version for p in members.parameters]
         known, places = self._places  # read and replaced in one go: other threads may do the same
         if known != addresses:
-            refuse_meta(self._network)
-            places = self.locate([p.detach().reshape(-1)[:_SAMPLES] for p in members.parameters])
+            check_weights(self._network)
+            places = self.locate([_first_values(p.detach()) for p in members.parameters])
             self._places = addresses, places
         return members.known, addresses, versions, self.read(places), self._refreshed
 
@@ -98,9 +99,17 @@ class _Members:
         return [id(member) for holder in self.holders for member in holder.values()]
 
 
-def refuse_meta(network: nn.Module) -> None:
-    """Raise ValueError, naming it, if ``network`` has a weight without values."""
+def _first_values(weight: Tensor) -> Tensor:
+    """Return a view of the first values in memory order, or of the first row where there is no such order."""
+    flat = weight.view(-1) if weight.is_contiguous() else weight[(0,) * (weight.ndim - 1)]
+    return flat[:_SAMPLES]
+
+
+def check_weights(network: nn.Module) -> None:
+    """Raise ValueError, naming it, if ``network`` has a weight without values, or one that is no floating-point number."""
     for name, parameter in network.named_parameters():
+        if not parameter.is_floating_point():
+            raise ValueError(f"network: expected floating-point weights, got {name!r} of {parameter.dtype}")
         if parameter.is_meta:
             raise ValueError(
                 f"network: expected weights with values, got {name!r} on the meta device (move the network with "

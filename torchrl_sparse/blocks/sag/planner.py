@@ -55,7 +55,7 @@ def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
         1.5
     """
     ordered = logits[:, 1:].flatten(1).sort(descending=True).values
-    count = (rate * logits[0].numel()).round().long().clamp(1, ordered.shape[1] - 1)
+    count = (rate * logits.shape[1:].numel()).round().long().clamp(1, ordered.shape[1] - 1)
     return ordered.gather(1, torch.cat([count - 1, count], dim=1)).mean(dim=1)[:, None, None]
 
 

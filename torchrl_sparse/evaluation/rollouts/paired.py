@@ -19,6 +19,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.seeds import whole_seed
 from torchrl_sparse.evaluation.rollouts.collectors import running_collector
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.runtime.backends import WorkerDied, backend_runtime
@@ -82,7 +83,7 @@ def rollout_episodes(
         The episodes in the order of ``seeds``.
 
     Raises:
-        ValueError: if seeds repeat, an option is out of range or the file belongs to something else.
+        ValueError: if seeds repeat or are no whole numbers, an option is out of range or the file belongs to something else.
         ImportError: if Ray is asked for and not installed.
         KeyError: if the actor or the environment leaves out a key that is needed.
         RuntimeError: if workers keep dying without finishing an episode, or one raised an error.
@@ -95,7 +96,7 @@ def rollout_episodes(
         >>> [episode.queries for episode in rollout_episodes(ChunkExecutor(policy), make, [100_000, 100_001], num_envs=2)]
         [2, 2]
     """
-    seeds = [int(seed) for seed in seeds]
+    seeds = [whole_seed(seed) for seed in seeds]
     if len(set(seeds)) != len(seeds):
         raise ValueError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
     if num_envs < 1 or (max_steps is not None and max_steps < 1):

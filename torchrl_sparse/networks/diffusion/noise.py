@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+_WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
@@ -32,13 +36,23 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
         seed: i64 [B].
         num_steps: denoising steps K.
         chunk_shape: (H, A).
+
+    Raises:
+        ValueError: if seeds are no whole numbers.
     """
-    rows = []
-    for value in seed.tolist():
+    check_whole("seed", seed)
+    noise = torch.empty(len(seed), num_steps, *chunk_shape)
+    for row, value in zip(noise, seed.tolist(), strict=True):
         generator = torch.Generator().manual_seed(value)
-        initial = torch.randn(1, *chunk_shape, generator=generator)
-        rows.append(torch.cat([initial, torch.randn(num_steps - 1, *chunk_shape, generator=generator)]))
-    return torch.stack(rows).to(seed.device)
+        row[:1] = torch.randn(1, *chunk_shape, generator=generator)
+        row[1:] = torch.randn(num_steps - 1, *chunk_shape, generator=generator)
+    return noise.to(seed.device)
+
+
+def check_whole(name: Any, tensor: Tensor) -> None:
+    """Raise ValueError unless ``tensor`` holds whole numbers: of a fraction, a generator would take another seed."""
+    if tensor.dtype not in _WHOLE:
+        raise ValueError(f"{name}: expected whole numbers, got {tensor.dtype}")
 
 
 def _signed(unsigned: int) -> int:

@@ -14,6 +14,7 @@ Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods sk
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 
 import torch
 from torch import Tensor, nn
@@ -75,6 +76,9 @@ class TransformerForDiffusion(nn.Module):
         n_cond_layers: 0 makes the condition encoder a token-wise MLP (all published models), more a
             transformer encoder.
 
+    Attributes:
+        made_shapes: of its weights by name, as it was made with them.
+
     Raises:
         ValueError: if a size is no positive number or far too large, or ``n_emb`` is not a multiple of ``n_head``.
 
@@ -125,6 +129,11 @@ class TransformerForDiffusion(nn.Module):
         self.num_blocks = len(BLOCK_TYPES) * n_layer
         self._build()
         self._init_weights()
+        self.made_shapes = {name: tuple(weight.shape) for name, weight in self.named_parameters()}
+
+    def present_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shapes that its weights have now, which others may have put there; see ``made_shapes``."""
+        return {name: tuple(attrgetter(name)(self).shape) for name in self.made_shapes}
 
     def _build(self) -> None:
         width = self.n_emb

@@ -47,6 +47,8 @@ class ActionDenoiser(TensorDictModuleBase):
         )
         shape = (self.network.horizon, self.network.input_dim)
         noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
+        dtype = self.network.pos_emb.dtype
+        noise, cond = noise.to(dtype), cond.to(dtype)
         actions = self._follow_rules(noise, cond, mask, keys.read(tensordict, keys.REUSE).reshape(-1))
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))

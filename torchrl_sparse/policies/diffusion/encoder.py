@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.diffusion.noise import query_seed
+from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
@@ -99,6 +99,10 @@ class ObservationEncoder(TensorDictModuleBase):
                 f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self._state_shape[0]}, "
                 f"{self._state_shape[1]}], got {list(state.shape)}"
             )
+        if state.is_meta or state.is_complex() or state.layout != torch.strided:
+            raise ValueError(
+                f"{keys.HISTORY_STATE}: expected real numbers in memory, got {state.dtype} {state.layout} on {state.device}"
+            )
         if not state.isfinite().all():
             bad = (~state.isfinite()).nonzero()[0].tolist()
             raise ValueError(
@@ -109,4 +113,6 @@ class ObservationEncoder(TensorDictModuleBase):
         seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
         if seed is None or step is None:
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
-        return query_seed(seed + self.noise_stream * _STREAM, step)
+        check_whole(keys.EPISODE_SEED, seed)
+        check_whole(keys.EPISODE_STEP, step)
+        return query_seed(seed.long() + self.noise_stream * _STREAM, step.long())

@@ -48,7 +48,8 @@ class VLAPolicy(VLAWrapperBase):
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
         TypeError: if an instruction is not text.
-        ValueError: if an image, the state or a mask has a wrong shape or type, or the tokenizer has more ids than the network.
+        ValueError: if the batch is empty, an image, the state or a mask has a wrong shape or type, or the tokenizer has more
+            ids than the network.
 
     Examples:
         >>> policy = VLAPolicy(VLANetwork(VLAConfig.tiny()))
@@ -142,16 +143,25 @@ class VLAPolicy(VLAWrapperBase):
     ) -> TensorDictBase:
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
-        query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
+        query = self._flatten(tensordict)
         actions, decoded = self.predict(query)
         answer = self._answer(query, actions, decoded)
         answer.set(keys.LATENCY, torch.full_like(answer.get(keys.FLOPS), synchronised_clock(device) - start))
         return self._output_tensordict(tensordict, answer.reshape(tensordict.batch_size), tensordict_out)
 
     def _predict_chunk(self, tensordict: TensorDictBase) -> Tensor:
-        query = tensordict.select(*self.in_keys, strict=False).reshape(-1)
+        query = self._flatten(tensordict)
         chunk = self.normalizer.unnormalize_action(self.predict(query)[0])
         return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
+
+    def _flatten(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return what a query reads, [B]."""
+        rows = tensordict.batch_size.numel()
+        if not rows:
+            raise ValueError(
+                f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
+            )
+        return tensordict.select(*self.in_keys, strict=False).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""

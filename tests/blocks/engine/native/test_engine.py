@@ -215,7 +215,9 @@ def test_wrong_inputs_are_named():
     engine = NativeEngine(network, sampler)
     with pytest.raises(ValueError, match=r"noise: expected shape \[2, 6, 10, 7\], got \[2, 5, 10, 7\]"):
         engine.denoise(noise[:, :5], cond)
-    with pytest.raises(ValueError, match=r"cond: expected torch\.float32 on the CPU, got torch\.float64"):
+    with pytest.raises(
+        ValueError, match=r"cond: expected torch\.float32 on cpu, as the network, got torch\.float64"
+    ):
         engine.denoise(noise, cond.double())
     with pytest.raises(ValueError, match="prune mask: expected shape"):
         engine.denoise(noise, cond, mask[..., :3])

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from ctypes import byref, c_float, c_void_p
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -64,9 +65,12 @@ class _NativeWatch(WeightWatch):
     """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
-        elsewhere = next((sample.device for sample in samples if not sample.is_cpu), None)
-        if elsewhere is not None:
-            raise ValueError(f"native engine: it runs on the CPU, the network was moved to {elsewhere}")
+        for sample in samples:
+            if not sample.is_cpu or sample.dtype != torch.float32:
+                raise ValueError(
+                    f"native engine: it reads float32 weights on the CPU, the network was changed to {sample.dtype} on "
+                    f"{sample.device}"
+                )
         places = [value.data_ptr() for sample in samples for value in sample]
         return (c_void_p * len(places))(*places)
 
@@ -129,17 +133,25 @@ class NativeEngine:
             raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {weights!r}")
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
-        self.network, self.sampler, self.weights, self.threads = network, sampler, weights, threads
+        self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
         self._level = instruction_level(instruction_set)
-        self._dense = torch.zeros(sampler.num_inference_steps, network.num_blocks, dtype=torch.bool)
+        self._dense = torch.zeros(
+            sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
+        )
         self._stock: list[Tensor] = []
         self._watch = _NativeWatch(network)
         self._packed = (None, None)
         self._current()
 
+    def __reduce__(self) -> tuple:
+        """Let copies and pickles pack the weights of their own network."""
+        options = {"weights": self._weights, "threads": self._threads}
+        options["instruction_set"] = INSTRUCTION_SETS[self._level]
+        return partial(NativeEngine, **options), (self._network, self._sampler)
+
     @property
     def detail(self) -> str:
-        return f"{INSTRUCTION_SETS[self._level]}, {self.weights} weights"
+        return f"{INSTRUCTION_SETS[self._level]}, {self._weights} weights"
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
@@ -147,15 +159,18 @@ class NativeEngine:
         """Return normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
         Raises:
-            ValueError: also if the inputs are no float32 tensors on the CPU, or if the network is in training mode.
+            ValueError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
         """
-        check_query(self.network, self.sampler, noise, cond, mask, reuse)
+        check_query(self._network, self._sampler, noise, cond, mask, reuse)
+        self._check(mask)
+        packed, slots = self._current(), num_buffers(reuse, self._dense.shape[1])
         if mask is None:
             mask = self._dense.expand(len(cond), -1, -1)
-        self._check(noise, cond, mask)
+        packed.check(noise=noise, cond=cond, mask=mask)
+        actions = noise.new_empty(len(cond), *noise.shape[2:])
+        if not len(cond):
+            return actions
         query = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
-        actions = torch.empty(len(cond), self.network.horizon, self.network.input_dim)
-        packed, slots = self._current(), num_buffers(reuse, self.network.num_blocks)
         rows = iter(range(len(cond)))
 
         def work() -> None:
@@ -163,7 +178,7 @@ class NativeEngine:
                 for row in rows:  # each thread takes the next: one that is held up holds up nothing else
                     self._run(packed, slots, row, *query, actions, scratch)
 
-        _run_in_threads(work, min(self.threads or torch.get_num_threads(), len(cond)))
+        _run_in_threads(work, min(self._threads or torch.get_num_threads(), len(cond)))
         return actions
 
     def refresh(self) -> None:
@@ -178,11 +193,11 @@ class NativeEngine:
         def walk(kind: int) -> None:
             library().sparse_blocks(self._level, byref(packed.model), kind, scratch.data_ptr())
 
-        return time_blocks(walk, self.network.n_layer, repeats, scratch.device)
+        return time_blocks(walk, self._network.n_layer, repeats, scratch.device)
 
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
-        return folded_block_macs(self.network)
+        return folded_block_macs(self._network)
 
     def _run(self, packed, slots: int, row: int, mask, noise, cond, actions, scratch) -> None:
         mask, noise, cond, actions = (
@@ -205,29 +220,23 @@ class NativeEngine:
 
     def _new_scratch(self, packed: PackedNetwork) -> Tensor:
         """Allocate on a cache line, as PyTorch always does, with a slot for each block: enough for every reuse rule."""
-        return torch.empty(library().sparse_scratch(byref(packed.model), self.network.num_blocks))
+        size = library().sparse_scratch(byref(packed.model), self._dense.shape[1])
+        return torch.empty(size, dtype=torch.float32, device="cpu")
 
     def _current(self) -> PackedNetwork:
         """Return the packed weights, packed anew if the network has changed."""
         version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
         if known != version:
-            packed = PackedNetwork(self.network, self.sampler, getattr(torch, self.weights))
+            packed = PackedNetwork(self._network, self._sampler, getattr(torch, self._weights))
             self._packed = (version, packed)
         return packed
 
-    def _check(self, noise: Tensor, cond: Tensor, mask: Tensor) -> None:
-        if self.network.training:
+    def _check(self, mask: Tensor | None) -> None:
+        if self._network.training:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
-        for name, tensor, dtype in (
-            ("noise", noise, torch.float32),
-            ("cond", cond, torch.float32),
-            ("mask", mask, torch.bool),
-        ):
-            if tensor.dtype != dtype or not tensor.is_cpu:
-                raise ValueError(
-                    f"{name}: expected {dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
-                )
+        if mask is not None and not mask.is_cpu:
+            raise ValueError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")
 
 
 def _run_in_threads(work: Callable[[], None], threads: int) -> None:

@@ -33,6 +33,7 @@ from torchrl_sparse.blocks.engine.folding import (
 from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.storage.tensors import check_shapes
 
 __all__ = ["Model", "PackedNetwork"]
 
@@ -71,14 +72,32 @@ class PackedNetwork:
 
     Attributes:
         model: the structure that native.cpp reads.
+
+    Raises:
+        ValueError: naming a weight that has another shape than the network was made with.
     """
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler, weights: torch.dtype) -> None:
         self._weights = weights
         self._arena = Arena()
         self._arrays: list[ctypes.Array] = []  # structures only point to theirs
+        # What is read beyond its end would not be noticed.
+        check_shapes("network", network.present_shapes(), network.made_shapes)
+        self._sizes = {
+            "noise": (sampler.num_inference_steps, network.horizon, network.input_dim),
+            "cond": (network.n_obs_steps, network.cond_dim),
+            "mask": (sampler.num_inference_steps, network.num_blocks),
+        }
         with torch.no_grad():
             self.model = self._pack(network, sampler)
+
+    def check(self, **query: Tensor) -> None:
+        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a query have the sizes that were packed."""
+        for name, tensor in query.items():
+            if tuple(tensor.shape[1:]) != self._sizes[name]:
+                raise ValueError(
+                    f"{name}: expected [B, *{self._sizes[name]}] as it was packed, got {list(tensor.shape)}"
+                )
 
     def _pack(self, network: TransformerForDiffusion, sampler: Sampler) -> Model:
         layers, head = fold_layers(network), network.head

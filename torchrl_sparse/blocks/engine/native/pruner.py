@@ -109,19 +109,23 @@ class NativePruner:
         Raises:
             ValueError: if there is another number of features than F.
         """
-        logits = torch.empty(len(features), *self._shape)
+        logits = torch.empty(len(features), *self._shape, dtype=torch.float32, device="cpu")
         self._run(features, logits.data_ptr(), None)
         return logits
 
     def masks(self, features: Tensor) -> Tensor:
         """Return where pruning is preferred, bool [B, K, 3L], False in the first step; see :meth:`logits`."""
-        masks = torch.empty(len(features), *self._shape, dtype=torch.bool)
+        masks = torch.empty(len(features), *self._shape, dtype=torch.bool, device="cpu")
         self._run(features, None, masks.data_ptr())
         return masks
 
     def _run(self, features: Tensor, logits: int | None, masks: int | None) -> None:
-        if features.shape[1] != self._features:
-            raise ValueError(f"features: expected [B, {self._features}], got {list(features.shape)}")
+        shape, kind = (len(features), self._features), (features.dtype, features.device.type)
+        if tuple(features.shape) != shape or kind != (torch.float32, "cpu"):
+            raise ValueError(
+                f"features: expected torch.float32 [B, {self._features}] on cpu, "
+                f"got {features.dtype} {list(features.shape)} on {features.device}"
+            )
         features = features.contiguous()
         pruner = byref(self._pruner)
         library().sparse_prune(self._level, pruner, len(features), features.data_ptr(), logits, masks)

@@ -69,6 +69,10 @@ class TorchEngine:
         self._known: tuple = (None, None, None)
         self._current()
 
+    def __reduce__(self) -> tuple:
+        """Let copies and pickles make tables and locks of their own."""
+        return TorchEngine, (self._network, self._sampler)
+
     @property
     def detail(self) -> str:
         weight = self._network.head.weight
@@ -80,6 +84,8 @@ class TorchEngine:
     ) -> Tensor:
         """See :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`; no gradients flow."""
         check_query(self._network, self._sampler, noise, cond, mask, reuse)
+        if not len(cond):
+            return torch.empty_like(noise[:, 0])
         tables, pool = self._current()
         with _in_weights_type(tables.device):
             actions = self._denoise(tables, pool, noise, cond, mask, reuse)
