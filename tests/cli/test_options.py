@@ -89,6 +89,7 @@ def test_what_cannot_mean_anything_is_refused(recipe, override, message):
         ("train_pruner", "init=[a.json,b.json]"),
         ("train_pruner", "sampler={kind: ddim, timesteps: [90, 50, 10]}"),
         ("train_pruner", "train.rate_range=[0.5,0.97]"),
+        ("calibrate_bac", "sampler=ddpm_82_14"),
         ("train_vla", "+network.llm.layers=6"),
         ("benchmark_vla", "+specprune.keep_share=0.95"),
         ("benchmark", "margin=0.1"),

@@ -41,7 +41,7 @@ def running_collector(
 
     Raises:
         WorkerDied: if a worker dies, while it starts or in the block, or has not started after ten minutes.
-        Exception: what a worker raised while it started or, on Ray, at any time.
+        Exception: what a worker raised while it started (on Ray within a RayActorError) or, on Ray, later.
         RuntimeError: if a worker process raised something later; its traceback is on stderr.
     """
     workers = min(workers, len(seeds))
