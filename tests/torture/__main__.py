@@ -23,7 +23,8 @@ from tests.torture.archives import torture_archives
 from tests.torture.engine_fuzz import torture_engines
 from tests.torture.files import torture_files
 from tests.torture.folders import torture_folder
-from tests.torture.kills import Killer, torture_recipes
+from tests.torture.kills import RESUMED, Killer, torture_recipes
+from tests.torture.processes import Hang
 from tests.torture.recipes import tiny_recipes
 from tests.torture.report import Campaign, Report, Verdict, format_report, save_report
 
@@ -63,11 +64,15 @@ def run(options: Options, command: str) -> Report:
     deadline = began + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        recipes = list(tiny_recipes(work))
         rng, killers = random.Random(options.seed), []
-        for index, tiny in enumerate(recipes):
-            killers.append(Killer(tiny, work / str(index), rng))
-            _take(campaign, torture_folder(killers[-1], work / str(index), rng))
+        for tiny in list(tiny_recipes(work)):
+            runs = work / tiny.name
+            try:
+                killers.append(Killer(tiny, runs, rng))
+            except (Hang, RuntimeError) as error:
+                campaign.add(Verdict(RESUMED, tiny.name, "undisturbed", str(error)))
+            else:
+                _take(campaign, torture_folder(killers[-1], runs, rng))
         _take(campaign, torture_recipes(killers, deadline, options.kills))
     return campaign.report((time.monotonic() - began) / 60)
 

@@ -27,7 +27,7 @@ KILL, WORKER, RESUMED = (
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 _SLOWER = 4  # times the length of an undisturbed run after which a run has hung
 _LEAST = 120.0  # seconds that are always granted
-_CHAIN = 5  # kills of one folder
+_CHAIN = 7  # kills of one folder
 
 
 @dataclass(frozen=True)

@@ -75,13 +75,15 @@ def tiny_recipes(work: Path) -> Iterator[TinyRecipe]:
         yield TinyRecipe("train_vla", "train_vla", (f"demos={rendered}", *sizes, *stages, "log_every=5"))
     yield TinyRecipe("collect_demos", "collect_demos", ("task=lift", "episodes=4"), out="out/demos.h5")
     few = ("episodes=3", "horizon=16", "latency_repeats=1", "probe_episodes=1", "videos=[]")
-    benchmark = ("task=lift", f"policy={policy}", "methods=[dense,ddim2]", *few)
-    yield TinyRecipe("benchmark", "benchmark", benchmark)
+    benchmark = ("task=lift", f"policy={policy}", *few)
+    yield TinyRecipe("benchmark", "benchmark", (*benchmark, "methods=[dense,ddim2]"))
     realtime = ("task=lift_moving", f"policy={policy}", "methods=[ddim2]", "latencies=[0.1]", *few[:3])
     yield TinyRecipe("realtime", "realtime", realtime)
     if importlib.util.find_spec("sweeps"):
         yield TinyRecipe("sweep", "sweep", (f"sweep={_write_sweep(work / 'sweep')}",))
-    yield TinyRecipe("benchmark, workers=2", "benchmark", (*benchmark, "workers=2"), workers=True)
+    yield TinyRecipe(
+        "benchmark, workers=2", "benchmark", (*benchmark, "methods=[dense]", "workers=2"), workers=True
+    )
     yield TinyRecipe(
         "collect_demos, workers=2",
         "collect_demos",

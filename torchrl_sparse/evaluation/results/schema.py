@@ -215,7 +215,7 @@ def load_results(path: str | os.PathLike) -> AnyResults:
         ValueError: naming file and key, if it is of neither version or does not agree with itself.
     """
     found = read_json(path, dict[str, Any]).get("schema")
-    if found not in (1, SCHEMA):
+    if type(found) is not int or found not in (1, SCHEMA):  # true is 1
         raise ValueError(f"{path}: schema: expected 1 or {SCHEMA}, got {found!r}")
     return read_json(path, Results if found == SCHEMA else Results1)
 
