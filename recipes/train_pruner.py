@@ -21,10 +21,10 @@ from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
+from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
 from torchrl_sparse.training.diffusion.published import published_shape
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_sparse.evaluation.figures.training import read_scalars
+from torchrl_sparse.training.curves import read_scalars
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.trainer import Trainer
 

@@ -31,7 +31,9 @@ from torchrl_sparse.networks.diffusion.transformer import BLOCK_TYPES, Transform
 
 __all__ = [
     "BLOCK_TYPES",
+    "REUSED_COLOR",
     "REUSE_RULES",
+    "TYPE_COLORS",
     "MaskError",
     "NetworkSizes",
     "Reuse",
@@ -49,6 +51,12 @@ __all__ = [
     "steps_from_mask",
     "validate_mask",
 ]
+
+TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
+"""Of computed blocks in figures, in the order of `BLOCK_TYPES`: Okabe and Ito's, which colour-blind readers tell apart."""
+
+REUSED_COLOR = "#E9E9EC"
+"""Of pruned blocks in figures."""
 
 Reuse = Literal["block", "type", "single"]
 REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)  # a TensorDict holds a rule as its index here

@@ -8,7 +8,7 @@ import pytest
 
 from tests.evaluation import synthetic
 from tests.evaluation.results.test_realtime import DENSE, FAST, build
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
 from torchrl_sparse.evaluation.results.realtime import save_realtime
 from torchrl_sparse.evaluation.results.schema import save_results

@@ -8,12 +8,7 @@ from collections.abc import Iterable
 from torchrl_sparse.methods.diffusion import METHODS
 from torchrl_sparse.methods.vla import TOKEN_METHODS
 
-__all__ = ["OTHER_COLORS", "REUSED_COLOR", "TYPE_COLORS", "method_colors"]
-
-TYPE_COLORS = ("#0072B2", "#009E73", "#D55E00")
-"""Of computed blocks, in the order of `BLOCK_TYPES`."""
-
-REUSED_COLOR = "#E9E9EC"
+__all__ = ["OTHER_COLORS", "method_colors"]
 
 # Of methods whose table names none.
 OTHER_COLORS = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.results.schema import DENSE, Results
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.engine_report import EngineShape
 from torchrl_sparse.evaluation.results.schema import DENSE

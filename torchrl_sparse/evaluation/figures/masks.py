@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
-from torchrl_sparse.evaluation.figures.colors import REUSED_COLOR, TYPE_COLORS
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.plots import block_labels, type_legend
 
 __all__ = ["mask_panel", "plot_mask_statistics", "plot_mask_strip"]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.labels import place_labels
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1

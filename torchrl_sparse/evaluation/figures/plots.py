@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
-from torchrl_sparse.evaluation.figures.colors import REUSED_COLOR, TYPE_COLORS, method_colors
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS
+from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.figures.colors import method_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

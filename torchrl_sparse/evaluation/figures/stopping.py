@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.results.stopping import StoppingResults
 
 __all__ = ["plot_stopping"]

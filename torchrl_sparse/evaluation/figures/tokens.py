@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
+from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.tokens.budget import TokenBudget
 

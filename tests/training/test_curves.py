@@ -2,7 +2,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from torchrl_sparse.evaluation.figures.training import plot_pruner_curves, read_scalars
+from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
 
 
 @pytest.fixture

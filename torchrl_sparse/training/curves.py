@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES
-from torchrl_sparse.evaluation.figures.canvas import make_figure, save_figure
-from torchrl_sparse.evaluation.figures.colors import TYPE_COLORS
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, TYPE_COLORS
+from torchrl_sparse.canvas import make_figure, save_figure
 
 __all__ = ["plot_pruner_curves", "read_scalars"]
 
