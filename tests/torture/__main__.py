@@ -120,8 +120,8 @@ def _disturb(options: Options, book: Book, deadline: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         rng, killers = random.Random(options.seed), []
-        for tiny in list(tiny_recipes(work)):
-            runs = work / tiny.name
+        for number, tiny in enumerate(list(tiny_recipes(work))):
+            runs = work / f"runs{number}"  # Hydra's options cannot hold every name
             try:
                 killers.append(Killer(tiny, runs, rng))
             except (Hang, RuntimeError) as error:
