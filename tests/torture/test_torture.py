@@ -1,4 +1,4 @@
-"""The campaign, shortened (`-m slow`), and what it is made of."""
+"""The campaign, shortened, and what it is made of."""
 
 import os
 import random
@@ -27,17 +27,14 @@ def assert_survived(verdicts, at_least):
     assert not faults, "\n".join(map(str, faults))
 
 
-@pytest.mark.slow
 def test_malformed_files_are_refused_by_name_and_in_time():
     assert_survived(torture_files(SEED, share=0.18), at_least=300)
 
 
-@pytest.mark.slow
 def test_hostile_archives_execute_and_exhaust_nothing():
     assert_survived(torture_archives(), at_least=100)
 
 
-@pytest.mark.slow
 def test_engines_answer_or_refuse():
     assert_survived(torture_engines(SEED, queries=80, library=None, seconds=300), at_least=3 * 80)
 
@@ -49,11 +46,11 @@ def killer(tmp_path_factory):
     return Killer(next(tiny_recipes(work)), work / "runs", random.Random(SEED))
 
 
-@pytest.mark.slow
 def test_a_killed_recipe_goes_on_as_if_never_killed(killer):
-    verdicts = list(killer.chain(kills=3))
-    assert [verdict.part for verdict in verdicts[-2:]] == [KILL, RESUMED]
-    assert_survived(verdicts, at_least=2)
+    verdicts = list(killer.chain(kills=1))
+    assert {verdict.part for verdict in verdicts} <= {KILL, RESUMED}
+    assert verdicts[-1].part == RESUMED
+    assert_survived(verdicts, at_least=1)
 
 
 @pytest.mark.slow
