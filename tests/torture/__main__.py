@@ -139,7 +139,8 @@ def main(words: list[str]) -> int:
         OmegaConf.merge(OmegaConf.structured(Options), OmegaConf.from_dotlist(words))
     )
     print(f"seed={options.seed}", flush=True)
-    report = run(options, " ".join(["python -m tests.torture", *words]))
+    told = [word for word in words if not word.startswith("out=")]
+    report = run(options, " ".join(["python -m tests.torture", *told]))
     print(f"\n{format_report(report)}\n\n{Path(options.out) / 'report.json'}")
     return int(any(row.faults for row in report.rows))
 

@@ -3,6 +3,7 @@
 import os
 import random
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from tests.torture.folders import torture_folder
 from tests.torture.kills import KILL, RESUMED, Killer
 from tests.torture.limits import Outcome, run_limited
 from tests.torture.recipes import tiny_recipes
-from tests.torture.report import Campaign, Verdict, format_report, render_page
+from tests.torture.report import PAGE, Campaign, Verdict, added, format_report, load_report, render_page
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="kills and limits are Linux's own")
 SEED = 0
@@ -112,3 +113,24 @@ def test_a_report_counts_and_names():
     assert "- kill, sweep, SIGINT after 2.0 s: hung" in text
     with pytest.raises(ValueError, match="expected one <!-- report -->"):
         render_page("no place", campaign.report(minutes=1.0))
+
+
+def test_reports_add_up():
+    one, other = Campaign(seed=3, command="a"), Campaign(seed=4, command="b")
+    one.add(Verdict("kill", "sweep", "first", tags=("SIGINT",)))
+    other.add(Verdict("kill", "sweep", "second", "hung", ("SIGINT",)))
+    other.add(Verdict("kill", "benchmark", "third", tags=("SIGKILL",)))
+    total = added(one.report(minutes=1.0), other.report(minutes=2.0))
+    assert (total.minutes, total.seeds, total.commands) == (3.0, (3, 4), ("a", "b"))
+    assert [(row.subject, row.cases, len(row.faults)) for row in total.rows] == [
+        ("sweep", 2, 1),
+        ("benchmark", 1, 0),
+    ]
+    assert total.rows[0].tags == {"SIGINT": 2}
+    with pytest.raises(ValueError, match="cpu: expected another"):
+        added(replace(one.report(1.0), cpu="another"), other.report(1.0))
+
+
+def test_the_page_shows_the_report_beside_it():
+    text = PAGE.read_text(encoding="utf-8")
+    assert text == render_page(text, load_report())
