@@ -63,7 +63,10 @@ def test_an_option_that_has_to_be_given_is_named(fail):
     assert fail("convert_robomimic", "out=a.h5").startswith("demos: expected a value, got ")
 
 
-@pytest.mark.parametrize("content", ["parameters: [", "parameters: {a: {}}", "7", "- " * 5000, "a: \udcff"])
+@pytest.mark.parametrize(
+    "content",
+    ["parameters: [", "parameters: {a: {}}", "a: 1\n\tb: 2", 'a: "b\nc: {d', "7", "- " * 5000, "a: \udcff"],
+)
 def test_a_damaged_sweep_is_named(fail, tmp_path, content):
     path = tmp_path / "mine.yaml"
     path.write_bytes(content.encode("utf-8", "surrogateescape"))
@@ -99,6 +102,7 @@ RECIPE = """
 from pathlib import Path
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.runtime.failure import RunFailed
 
 
 @recipe("toy")
@@ -107,6 +111,10 @@ def main(config):
         raise OSError(28, "no space left on the volume /data", "results.json")
     if config.title == "worker":
         raise ValueError("seed: expected 1,\\n   got 2\\n\\nWorker traceback: ...")
+    if config.title == "expert":
+        raise RunFailed("the expert fails: 0 of 20")
+    if config.title == "torch":
+        raise RuntimeError("mat1 and mat2")
     if config.title == "bug":
         raise AssertionError("a bug")
     Path(config.out, "made").touch()
@@ -122,6 +130,8 @@ def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
     toy, out = tmp_path / "toy", f"out={tmp_path}/out"
     assert run(toy, out, "title=disk", expect=2) == "results.json: no space left on the volume /data\n"
     assert run(toy, out, "title=worker", expect=2) == "seed: expected 1, got 2\n"
+    assert run(toy, out, "title=expert", expect=2) == "the expert fails: 0 of 20\n"
+    assert "Traceback" in run(toy, out, "title=torch", expect=1)
     assert "AssertionError: a bug" in run(toy, out, "title=bug", expect=1)
     assert not (tmp_path / "out").exists()
     assert run(toy, out) == ""

@@ -1,8 +1,10 @@
 """The campaign: kills, malformed files, hostile archives, engine fuzzing, shared folders and small disks, one after the other.
 
     python -m tests.torture seed=7 minutes=30 out=outputs/torture
+    python -m tests.torture seed=8 parts=[kills]    # adds its counts to those of the report that is there
 
-writes ``report.json`` and the table of the page, ``page.md``, into ``out`` and ends with code 1 if a case was not survived.
+writes ``report.json`` into ``out`` as it goes, so that a campaign cut short keeps its counts, and ends with code 1 if a case
+was not survived. A campaign of the same machine's model adds to the report that it finds.
 `make torture` builds the sanitized engine before.
 """
 
@@ -13,7 +15,7 @@ import secrets
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,9 +28,11 @@ from tests.torture.folders import torture_folder
 from tests.torture.kills import RESUMED, Killer, torture_recipes
 from tests.torture.processes import Hang
 from tests.torture.recipes import tiny_recipes
-from tests.torture.report import Campaign, Report, Verdict, format_report, save_report
+from tests.torture.report import Campaign, Report, Verdict, added, format_report, load_report, save_report
 
 SANITIZED = Path(__file__).parents[2] / "build" / "sanitize" / "native.so"
+PARTS = ("archives", "files", "engines", "folders", "kills")
+_SAVED_EVERY = 10.0  # seconds
 
 
 @dataclass
@@ -37,6 +41,7 @@ class Options:
 
     Attributes:
         seed: of everything that is drawn; a new one unless given, printed.
+        parts: of the campaign, of archives, files, engines, folders and kills.
         minutes: after which no further recipe is killed; the other parts come first and are not cut short.
         kills: after which there are enough; None goes on until ``minutes`` are over.
         files: share of the malformed files that is tried.
@@ -45,6 +50,7 @@ class Options:
     """
 
     seed: int = field(default_factory=lambda: secrets.randbelow(10**6))
+    parts: list[str] = field(default_factory=lambda: list(PARTS))
     minutes: float = 30.0
     kills: int | None = None
     files: float = 1.0
@@ -52,34 +58,79 @@ class Options:
     out: str = "outputs/torture"
 
 
+class Book:
+    """Counts the verdicts of a campaign and keeps their report on disk, on top of an earlier one."""
+
+    def __init__(self, options: Options, command: str) -> None:
+        self._path = Path(options.out) / "report.json"
+        self._earlier = load_report(self._path) if self._path.exists() else None
+        self._began, self._campaign = time.monotonic(), Campaign(options.seed, command)
+        self.note = self._campaign.note
+
+    def take(self, verdicts: Iterable[Verdict]) -> None:
+        """Count verdicts as they come."""
+        saved = time.monotonic()
+        for verdict in verdicts:
+            self._campaign.add(verdict)
+            if time.monotonic() - saved > _SAVED_EVERY:
+                self.save()
+                saved = time.monotonic()
+        self.save()
+
+    def save(self) -> Report:
+        """Write the report as it is now and return it."""
+        report = self._campaign.report((time.monotonic() - self._began) / 60)
+        if self._earlier is not None:
+            report = added(self._earlier, report)
+        save_report(report, self._path)
+        return report
+
+
 def run(options: Options, command: str) -> Report:
-    """Run the campaign and return its report."""
-    began, campaign = time.monotonic(), Campaign(options.seed, command)
+    """Run the campaign and return its report.
+
+    Raises:
+        ValueError: if a part has another name than those that there are.
+    """
+    if unknown := set(options.parts) - set(PARTS):
+        raise ValueError(f"parts: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
+    deadline, book = time.monotonic() + 60 * options.minutes, Book(options, command)
+    parts: dict[str, Callable[[], Iterable[Verdict]]] = {
+        "archives": torture_archives,
+        "files": lambda: torture_files(options.seed, options.files),
+        "engines": lambda: _engines(options, book),
+    }
+    for name, torture in parts.items():
+        if name in options.parts:
+            book.take(torture())
+    if {"folders", "kills"} & set(options.parts):
+        _disturb(options, book, deadline)
+    return book.save()
+
+
+def _engines(options: Options, book: Book) -> Iterable[Verdict]:
     library = SANITIZED if SANITIZED.exists() else None
     if library is None:
-        campaign.note("Without the sanitizers: `make sanitize` builds their library.")
-    _take(campaign, torture_archives())
-    _take(campaign, torture_files(options.seed, options.files))
-    _take(campaign, torture_engines(options.seed, options.queries, library, 60 + options.queries))
-    deadline = began + 60 * options.minutes
+        book.note("Without the sanitizers: `make sanitize` builds their library.")
+    return torture_engines(options.seed, options.queries, library, 60 + options.queries)
+
+
+def _disturb(options: Options, book: Book, deadline: float) -> None:
+    """Run every recipe undisturbed, then share and fill its folder, then kill it."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         rng, killers = random.Random(options.seed), []
-        for tiny in list(tiny_recipes(work)):
-            runs = work / tiny.name
+        for number, tiny in enumerate(list(tiny_recipes(work))):
+            runs = work / f"runs{number}"  # Hydra's options cannot hold every name
             try:
                 killers.append(Killer(tiny, runs, rng))
             except (Hang, RuntimeError) as error:
-                campaign.add(Verdict(RESUMED, tiny.name, "undisturbed", str(error)))
-            else:
-                _take(campaign, torture_folder(killers[-1], runs, rng))
-        _take(campaign, torture_recipes(killers, deadline, options.kills))
-    return campaign.report((time.monotonic() - began) / 60)
-
-
-def _take(campaign: Campaign, verdicts: Iterable[Verdict]) -> None:
-    for verdict in verdicts:
-        campaign.add(verdict)
+                book.take([Verdict(RESUMED, tiny.name, "undisturbed", str(error))])
+                continue
+            if "folders" in options.parts:
+                book.take(torture_folder(killers[-1], runs, rng))
+        if "kills" in options.parts:
+            book.take(torture_recipes(killers, deadline, options.kills))
 
 
 def main(words: list[str]) -> int:
@@ -88,11 +139,9 @@ def main(words: list[str]) -> int:
         OmegaConf.merge(OmegaConf.structured(Options), OmegaConf.from_dotlist(words))
     )
     print(f"seed={options.seed}", flush=True)
-    report = run(options, " ".join(["python -m tests.torture", *words]))
-    out = Path(options.out)
-    save_report(report, out / "report.json")
-    (out / "page.md").write_text(format_report(report) + "\n", encoding="utf-8")
-    print(f"\n{format_report(report)}\n\n{out / 'report.json'}")
+    told = [word for word in words if not word.startswith("out=")]
+    report = run(options, " ".join(["python -m tests.torture", *told]))
+    print(f"\n{format_report(report)}\n\n{Path(options.out) / 'report.json'}")
     return int(any(row.faults for row in report.rows))
 
 

@@ -14,7 +14,15 @@ import numpy as np
 import torch
 from torch.utils import _pytree as pytree
 
-_TIMES = {"machine", "latency", "latency_s", "own_latency_s", "planning_s", "speedup_vs_dense"}
+_TIMES = {
+    "machine",
+    "latency",
+    "latency_s",
+    "own_latency_s",
+    "planning_s",
+    "speedup_vs_dense",
+    "speedup_ci95",
+}
 _PICTURES = {".png", ".mp4"}
 _RUN_ID = re.compile(r"-[0-9a-f]{8}\b")
 

@@ -26,7 +26,7 @@ KILL, WORKER, RESUMED = (
 )
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 _SLOWER = 4  # times the length of an undisturbed run after which a run has hung
-_LEAST = 120.0  # seconds that are always granted
+_LEAST = 300.0  # seconds that are always granted: others use the machine too
 _CHAIN = 7  # kills of one folder
 
 

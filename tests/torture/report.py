@@ -9,7 +9,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -66,6 +66,7 @@ class Row:
 class Report:
     """A campaign: where, when and how it ran, and one row per subject, in the order in which they came.
 
+    Campaigns add up: ``minutes`` and ``rows`` are their sums, ``seeds`` and ``commands`` those of each, the rest is the last's.
     ``load`` is how many processes wanted a core just before it began: those of others.
     """
 
@@ -74,8 +75,8 @@ class Report:
     load: float
     date: str
     minutes: float
-    seed: int
-    command: str
+    seeds: tuple[int, ...]
+    commands: tuple[str, ...]
     notes: tuple[str, ...]
     rows: tuple[Row, ...]
 
@@ -114,8 +115,8 @@ class Campaign:
             load=round(self._load, 1),
             date=self._machine.date,
             minutes=round(minutes, 1),
-            seed=self._seed,
-            command=self._command,
+            seeds=(self._seed,),
+            commands=(self._command,),
             notes=tuple(self._notes),
             rows=tuple(_row(verdicts) for verdicts in self._verdicts.values()),
         )
@@ -131,6 +132,33 @@ def _row(verdicts: list[Verdict]) -> Row:
     )
 
 
+def added(earlier: Report, later: Report) -> Report:
+    """Return the sum of two reports.
+
+    Raises:
+        ValueError: if they were written on processors of different models.
+    """
+    if earlier.cpu != later.cpu:
+        raise ValueError(f"cpu: expected {earlier.cpu} as in the report that is there, got {later.cpu}")
+    rows = {(row.part, row.subject): row for row in earlier.rows}
+    for row in later.rows:
+        before = rows.get((row.part, row.subject))
+        rows[row.part, row.subject] = row if before is None else _sum(before, row)
+    return replace(
+        later,
+        minutes=round(earlier.minutes + later.minutes, 1),
+        seeds=earlier.seeds + later.seeds,
+        commands=earlier.commands + later.commands,
+        notes=tuple(dict.fromkeys(earlier.notes + later.notes)),
+        rows=tuple(rows.values()),
+    )
+
+
+def _sum(one: Row, other: Row) -> Row:
+    tags = dict(sorted((Counter(one.tags) + Counter(other.tags)).items()))
+    return replace(one, cases=one.cases + other.cases, tags=tags, faults=one.faults + other.faults)
+
+
 def format_report(report: Report) -> str:
     """Return the report as Markdown: a line on the campaign, the table, and every case that was not survived."""
     total, faults = (
@@ -139,7 +167,9 @@ def format_report(report: Report) -> str:
     )
     head = (
         f"{report.date[:10]}, {report.cpu}, shared with other work (load {report.load:g} before it began), "
-        f"{report.minutes:g} minutes: `{report.command}`. {total} cases, {total - len(faults)} survived."
+        f"{report.minutes:g} minutes, seeds {', '.join(map(str, report.seeds))}: "
+        f"{', '.join(f'`{command}`' for command in dict.fromkeys(report.commands))}. "
+        f"{total} cases, {total - len(faults)} survived."
     )
     return "\n\n".join([head, *report.notes, _table(report.rows), *_faults(report.rows)])
 

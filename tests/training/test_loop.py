@@ -85,6 +85,29 @@ def test_a_signal_ends_the_step_saves_and_leaves_ctrl_c_as_it_was(run, capsys):
     assert torch.equal(resumed.module.weight, unbroken.module.weight)
 
 
+@pytest.mark.parametrize("stop_in", [2, 3])
+def test_an_entry_of_the_log_is_the_mean_of_all_its_steps_after_a_stop_between_entries(
+    run, tmp_path, stop_in
+):
+    plain = Regression()
+    losses = [plain.train_step()["loss"] for _ in range(6)]
+    run(Regression(at_step=lambda step: step == stop_in and os.kill(os.getpid(), signal.SIGTERM)))
+    run(Regression())
+    means = [(losses[i] + losses[i + 1]) / 2 for i in (0, 2, 4)]
+    assert read_scalars(tmp_path / "log")["train/loss"][:, 1].tolist() == pytest.approx(means)
+
+
+def test_a_checkpoint_from_before_it_held_unlogged_steps_is_resumed(tmp_path):
+    trainer, resumed = Regression(), Regression()
+    trainer.train_step()
+    torch.save(
+        {name: value for name, value in (trainer.header() | trainer.state()).items() if name != "unlogged"},
+        tmp_path / "checkpoint.pt",
+    )
+    resumed.load(tmp_path / "checkpoint.pt")
+    assert (resumed.step, resumed.unlogged) == (1, [])
+
+
 def test_a_checkpoint_of_another_training_is_refused(run):
     run(Regression())
     with pytest.raises(

@@ -18,20 +18,21 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 
 __all__ = ["recipe"]
 
 _FULL = "HYDRA_FULL_ERROR"
-_MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
+_MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException, RunFailed)
 
 
 def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Callable:
     """Make a function of its options a recipe: a program whose options are those in ``name.yaml`` beside its file.
 
-    A mistake (`ValueError`, `OSError`, `ImportError`, or one that Hydra finds) ends it with exit code 2 and one line on stderr;
-    the environment variable ``HYDRA_FULL_ERROR=1`` shows the whole traceback instead. All options are checked before the
-    function is called, see `check_options`, and no other recipe works on the same ``out`` while it runs.
+    A mistake (`ValueError`, `OSError`, `ImportError`, or one that Hydra finds) or `RunFailed` ends it with exit code 2 and one
+    line on stderr; the environment variable ``HYDRA_FULL_ERROR=1`` shows the whole traceback instead. All options are checked
+    before the function is called, see `check_options`, and no other recipe works on the same ``out`` while it runs.
 
     Args:
         name: of the recipe.

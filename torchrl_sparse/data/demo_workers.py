@@ -17,6 +17,7 @@ from multiprocessing import get_context
 from typing import Any
 
 from torchrl_sparse.runtime.backends import backend_runtime, ray_death
+from torchrl_sparse.runtime.failure import RunFailed
 
 __all__ = ["in_order"]
 
@@ -40,7 +41,7 @@ def in_order(
     Raises:
         ValueError: for an unknown backend.
         ImportError: if Ray is asked for and not installed.
-        RuntimeError: if workers die three times in a row without anything done between.
+        RunFailed: if workers die three times in a row without anything done between.
         Exception: whatever ``task`` raises.
 
     >>> numbers = in_order(abs, 3, workers=1)
@@ -67,7 +68,7 @@ def in_order(
                     raise
                 failures += 1
                 if failures == _FAILURES:
-                    raise RuntimeError(
+                    raise RunFailed(
                         f"workers died {failures} times in a row at number {first}: {death}"
                     ) from error
                 warnings.warn(f"{death}; going on from number {first}", RuntimeWarning, stacklevel=2)

@@ -28,6 +28,7 @@ from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
 from torchrl_sparse.envs.tasks import Task, find_task
 from torchrl_sparse.runtime.backends import check_backend
+from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.json import parse_json
 
 # Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
@@ -241,7 +242,7 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
 
 def _check_yield(tally: Summary) -> None:
     if tally.attempts >= 20 and tally.successes * 20 < tally.attempts:
-        raise RuntimeError(f"the expert fails: {tally}; keep_failures=true collects its episodes")
+        raise RunFailed(f"the expert fails: {tally}; keep_failures=true collects its episodes")
 
 
 def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:

@@ -18,6 +18,7 @@ from torchrl.data import Bounded
 from torchrl_sparse.envs.extras import import_extra
 from torchrl_sparse.envs.rendering import GL_HINT
 from torchrl_sparse.envs.seeded import SeededEnv
+from torchrl_sparse.runtime.failure import RunFailed
 
 __all__ = ["NUM_TASKS", "KitchenEnv"]
 
@@ -120,14 +121,14 @@ class KitchenEnv(SeededEnv):
         The first call decides on the size.
 
         Raises:
-            RuntimeError: if no GL library is installed; the message says which package brings one.
+            RunFailed: if no GL library is installed; the message says which package brings one.
         """
         renderer = self.sim_env.mujoco_renderer
         renderer.height, renderer.width = height, width
         try:
             return self.sim_env.render()
         except Exception as error:  # every backend fails with an exception type of its own
-            raise RuntimeError(f"{GL_HINT} ({type(error).__name__}: {error})") from error
+            raise RunFailed(f"{GL_HINT} ({type(error).__name__}: {error})") from error
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         self.sim_env.close()

@@ -15,6 +15,7 @@ from torchrl.data import Bounded
 from torchrl_sparse.envs.extras import import_extra
 from torchrl_sparse.envs.rendering import GL_HINT
 from torchrl_sparse.envs.seeded import SeededEnv
+from torchrl_sparse.runtime.failure import RunFailed
 
 __all__ = ["KEYPOINTS", "PushTEnv", "block_keypoints", "published_start"]
 
@@ -97,13 +98,13 @@ class PushTEnv(SeededEnv):
         """Return a u8 [height, width, 3] picture of the world from above; there is one view, whatever the ``camera``.
 
         Raises:
-            RuntimeError: if OpenCV cannot be imported, for want of a GL library.
+            RunFailed: if OpenCV cannot be imported, for want of a GL library.
         """
         self.sim_env.visualization_height, self.sim_env.visualization_width = height, width
         try:
             return self.sim_env.render()
         except AttributeError as error:  # of the stand-in for cv2
-            raise RuntimeError(GL_HINT) from error
+            raise RunFailed(GL_HINT) from error
 
 
 def block_keypoints(position: Sequence[float], angle: float) -> np.ndarray:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_sparse.runtime.failure import RunFailed
+
 GL_HINT = (
     "rendering needs a GL library: install Debian's libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0 libgles2, or "
     "libosmesa6 with MUJOCO_GL=osmesa"
@@ -33,7 +35,7 @@ class CameraRenderer:
             half of the time and changes nothing.
 
     Raises:
-        RuntimeError: if no GL library is installed; the message says which package brings one.
+        RunFailed: if no GL library is installed; the message says which package brings one.
     """
 
     def __init__(self, sim: Any, height: int, width: int, *, fast: bool = True):
@@ -141,4 +143,4 @@ def _make_gl_context(height: int, width: int) -> Any:
             from mujoco.egl import GLContext
         return GLContext(width, height)
     except Exception as error:  # every backend fails with an exception type of its own
-        raise RuntimeError(f"{GL_HINT} ({type(error).__name__}: {error})") from error
+        raise RunFailed(f"{GL_HINT} ({type(error).__name__}: {error})") from error

@@ -21,14 +21,19 @@ def write_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(
-    path: str | Path, fields: Set[str], header: Mapping[str, Mapping[str, Any]]
+    path: str | Path,
+    fields: Set[str],
+    header: Mapping[str, Mapping[str, Any]],
+    *,
+    optional: Set[str] = frozenset(),
 ) -> dict[str, Any]:
     """Read a checkpoint. Nothing in the file is executed.
 
     Args:
         path: the file.
-        fields: names of everything that it must hold.
+        fields: names of everything that it may hold.
         header: the fields that must be equal: how the training was set up.
+        optional: the fields that may be missing.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -43,7 +48,7 @@ def read_checkpoint(
         raise ValueError(
             f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
         ) from error
-    if not isinstance(state, dict) or set(state) != fields:
+    if not isinstance(state, dict) or not fields - optional <= set(state) <= fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
         raise ValueError(
             f"{path}: expected a training checkpoint of this version with {sorted(fields)}, got {found}; "

@@ -38,9 +38,10 @@ def train(
         export: write what was trained so far, for its users; return where. Called with each checkpoint.
         evaluate: return the success rate so far, in [0, 1], or None where it cannot be measured.
 
-    Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and
-    ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of `Trainer.validate` and ``eval/success``. A CSV
-    log has each step once: what it tells of steps after the checkpoint, which are taken again, is removed first.
+    Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and, over those of
+    them since the start or resumption, ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of
+    `Trainer.validate` and ``eval/success``. A CSV log has each step once: what it tells of steps after the checkpoint, which
+    are taken again, is removed first.
 
     Raises:
         ValueError: if the checkpoint belongs to another training, see `Trainer.load`.
@@ -52,7 +53,7 @@ def train(
     eval_every = settings["eval_every"] if evaluate else 0
     folder = Path(settings["out"]).resolve() / LOG
     _forget_after(trainer.step, folder)
-    logger, losses, since = _make_logger(settings), [], time.perf_counter()
+    logger, since, first = _make_logger(settings), time.perf_counter(), trainer.step
 
     def log(metrics: Mapping[str, float], group: str) -> None:
         with naming_full_disk(folder):
@@ -65,14 +66,14 @@ def train(
         tqdm(total=trainer.total, initial=trainer.step, unit="step", mininterval=2) as bar,
     ):
         while trainer.step < trainer.total and stop.name is None:
-            losses.append(trainer.train_step())
+            trainer.unlogged.append(trainer.train_step())
             bar.update()
             if trainer.step % settings["log_every"] == 0:
-                now, means = time.perf_counter(), _means(losses)
-                means |= {"lr": trainer.lr, "seconds_per_step": (now - since) / len(losses)}
+                now, means = time.perf_counter(), _means(trainer.unlogged)
+                means |= {"lr": trainer.lr, "seconds_per_step": (now - since) / (trainer.step - first)}
                 bar.set_postfix(loss=f"{means['loss']:.4f}")
                 log(means, "train")
-                losses, since = [], now
+                trainer.unlogged, since, first = [], now, trainer.step
             due = trainer.step % settings["checkpoint_every"] == 0
             if due:
                 log(trainer.validate(), "held_out")

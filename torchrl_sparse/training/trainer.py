@@ -20,6 +20,8 @@ from torchrl_sparse.storage.training_state import read_checkpoint, write_checkpo
 
 __all__ = ["StepConfig", "Trainer", "batch_indices", "checksum", "step_seed"]
 
+UNLOGGED = "unlogged"  # of a checkpoint's fields; earlier ones lack it
+
 
 class StepConfig(Protocol):
     """Options of a step that every training has.
@@ -49,6 +51,7 @@ class Trainer(ABC):
     Attributes:
         step: optimiser steps taken.
         total: optimiser steps to take.
+        unlogged: what the steps since the last log entry returned; in checkpoints, so that an entry is of all its steps.
 
     Examples:
         >>> class Regression(Trainer):
@@ -83,6 +86,7 @@ class Trainer(ABC):
         self.module, self.config = module, config
         self.step, self.total, self.warmup_steps = 0, total, warmup_steps
         self._optimizer, self._num_samples = optimizer, num_samples
+        self.unlogged: list[dict[str, float]] = []
         self._lr_scheduler = self.make_lr_scheduler(optimizer)
 
     @abstractmethod
@@ -103,13 +107,14 @@ class Trainer(ABC):
             "step": self.step,
             "network": self.module.state_dict(),
             "optimizer": self._optimizer.state_dict(),
+            UNLOGGED: self.unlogged,
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
         self.module.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self.step = state["step"]
+        self.step, self.unlogged = state["step"], state.get(UNLOGGED, [])
         self._lr_scheduler = self.make_lr_scheduler(self._optimizer)
 
     def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LRScheduler:
@@ -156,7 +161,8 @@ class Trainer(ABC):
             ValueError: if it is no checkpoint of this class, or its header is another.
         """
         header = self.header()
-        self.load_state(read_checkpoint(path, header.keys() | self.state().keys(), header))
+        fields = header.keys() | self.state().keys()
+        self.load_state(read_checkpoint(path, fields, header, optional={UNLOGGED}))
 
 
 def checksum(values: Tensor) -> float:

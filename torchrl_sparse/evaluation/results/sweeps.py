@@ -15,6 +15,7 @@ import yaml
 
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, load_results
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
+from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
 
@@ -186,7 +187,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     """Run a trial to its end, as one offline run of wandb.
 
     Raises:
-        RuntimeError: if its command fails.
+        RunFailed: if its command fails.
         FileNotFoundError: if it left no results.
     """
     environment = os.environ | {
@@ -197,7 +198,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     command = trial_command(sweep.config, trial)
     code = subprocess.run(command, env=environment, pass_fds=[lock]).returncode
     if code:
-        raise RuntimeError(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
+        raise RunFailed(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
     sweep.finish(trial)
 
 

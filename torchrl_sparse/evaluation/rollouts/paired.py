@@ -23,6 +23,7 @@ from torchrl_sparse.envs.seeds import whole_seed
 from torchrl_sparse.evaluation.rollouts.collectors import running_collector
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.runtime.backends import WorkerDied, backend_runtime
+from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.threads import num_threads
 
 __all__ = ["rollout_episodes"]
@@ -86,7 +87,8 @@ def rollout_episodes(
         ValueError: if seeds repeat or are no whole numbers, an option is out of range or the file belongs to something else.
         ImportError: if Ray is asked for and not installed.
         KeyError: if the actor or the environment leaves out a key that is needed.
-        RuntimeError: if workers keep dying without finishing an episode, or one raised an error.
+        RunFailed: if workers keep dying without finishing an episode.
+        RuntimeError: if one raised an error.
 
     Examples:
         >>> from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, make_env
@@ -148,9 +150,7 @@ def _episodes(
         except WorkerDied as death:
             failures += 1
             if failures == _FAILURES:
-                raise RuntimeError(
-                    f"{death}, {failures} times without an episode finished between"
-                ) from death
+                raise RunFailed(f"{death}, {failures} times without an episode finished between") from death
             warnings.warn(f"{death}; {len(pending)} episodes are run anew", RuntimeWarning, stacklevel=3)
 
 

@@ -1,0 +1,13 @@
+"""What ends a run and is no bug: a recipe says it in one line, where any other `RuntimeError` keeps its traceback."""
+
+from __future__ import annotations
+
+__all__ = ["RunFailed"]
+
+
+class RunFailed(RuntimeError):
+    """A run cannot go on, by no fault of this library's: no GL, an expert that fails, workers that die again and again.
+
+    >>> isinstance(RunFailed("the expert fails"), RuntimeError)
+    True
+    """
