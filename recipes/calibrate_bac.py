@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
+from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import tuning_seeds
@@ -31,7 +32,7 @@ def main(config: DictConfig) -> None:
     environment = diffusion_env(config.task, policy)
     seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
-    dense = query_flops(policy.network, policy.plan.mask(policy.plan.spec))
+    dense = query_flops(policy.network, Dense().mask(policy.plan.spec))
     for name in config.methods:
         options = {"top_k": config.top_k} if name == "bac" else {}
         schedule = SCHEDULES[name](

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from torchrl_sparse.blocks import schedule
-from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.blocks.sag import planner as sag
 from torchrl_sparse.storage.json import read_json
 
-__all__ = ["PLANNERS", "load_planner"]
+__all__ = ["PLANNERS", "load_planner", "save_beside"]
 
 PLANNERS: dict[str, type[Planner]] = {
     schedule.FORMAT: schedule.SchedulePlanner,
@@ -25,15 +25,17 @@ PLANNERS: dict[str, type[Planner]] = {
 """Format of a planner's file -> the class whose ``from_pretrained`` reads it."""
 
 
-def load_planner(path: str | os.PathLike) -> Planner:
+def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Planner:
     """Read a planner of any format. Nothing in its files is executed.
 
     Args:
         path: a JSON file, or a folder whose ``config.json`` names the format.
+        spec: what the planner is to serve; it comes bound to that. None leaves it open.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming the file, if its format is not in :data:`PLANNERS`, or as the planner's class raises it.
+        ValueError: naming the file, if its format is not in :data:`PLANNERS` or it was made for another spec, or as the
+            planner's class raises it.
 
     Examples:
         >>> type(load_planner("assets/lift/bac.json")).__name__, type(load_planner("assets/lift/sag")).__name__
@@ -44,4 +46,53 @@ def load_planner(path: str | os.PathLike) -> Planner:
     found = read_json(file, dict[str, Any]).get("format")
     if not isinstance(found, str) or found not in PLANNERS:
         raise ValueError(f"{file}: format: expected one of {list(PLANNERS)}, got {found!r}")
-    return PLANNERS[found].from_pretrained(path)
+    planner = PLANNERS[found].from_pretrained(path)
+    if spec is not None:
+        try:
+            planner.bind(spec)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from error
+    return planner
+
+
+def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] | None:
+    """Write a bound planner into its policy's folder and return its name there, which `load_planner` reads; None for dense.
+
+    A learned planner is the folder ``plan``. One that prunes the same blocks always is ``plan.json``: a cache schedule,
+    unless its class is in :data:`PLANNERS`.
+
+    Raises:
+        ValueError: if the planner looks at the observation and its class is not in the table; nothing is written.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_sparse.blocks.uniform import Uniform
+        >>> planner, folder = Uniform(2), Path(tempfile.mkdtemp())
+        >>> planner.bind(PlanSpec(4, 1, "a policy"))
+        >>> save_beside(planner, folder)
+        'plan.json'
+        >>> load_planner(folder / "plan.json").schedule.computed_steps
+        ((0, 2), (0, 2), (0, 2))
+    """
+    if isinstance(planner, Dense):
+        return None
+    storable, name = _storable(planner), "plan.json" if planner.is_static else "plan"
+    storable.save_pretrained(folder / name)
+    return name
+
+
+def _storable(planner: Planner) -> Any:
+    if type(planner) in PLANNERS.values():
+        return planner
+    if not isinstance(planner, StaticPlanner):
+        raise ValueError(
+            f"plan: expected a planner of a class in PLANNERS or a StaticPlanner, to save it, got {type(planner).__name__}"
+        )
+    spec = planner.spec
+    return schedule.CacheSchedule.from_mask(
+        planner.mask(spec),
+        method=type(planner).__name__,
+        policy=spec.policy,
+        sampler=spec.sampler,
+        reuse=planner.reuse,
+    )

@@ -1,10 +1,11 @@
-"""A diffusion policy as two files: ``config.json`` and ``model.safetensors``. Neither can hold anything that executes.
+"""A diffusion policy as ``config.json``, ``model.safetensors`` and its planner, if any. None can hold anything that executes.
 
 ::
 
     {"format": "torchrl_sparse.diffusion_policy/1",
      "network": {arguments of TransformerForDiffusion},
      "schedule": {arguments of Sampler},
+     "plan": "plan.json" or "plan", a planner's file or folder beside this one; only where something is pruned,
      "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
 
@@ -30,6 +31,7 @@ from torchrl_sparse.storage.tensors import read_tensors, take, write_tensors
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
+PlanName = Literal["plan.json", "plan"]  # of fixed names alone: a file cannot ask for one elsewhere
 _NETWORK, _NORMALIZER, _VISION = "network.", "normalizer.", "vision."
 
 
@@ -42,6 +44,7 @@ class _Config:
     schedule: dict[str, Any]
     vision: dict[str, Any] | None = None
     source: dict[str, Any] | None = None
+    plan: PlanName | None = None
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ class StoredPolicy:
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
             chunk, ``"state_keys"``, robomimic's names of the observations that make up the state, in order, and
             ``"cameras"``, name of the image here -> robomimic's; None for what a checkpoint does not say.
+        plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
     """
 
     network: TransformerForDiffusion
@@ -64,12 +68,15 @@ class StoredPolicy:
     sampler: Sampler
     vision: VisionEncoder | None = None
     source: dict[str, Any] = field(default_factory=dict)
+    plan: PlanName | None = None
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
     """Write both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
     vision = None if policy.vision is None else policy.vision.config
-    config = _Config(FORMAT, policy.network.config, policy.sampler.config, vision, policy.source or None)
+    config = _Config(
+        FORMAT, policy.network.config, policy.sampler.config, vision, policy.source or None, policy.plan
+    )
     weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
     if policy.vision is not None:
         weights |= {_VISION + name: value for name, value in policy.vision.state_dict().items()}
@@ -96,7 +103,8 @@ def read_pretrained(path: Path) -> StoredPolicy:
         module.load_state_dict({name: value.float() for name, value in take(tensors, prefix).items()})
         module.eval()
     normalizer = _make(path / "model.safetensors", "normalizer", Normalizer, take(tensors, _NORMALIZER))
-    return StoredPolicy(modules[_NETWORK], normalizer, sampler, modules.get(_VISION), config.source or {})
+    vision, source = modules.get(_VISION), config.source or {}
+    return StoredPolicy(modules[_NETWORK], normalizer, sampler, vision, source, config.plan)
 
 
 def _modules(file: Path, config: _Config) -> dict[str, nn.Module]:

@@ -201,10 +201,10 @@ class SAGPruner(Planner):
         return masks
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
-        """Write ``config.json`` and ``pruner.safetensors`` into the folder ``path``."""
+        """Write ``config.json``, with the rate that is set now, and ``pruner.safetensors`` into the folder ``path``."""
         path = Path(path)
         write_tensors(path / "pruner.safetensors", self.network.state_dict())
-        config = {"format": FORMAT, **asdict(self.info), "network": self.network.config}
+        config = {"format": FORMAT, **asdict(self.info), "rate": self.rate, "network": self.network.config}
         write_json(path / "config.json", config)
 
     @classmethod

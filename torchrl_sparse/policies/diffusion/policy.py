@@ -21,6 +21,7 @@ from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
+from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -138,14 +139,9 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             ValueError: if the planner was made for another policy or sampler.
         """
-        policy = DiffusionPolicy(
-            self.network,
-            self.normalizer,
-            vision=self.vision,
-            sampler=self.sampler if sampler is None else sampler,
-            plan=plan,
-            engine=self.engine,
-        )
+        sampler = self.sampler if sampler is None else sampler
+        shared = {"vision": self.vision, "engine": self.engine}
+        policy = DiffusionPolicy(self.network, self.normalizer, sampler=sampler, plan=plan, **shared)
         policy.source = self.source
         policy.module["encode"].noise_stream = self.noise_stream
         return policy
@@ -255,20 +251,27 @@ class DiffusionPolicy(TensorDictSequential):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
-        """Write ``config.json`` and ``model.safetensors``, fp16 if ``half``, else fp32, into the folder ``path``."""
-        stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source)
+        """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
+
+        Raises:
+            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`; nothing is written.
+        """
+        plan = save_beside(self.plan, Path(path))
+        stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
         write_pretrained(Path(path), stored, half=half)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, to run in ``engine``. Nothing in the files is executed.
-
-        Whoever then writes to weights through ``.data`` calls `refresh` afterwards.
+        """Read what `save_pretrained` wrote, with sampler and planner, to run in ``engine``. Nothing in the files is executed.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        return cls._assemble(read_pretrained(Path(path)), engine)
+        stored = read_pretrained(Path(path))
+        policy = cls._assemble(stored, engine)
+        if stored.plan is not None:
+            policy.plan = load_planner(Path(path) / stored.plan, policy.plan.spec)
+        return policy
 
     @classmethod
     def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
@@ -290,8 +293,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
-        policy = cls(
-            stored.network, stored.normalizer, vision=stored.vision, sampler=stored.sampler, engine=engine
-        )
+        options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
+        policy = cls(stored.network, stored.normalizer, **options)
         policy.source = stored.source
         return policy
