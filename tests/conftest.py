@@ -1,8 +1,16 @@
-"""Where workers run, as a parameter of tests."""
+"""What every run of the tests begins with, and where workers run, as a parameter of tests."""
+
+import signal
 
 import pytest
 
 from torchrl_sparse.runtime.backends import backend_runtime
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c_interrupts():
+    """A shell hands SIGINT on ignored to what it starts in the background, and Python keeps it so."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
