@@ -1,4 +1,4 @@
-"""What every run of the tests begins with, and where workers run, as a parameter of tests."""
+"""Ctrl-C as in a terminal for every run of the tests; where workers run, as a parameter of tests."""
 
 import signal
 

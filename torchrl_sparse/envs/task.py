@@ -1,4 +1,4 @@
-"""What every task offers, whichever simulator it runs in."""
+"""The protocol of tasks, whichever simulator they run in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a full disk is called."""
+"""Name the file and the volume of a disk that is full."""
 
 import errno
 import os

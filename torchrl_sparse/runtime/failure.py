@@ -1,4 +1,4 @@
-"""What ends a run and is no bug: a recipe says it in one line, where any other `RuntimeError` keeps its traceback."""
+"""The error of a run that ends without a bug: a recipe says it in one line, any other `RuntimeError` keeps its traceback."""
 
 from __future__ import annotations
 

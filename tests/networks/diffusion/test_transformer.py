@@ -7,7 +7,6 @@ from torch import nn
 from torchrl_sparse.networks.diffusion.transformer import (
     SinusoidalPosEmb,
     TransformerForDiffusion,
-    optimizer_groups,
 )
 
 LIFT = {"input_dim": 10, "output_dim": 10, "horizon": 10, "n_obs_steps": 2, "cond_dim": 19}
@@ -132,18 +131,6 @@ def test_initialisation_is_the_published_one():
             assert (module.bias == 0).all()
     for weight in (network.decoder.layers[3].multihead_attn.in_proj_weight, network.pos_emb):
         assert weight.std().item() == pytest.approx(0.02, rel=0.1)
-
-
-def test_only_linear_and_attention_weights_decay(make_network):
-    network = make_network()
-    names = {id(parameter): name for name, parameter in network.named_parameters()}
-    decay, free = optimizer_groups(network, 1e-3)
-    assert (decay["weight_decay"], free["weight_decay"]) == (1e-3, 0.0)
-    decayed = {names[id(p)] for p in decay["params"]}
-    assert len(decayed) + len(free["params"]) == len(names)
-    assert all(name.endswith("weight") and "norm" not in name and "ln_f" not in name for name in decayed)
-    assert {"decoder.layers.0.self_attn.in_proj_weight", "head.weight", "encoder.0.weight"} <= decayed
-    assert {"pos_emb", "cond_pos_emb"} <= {names[id(p)] for p in free["params"]}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What stopping when a benchmark is decided saves, and what it costs."""
+"""Draw what stopping when a benchmark is decided saves, and what it costs."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class MethodRun:
 
 @dataclass(frozen=True)
 class Terms:
-    """What a comparison goes by, agreed on before its episodes ran.
+    """The terms of a comparison, agreed on before its episodes ran.
 
     Attributes:
         design: when the episodes are looked at.

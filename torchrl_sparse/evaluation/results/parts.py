@@ -1,4 +1,4 @@
-"""What files of results are made of: rates, differences, percentiles, each checked on reading."""
+"""The parts of files of results: rates, differences, percentiles, each checked on reading."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ class Stopping:
 
 
 class _Methods:
-    """What both versions offer."""
+    """The fields and methods of both versions."""
 
     methods: dict[str, MethodEntry]
 

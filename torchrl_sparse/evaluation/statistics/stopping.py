@@ -65,7 +65,7 @@ class Population:
 
 @dataclass(frozen=True)
 class Savings:
-    """What stopping early gives on average.
+    """Averages over trials that stop early.
 
     Attributes:
         saved: share of the cap's episodes that need not run.

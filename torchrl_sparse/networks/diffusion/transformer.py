@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion", "optimizer_groups"]
+__all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion"]
 
 BLOCK_TYPES = ("SA", "CA", "FFN")
 _INIT_STD = 0.02
@@ -255,33 +255,6 @@ class TransformerForDiffusion(nn.Module):
             raise ValueError(
                 f"{name} must have shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
             )
-
-
-def optimizer_groups(network: nn.Module, weight_decay: float) -> list[dict]:
-    """Return the parameter groups for AdamW as published: only Linear and attention weights decay.
-
-    Args:
-        network: any module.
-        weight_decay: decay of the first group, >= 0.
-
-    Returns:
-        two groups, with and without decay, each in a deterministic order.
-
-    Examples:
-        >>> [len(group["params"]) for group in optimizer_groups(nn.Linear(2, 2), 1e-3)]
-        [1, 1]
-    """
-    decayed: set[int] = set()
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            decayed.add(id(module.weight))
-        elif isinstance(module, nn.MultiheadAttention) and module.in_proj_weight is not None:
-            decayed.add(id(module.in_proj_weight))
-    parameters = [p for p in network.parameters() if p.requires_grad]
-    return [
-        {"params": [p for p in parameters if id(p) in decayed], "weight_decay": weight_decay},
-        {"params": [p for p in parameters if id(p) not in decayed], "weight_decay": 0.0},
-    ]
 
 
 def _causal_masks(horizon: int, num_memory: int) -> tuple[Tensor, Tensor]:

@@ -11,12 +11,13 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion, optimizer_groups
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
 from torchrl_sparse.training.diffusion.loss import DiffusionLoss
+from torchrl_sparse.training.diffusion.optimizer import optimizer_groups
 from torchrl_sparse.training.trainer import checksum
 
 __all__ = ["PolicyTrainer"]
