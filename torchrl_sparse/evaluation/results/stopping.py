@@ -42,7 +42,7 @@ class TypeOne:
 
 @dataclass(frozen=True)
 class SavedEpisodes:
-    """The share of episodes that is saved at a true difference of success rates, which also makes the method slower by ``ratio``."""
+    """The episodes saved at a true difference of success rates, which also makes the method slower by ``ratio``."""
 
     task: str
     difference: float

@@ -32,7 +32,7 @@ Weights = dict[str, Tensor]
 
 
 class _Levels:
-    """The numbers that the solvers compute with, f64 [K] each: ``log_ratio`` is h, ``slope`` is q / 2, or 0 in steps of first order."""
+    """Numbers that the solvers use, f64 [K] each: ``log_ratio`` is h, ``slope`` is q / 2, or 0 in steps of first order."""
 
     def __init__(self, abar: Tensor, abar_next: Tensor) -> None:
         alpha, sigma = abar.double().sqrt(), (1 - abar.double()).sqrt()
