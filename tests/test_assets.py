@@ -12,7 +12,16 @@ from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
-FOLDERS = sorted(path.parent for path in ASSETS.glob("*/episodes"))
+FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
+
+
+def name(folder: Path) -> str:
+    return folder.relative_to(ASSETS).as_posix()
+
+
+def policy_of(folder: Path) -> Path:
+    """The folder of the policy whose episodes these are: the task's."""
+    return ASSETS / folder.relative_to(ASSETS).parts[0]
 
 
 def identity(log: Path) -> dict:
@@ -24,16 +33,17 @@ def outcomes(log: Path) -> dict[int, bool]:
     return {seed: episode.success for seed, episode in EpisodeLog(log, identity(log)).episodes.items()}
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", FOLDERS, ids=name)
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
-    policy = DiffusionPolicy.from_pretrained(folder)
+    planners = policy_of(folder)
+    policy = DiffusionPolicy.from_pretrained(planners)
     for log in (folder / "episodes").glob("*.jsonl"):
-        method = make_method(log.stem, policy, num_updates=10, planners=folder, calibration=pytest.fail)
+        method = make_method(log.stem, policy, num_updates=10, planners=planners, calibration=pytest.fail)
         published = identity(log)
         assert published | method_identity(log.stem, method) == published, log
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", FOLDERS, ids=name)
 def test_tables_count_the_episodes(folder):
     logs = {log.stem: outcomes(log) for log in (folder / "episodes").glob("*.jsonl")}
     tabled = set()
@@ -47,6 +57,7 @@ def test_tables_count_the_episodes(folder):
             if name != "dense":
                 difference = paired_difference(ours, dense, paired.margin)
                 assert paired.diff == pytest.approx(difference.diff)
-                assert paired.verdict == difference.verdict
+                if results.until_decided is None:  # else the interval is wider, for all the looks
+                    assert paired.verdict == difference.verdict
             tabled.add(name)
     assert tabled == logs.keys()
