@@ -1,4 +1,4 @@
-"""What every recipe begins with: its options checked, its output its own, its errors one line."""
+"""The beginning of every recipe: its options checked, its output its own, its errors one line."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""What the options of all recipes may be. A word has one meaning in all of them, so this is one table.
+"""The values that the options of all recipes may have. A word has one meaning in all of them, so this is one table.
 
 A recipe's yaml has the defaults and says what each option does. Checks that need more than the option alone, such as whether
 there is a task of that name, are made where the option is used, before anything is written.

@@ -1,4 +1,4 @@
-"""What a demonstration file may ask for: what it holds itself, and little if it is small.
+"""Bound what a demonstration file may ask for: what it holds itself, and little if it is small.
 
 HDF5 keeps nothing of a part that was never written, compresses others a thousandfold, follows links into other files and
 repeats a text as often as it is mentioned: a file of a few kilobytes can describe more than any memory holds.
