@@ -77,6 +77,8 @@ OPTIONS: dict[str, Any] = {
     "kind": Word,
     "eta": Annotated[float, Field(ge=0, le=1)],
     "spacings": Words,
+    "samplers": Words,
+    "draws": Annotated[int, Field(ge=3)],
     "sampler": Section | None,
     "calibrate_bac.sampler": Word | None,
     "specprune": Section,
