@@ -85,8 +85,8 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     chains = ("samplers=[ddim2,ddpm2_logsnr]", "draws=3", "targets.share=0.1", f"out={work}/noise")
     assert "ddim2: correlation" in run("carried_noise", *options[:2], *chains)
     assert {path.name for path in (work / "noise").iterdir()} == {
-        "carried_noise_lift.json",
-        "carried_noise_lift.png",
+        "carried_noise_Lift.json",
+        "carried_noise_Lift.png",
     }
     # Chains that end at timestep 0: this policy has learned too little to end anywhere else.
     methods = ["dense", "ddpm4", "ddim4_eta0.5", "uniform2_ddpm4", "bac_ddpm4"]

@@ -3,12 +3,14 @@
 import os
 import random
 import signal
+import sys
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from tests.torture.processes import Run
 from tests.worker_killer import Killer
 from torchrl_sparse.data import demo_workers
 from torchrl_sparse.data.demo_workers import in_order
@@ -73,3 +75,16 @@ def test_workers_that_keep_dying_end_it(tmp_path, backend):
 def test_what_the_work_raises_is_raised(backend):
     with pytest.raises(TypeError, match="str"):
         take(in_order(os.getenv, 0, workers=1, backend=backend), 1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="sessions are read in /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    program = "import time; from torchrl_sparse.data.demo_workers import in_order\n"
+    program += "for number in in_order(time.sleep, 0, workers=2): print('slept', number, flush=True)"
+    run = Run([sys.executable, "-c", program], tmp_path / "log.txt", {})
+    while "slept 1" not in run.output:
+        assert run.process.poll() is None, run.output
+        time.sleep(0.1)
+    assert run.workers()
+    run.process.kill()
+    run.wait(60)  # raises if a worker stays

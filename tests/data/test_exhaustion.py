@@ -129,7 +129,7 @@ def test_a_demonstration_linked_twenty_thousand_times(path):
 def test_as_many_demonstrations_as_there_may_be(tmp_path):
     path = tmp_path / "small.h5"
     with h5py.File(path, "w", libver="latest") as file:
-        for index in range(3500):
+        for index in range(2500):
             fill(file.create_group(f"data/demo_{index}"), steps=4)
     assert check_limits(read, path) is None
 

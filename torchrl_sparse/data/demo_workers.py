@@ -6,14 +6,16 @@ collector.
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import count
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from torchrl_sparse.runtime.backends import backend_runtime, ray_death
@@ -79,11 +81,21 @@ def in_order(
 def _pool(backend: str, workers: int) -> Executor:
     if backend == "ray":
         return _RayPool()
-    # An interrupt then ends a worker as a kill does, instead of as an error of its task.
-    default = (signal.SIGINT, signal.SIG_DFL)
-    return ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=signal.signal, initargs=default
-    )
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin_worker)
+
+
+def _begin_worker() -> None:
+    """An interrupt ends a worker as a kill does, instead of as an error of its task; so does the end of its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    # Without it a worker whose parent was killed waits for tasks for ever: it holds both ends of the queue's pipe.
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _death(backend: str, error: Exception) -> str:
