@@ -94,7 +94,7 @@ def test_other_files_of_results_have_their_tables():
         ("results.json methods=magic", r"methods: expected some of dense \| ddim10 \| bac, got magic"),
         ("results.json columns=magic", r"columns: expected some of .*, got magic"),
         ("results.json cells=magic", r"cells: expected some of .*, got magic"),
-        ("results.json rows=magic", r"rows: expected one of methods, got 'magic'"),
+        ("results.json rows=magic", r"rows: expected one of methods, headline, budgets, got 'magic'"),
         ("results.json colums=method", r"expected the options methods, .*, got 'colums'"),
         ('results.json pairs="bac"', r"pairs: expected METHOD : METHOD, got 'bac'"),
         ("other.json", r"expected a file results\*.json, .*, got other.json"),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
+from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
@@ -68,7 +69,11 @@ def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
-    return {"methods": _table(results.task, whole, len(rows[0]))}
+    methods = _table(results.task, whole, len(rows[0]))
+    if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
+        return {"methods": methods}
+    chosen = {"headline": headline_rows(results), "budgets": budget_rows(results)}
+    return {"methods": methods} | {name: _table(results.task, of_one) for name, of_one in chosen.items()}
 
 
 def _more(results: AnyResults, name: str) -> Row:
