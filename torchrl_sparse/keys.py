@@ -16,7 +16,7 @@ constant                          shape, dtype           meaning
 ``EPISODE_STEP``                  i64 [*B, 1]            environment steps since the reset
 ``EPISODE_COMPLETED``             i64 [*B, 1]            parts of the task done so far, where a benchmark counts them
 ``EPISODE_WAY``                   i64 [*B, 1]            which of its ways the task is being done, where an environment tells;
-                                                         -1 until that shows
+                                                         -1 until that shows, -2 if it failed by going between them
 ``HISTORY_STATE``                 f32 [*B, To, Ds]       the last To states, oldest first
 ``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)

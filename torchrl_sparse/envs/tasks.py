@@ -52,6 +52,7 @@ class RobosuiteTask(_Named):
         module: importing it registers the task with robosuite; None for robosuite's own.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.base.Expert`; None without one.
         early_cut: see `Task`.
+        tells_way: whether episodes tell which of several ways they took, see `torchrl_sparse.envs.lift_ways`.
     """
 
     name: str
@@ -63,6 +64,7 @@ class RobosuiteTask(_Named):
     module: str | None = None
     expert: str | None = None
     early_cut: int | None = None
+    tells_way: bool = False
 
     @property
     def has_choice(self) -> bool:
@@ -186,8 +188,9 @@ def _expert(place: str) -> str:
 
 
 _LIFT = _expert("lift:LiftExpert")
-# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved), rounded up, from
-# `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22, before any table that uses it.
+# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; of the two ways 49,
+# 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22 and
+# of the two ways on the 23rd, before any table that uses it.
 _ROBOSUITE = (
     RobosuiteTask("Lift", "lift", 1, 10, 400, ("lift the red cube",), expert=_LIFT, early_cut=44),
     RobosuiteTask(
@@ -200,6 +203,19 @@ _ROBOSUITE = (
         instructions=tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue")),
         module=f"{_ENVS}.named_lift",
         expert=_LIFT,
+    ),
+    *(
+        RobosuiteTask(
+            *(name, alias, 1, 10, 400, ("lift the red cube around the ball",)),
+            module=f"{_ENVS}.lift_ways",
+            expert=_expert("lift:LiftWaysExpert"),
+            early_cut=cut,
+            tells_way=True,
+        )
+        for name, alias, cut in (
+            ("LiftTwoWays", "lift_two_ways", 62),
+            ("LiftFourWays", "lift_four_ways", None),
+        )
     ),
     RobosuiteTask(
         *("PickPlaceCan", "can", 1, 14, 400, ("put the can into its bin",)),

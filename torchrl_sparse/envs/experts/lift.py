@@ -8,6 +8,7 @@ import numpy as np
 
 from torchrl_sparse.envs.experts.base import CLOSED, OPEN, Expert, Waypoint, at, downward, nearest
 
+_BERTH = 0.08  # m from the ball's centre, at which it is passed
 _LAG = 0.17  # s; the hand covers about a sixth of a second's way to its target in a second
 
 
@@ -40,3 +41,23 @@ class LiftMovingExpert(LiftExpert):
     def lead(self) -> np.ndarray:
         velocity = self.sim_env.sim.data.get_joint_qvel(self.sim_env.cube.joints[0])[:3]
         return _LAG * np.array([velocity[0], velocity[1], 0.0])
+
+
+class LiftWaysExpert(LiftExpert):
+    """The same behind a ball: first to a point beside it, on one of the ways, at random.
+
+    The operator's two signs, fair coins, choose the way; the rest of what they do is small beside it.
+    """
+
+    def waypoints(self) -> Sequence[Waypoint]:
+        sim_env = self.sim_env
+        if sim_env.passed > 0.02:
+            return super().waypoints()
+        way = (2 * (self.style.bow > 0) + (self.style.offset > 0)) % sim_env.ways
+        _, rotation = self.body(sim_env.cube.root_body)
+        hand = self.hand()
+        side = np.arctan2(rotation[1, 0], rotation[0, 0])
+        direction = sim_env.directions[way]
+        clear = (hand.position - sim_env.ball) @ direction > 0.7 * _BERTH
+        beside = sim_env.ball + _BERTH * direction + (0.04 if clear else -0.05) * sim_env.along
+        return [Waypoint(beside, downward(nearest(side, hand.yaw, np.pi / 2)), OPEN)]

@@ -31,7 +31,8 @@ class EpisodeResult:
         fine: whether each query was made in the controller's fine mode; empty without a controller.
         score: highest reward of a step. Published results on Push-T are means of it.
         completed: parts of the task that were done, None for a task that counts none.
-        way: which of its ways the task was done, None for a task that does not tell; -1 if none showed.
+        way: which of its ways the task was done, None for a task that does not tell; -1 if none showed, -2 if
+            it failed by going between them.
     """
 
     seed: int

@@ -16,7 +16,7 @@ def way_entropy(ways: Iterable[int]) -> float:
     episodes it is 1.9 in the mean.
 
     Args:
-        ways: one number an episode. Those that showed no way (-1) count as no episode.
+        ways: one number an episode. Negative ones, which showed no way or went between them, count as no episode.
 
     Raises:
         ValueError: if no episode showed a way.
