@@ -188,7 +188,7 @@ def _expert(place: str) -> str:
 
 
 _LIFT = _expert("lift:LiftExpert")
-# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; of the two ways 49,
+# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; two ways 49,
 # 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22 and
 # of the two ways on the 23rd, before any table that uses it.
 _ROBOSUITE = (
