@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from torchrl_sparse.data.hdf5_files import new_hdf5
 from torchrl_sparse.data.hdf5_reader import (
     ArrayReader,
     demo_group,
@@ -37,7 +38,6 @@ from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import POSE_DIM
-from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["AbsoluteActions", "convert_demos"]
 
@@ -207,7 +207,7 @@ def _make_parts(
         with _saying(where):
             arrays = absolute.convert(states, actions)
         _check_hands(where, demo, arrays, length)
-        with atomic_path(_part(parts, name)) as temporary, h5py.File(temporary, "w") as file:
+        with new_hdf5(_part(parts, name)) as file:
             for key, value in arrays.items():
                 file[key] = value
     absolute.close()
@@ -238,7 +238,7 @@ def _merge(
     path: Path, source: h5py.File, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]
 ) -> None:
     total = sum(open_demo(f"{path}, {name}", source["data"], name)[1] for name in names)
-    with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(out) as file:
         data = lay_out(file, names, attributes | {"total": total})
         if "mask" in source:
             source.copy("mask", file)

@@ -29,7 +29,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.data.hdf5_files import new_hdf5
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Episode:
 
 def write_episode(path: Path, episode: Episode) -> None:
     """Write one episode as a file of its own. A kill leaves either the whole file or none."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         _fill(file.create_group("demo"), episode)
 
 
@@ -78,7 +78,7 @@ def merge_episodes(
     parts = {f"demo_{index}": part for index, part in enumerate(parts)}
     total = sum(episode_length(part)[0] for part in parts.values())
     attributes = {"total": total, "env_args": env_args, "collection": collection}
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         data = lay_out(file, parts, attributes)
         for name, part in parts.items():
             with h5py.File(part, "r") as source:

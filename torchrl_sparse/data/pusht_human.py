@@ -15,13 +15,12 @@ from itertools import pairwise
 from pathlib import Path
 from zipfile import is_zipfile
 
-import h5py
 import numpy as np
 
+from torchrl_sparse.data.hdf5_files import new_hdf5
 from torchrl_sparse.data.hdf5_writer import lay_out
 from torchrl_sparse.envs.pusht import KEYPOINTS, block_keypoints
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["convert_pusht"]
 
@@ -62,7 +61,7 @@ def convert_pusht(path: str | Path, out: str | Path) -> int:
         "env_args": task.demonstrator.env_args(task),
         "collection": {"source": path.name, "operator": "human"},
     }
-    with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(out) as file:
         data = lay_out(file, spans, attributes)
         for name, (first, end) in spans.items():
             data[name].attrs["num_samples"] = end - first

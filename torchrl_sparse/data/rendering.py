@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from tqdm import tqdm
 
 from torchrl_sparse.data.demos import read_initial_state
+from torchrl_sparse.data.hdf5_files import new_hdf5
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["render_demos"]
@@ -43,7 +42,7 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     """
     if Path(path).resolve() == Path(out).resolve():
         raise ValueError(f"out: expected another file than the demonstrations, got {out}")
-    with open_demos(path) as source, atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+    with open_demos(path) as source, new_hdf5(out) as file:
         for group in source:  # the demonstrations and their filter keys
             source.copy(group, file)
         env_args = parse_json(file["data"].attrs["env_args"], dict[str, Any], f"{path}: env_args")
