@@ -54,8 +54,13 @@ def test_a_full_disk_is_one_error_that_names_the_file(tmp_path, monkeypatch, cap
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_error_of_the_block_leaves_nothing(tmp_path):
-    with pytest.raises(KeyError), new_hdf5(tmp_path / "new.h5") as file:
+def break_off(path):
+    with new_hdf5(path) as file:
         fill(file)
         raise KeyError("other")
+
+
+def test_an_error_of_the_block_leaves_nothing(tmp_path):
+    with pytest.raises(KeyError, match="other"):
+        break_off(tmp_path / "new.h5")
     assert list(tmp_path.iterdir()) == []
