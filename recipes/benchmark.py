@@ -29,10 +29,12 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
+from torchrl_sparse.evaluation.figures.ways import plot_ways
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
+from torchrl_sparse.evaluation.results.ways import told_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, make_controller, method_identity
@@ -93,6 +95,8 @@ def main(config: DictConfig) -> None:
     )
     save_results(results, out / "results.json")
     draw_methods(results, methods, queries, calibration(), out)
+    if ways := told_ways(episodes):
+        plot_ways(ways, out / "ways.png", title=f"{task.name}, {config.split} seeds: ways that were taken")
     try:
         for name in config.videos:
             if name in actors:

@@ -17,7 +17,6 @@ from torchrl_sparse import keys
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.block_push import way_of
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
@@ -88,9 +87,9 @@ def demonstrated_ways(config: DictConfig) -> list[int]:
     """Return the ways of demonstrations, to compare with the policy's."""
     if config.demos is None:
         return []
-    if find_task(config.task).name != "BlockPush":
-        raise ValueError(f"demos: expected none for {config.task}, which does not tell its ways")
-    demos = read_demos(config.demos, ("state",), poses=False)
+    task = find_task(config.task)
+    way_of = task.load_way_of()
+    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
     return [way_of(demos.episode(index)[keys.STATE].numpy()) for index in range(len(demos))]
 
 

@@ -8,7 +8,8 @@ import torch
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.experts.operators import draw_operator
-from torchrl_sparse.envs.lift_ways import BETWEEN, RADIUS, directions
+from torchrl_sparse.envs.lift_ways import RADIUS, directions, way_of
+from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.rotations import pose_to_absolute
 
@@ -20,12 +21,14 @@ def play(task, env, signs=(1, 1), command=None):
     style = replace(style, bow=signs[0] * abs(style.bow), offset=signs[1] * abs(style.offset))
     present = env.reset()
     expert = task.load_expert()(env.sim_env, style)
-    way = []
+    way, states = [], [present[keys.STATE].numpy()]
     while not present["done"].item():
         pose = expert.command() if command is None else command(expert)
         present[keys.ACTION] = torch.as_tensor(pose_to_absolute(pose), dtype=torch.float32)
         present = env.step(present)["next"]
         way.append(expert.hand().position - env.sim_env.ball)
+        states.append(present[keys.STATE].numpy())
+    assert present[keys.EPISODE_WAY].item() == way_of(np.stack(states), env.sim_env.ways)
     return present, np.stack(way)
 
 
@@ -65,7 +68,7 @@ def test_the_mean_of_the_ways_leads_through_the_ball_and_fails():
 def test_nothing_is_told_before_the_ball_is_passed():
     env = find_task("lift_two_ways").make(seeds=[0, 1])
     for _ in range(2):
-        assert env.reset()[keys.EPISODE_WAY].item() == -1
+        assert env.reset()[keys.EPISODE_WAY].item() == NO_WAY
 
 
 def test_a_restored_start_has_the_same_ball():

@@ -9,17 +9,17 @@ Importing this module registers ``"LiftTwoWays"`` and ``"LiftFourWays"`` with ro
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
+from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
 from torchrl_sparse.envs.simulator import import_robosuite
 
 import_robosuite()  # quietly, before anything else imports it
 from robosuite.environments.manipulation.lift import Lift  # noqa: E402
 
 RADIUS = 0.03  # m, of the ball
-BETWEEN = -2
-"""Way of an episode whose hand went through the ball."""
-
 _FROM_CUBE = np.array([-0.05, 0.0, 0.085])  # m, half of the way from the cube to where hands start
 _ALONG = -_FROM_CUBE / np.linalg.norm(_FROM_CUBE)
 _LEFT = np.array([0.0, 1.0, 0.0])
@@ -36,13 +36,35 @@ def directions(ways: int) -> np.ndarray:
     return np.cos(angles) * _LEFT + np.sin(angles) * _UP
 
 
+def way_of(states: np.ndarray, ways: int) -> int:
+    """Return the way of an episode with these states, [T, 19], as the environment tells it; `NO_WAY` short of the ball.
+
+    Args:
+        states: of the task: the cube's position first, the hand's from the eleventh number on.
+        ways: on how many sides demonstrations pass the ball.
+
+    >>> states = np.zeros((2, 19))
+    >>> states[:, 10:13] = [[-0.1, 0, 0.17], [-0.04, -0.08, 0.08]]  # past the ball, on its right
+    >>> way_of(states, 2)
+    1
+    """
+    hands = states[:, 10:13] - (states[0, :3] + _FROM_CUBE)
+    if (np.linalg.norm(hands, axis=1) < RADIUS).any():
+        return BETWEEN
+    passed = hands @ _ALONG > 0
+    return int((directions(ways) @ hands[passed.argmax()]).argmax()) if passed.any() else NO_WAY
+
+
+way_of_two, way_of_four = partial(way_of, ways=2), partial(way_of, ways=4)
+
+
 class LiftWays(Lift):
     """Lift behind a ball that hangs at a fixed offset from where the cube starts.
 
     Attributes:
         along: unit vector, f64 [3], of the straight way from where hands start to the cube.
         ways: on how many sides demonstrations pass the ball.
-        way: on which of them the hand passed it in this episode; -1 before that, `BETWEEN` once it was inside.
+        way: on which of them the hand passed it in this episode; `NO_WAY` before that, `BETWEEN` once it was inside.
     """
 
     ways: int
@@ -55,7 +77,7 @@ class LiftWays(Lift):
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
-        self.way = -1
+        self.way = NO_WAY
         self._ball: np.ndarray | None = None
 
     @property
@@ -78,7 +100,7 @@ class LiftWays(Lift):
         super()._pre_action(action, policy_step)
         if np.linalg.norm(hand := self._hand()) < RADIUS:
             self.way = BETWEEN
-        elif self.way == -1 and self.passed > 0:
+        elif self.way == NO_WAY and self.passed > 0:
             self.way = int((self.directions @ hand).argmax())
 
     def _check_success(self) -> bool:

@@ -87,7 +87,7 @@ class RobosuiteEnv(SeededEnv):
             raise ValueError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
         self.task = find_robosuite_task(task)
         horizon = self.task.horizon if horizon is None else horizon
-        super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.tells_way, device=device)
+        super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.way_of is not None, device=device)
         self.action_mode = action_mode
         self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         self._cameras = {key: name for key, name in self._cameras.items() if name is not None}

@@ -15,6 +15,12 @@ from torchrl.envs import EnvBase
 from torchrl_sparse import keys
 from torchrl_sparse.envs.seeds import whole_seed
 
+NO_WAY = -1
+"""Instead of a way: none showed so far."""
+
+BETWEEN = -2
+"""Instead of a way: the episode failed because it went between the ways, as the mean of several does."""
+
 
 class SeededEnv(EnvBase):
     """An environment on the canonical keys, each of whose episodes is fixed by one integer.
@@ -83,7 +89,7 @@ class SeededEnv(EnvBase):
         raise NotImplementedError
 
     def _way(self) -> int:
-        """Number, from 0, of the way in which the task is being done in this episode; -1 until that shows."""
+        """Number, from 0, of the way in which the task is being done in this episode, `NO_WAY` or `BETWEEN`."""
         raise NotImplementedError
 
     # -- specs ---------------------------------------------------------------------------------------------------------

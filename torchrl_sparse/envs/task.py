@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
+import numpy as np
 from torchrl.envs import EnvBase
 
 __all__ = ["Task"]
@@ -47,6 +49,13 @@ class Task(Protocol):
 
     def make(self, **kwargs: Any) -> EnvBase:
         """Make the task's environment; its class documents ``kwargs`` and errors."""
+
+    def load_way_of(self) -> Callable[[np.ndarray], int]:
+        """Import the function that tells the way of an episode from its states, f32 [T, Ds], as the environment does.
+
+        Raises:
+            ValueError: if the task's episodes tell none.
+        """
 
     def load_expert(self) -> type:
         """Import the class of the task's scripted expert.

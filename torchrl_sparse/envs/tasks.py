@@ -10,11 +10,12 @@ absolute actions command; robosuite's ``robot0_eef_quat`` is another frame, abou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+import numpy as np
 from torchrl.envs import EnvBase
 
 from torchrl_sparse.envs.task import Task
@@ -29,6 +30,13 @@ class _Named:
     name: str
     expert: str | None
     early_cut: int | None = None
+    way_of: str | None = None
+
+    def load_way_of(self) -> Callable[[np.ndarray], int]:
+        """See `Task.load_way_of`."""
+        if self.way_of is None:
+            raise ValueError(f"task: expected one that tells its ways, got {self.name!r}, which does not")
+        return _load(self.way_of)
 
     def load_expert(self) -> type:
         """See `Task.load_expert`."""
@@ -52,7 +60,7 @@ class RobosuiteTask(_Named):
         module: importing it registers the task with robosuite; None for robosuite's own.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.base.Expert`; None without one.
         early_cut: see `Task`.
-        tells_way: whether episodes tell which of several ways they took, see `torchrl_sparse.envs.lift_ways`.
+        way_of: ``"module:function"`` that tells the way of an episode from its states; None where a task has but one.
     """
 
     name: str
@@ -64,7 +72,7 @@ class RobosuiteTask(_Named):
     module: str | None = None
     expert: str | None = None
     early_cut: int | None = None
-    tells_way: bool = False
+    way_of: str | None = None
 
     @property
     def has_choice(self) -> bool:
@@ -140,6 +148,7 @@ class StateTask(_Named):
         environment: ``"module:class"`` of the environment.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
             without one.
+        way_of: see `RobosuiteTask`.
     """
 
     name: str
@@ -148,6 +157,7 @@ class StateTask(_Named):
     action_dim: int
     environment: str
     expert: str | None = None
+    way_of: str | None = None
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -210,11 +220,11 @@ _ROBOSUITE = (
             module=f"{_ENVS}.lift_ways",
             expert=_expert("lift:LiftWaysExpert"),
             early_cut=cut,
-            tells_way=True,
+            way_of=f"{_ENVS}.lift_ways:way_of_{number}",
         )
-        for name, alias, cut in (
-            ("LiftTwoWays", "lift_two_ways", 62),
-            ("LiftFourWays", "lift_four_ways", None),
+        for name, alias, number, cut in (
+            ("LiftTwoWays", "lift_two_ways", "two", 62),
+            ("LiftFourWays", "lift_four_ways", "four", None),
         )
     ),
     RobosuiteTask(
@@ -242,6 +252,7 @@ _OTHERS = (
     StateTask(
         *("BlockPush", "block_push", 16, 2, f"{_ENVS}.block_push:BlockPushEnv"),
         expert=_expert("block_push:BlockPushExpert"),
+        way_of=f"{_ENVS}.block_push:way_of",
     ),
     StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv"),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,8 @@ from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.text import percent_text
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
-from torchrl_sparse.evaluation.rollouts.episodes import read_episodes
+from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 
 __all__ = ["Row", "Table", "read_table"]
 
@@ -58,6 +59,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
         raise ValueError(f"expected a file {names}, got {path.name}")
     if pairs:
         return _pairs(path, pairs)
+    if which == "ways":
+        return _ways(path)
     tables = _READERS[kind](path)
     name = which or next(iter(tables))
     if name not in tables:
@@ -119,11 +122,23 @@ def _vla(path: Path) -> dict[str, Table]:
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
-    seeds = range(results.first_seed, results.first_seed + results.dense.success.n)
-    names = {name for pair in pairs for name in pair}
-    logs = {name: read_episodes(path.parent / "episodes" / f"{name}.jsonl") for name in names}
-    episodes = {name: [episode for episode in log if episode.seed in seeds] for name, log in logs.items()}
+    episodes = _episodes(path, results, {name for pair in pairs for name in pair})
     return _table(results.task, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
+
+
+def _ways(path: Path) -> Table:
+    results = load_results(path)
+    ways = told_ways(_episodes(path, results, results.methods))
+    if not ways:
+        raise ValueError(f"rows: expected episodes of {results.task} that tell their ways, got none")
+    return _table(results.task, way_rows(ways))
+
+
+def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
+    """Read the episodes of methods that are of these results."""
+    seeds = range(results.first_seed, results.first_seed + results.dense.success.n)
+    logs = {name: read_episodes(path.parent / "episodes" / f"{name}.jsonl") for name in names}
+    return {name: [episode for episode in log if episode.seed in seeds] for name, log in logs.items()}
 
 
 def _table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:

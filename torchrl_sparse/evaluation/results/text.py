@@ -22,7 +22,7 @@ def count_text(success: Success) -> str:
     >>> count_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
     '3/4 [30, 95] %'
     """
-    return f"{success.k}/{success.n} {_percent_range(success.ci95)} %"
+    return f"{success.k}/{success.n} {percent_range(success.ci95)} %"
 
 
 def percent_text(success: Success) -> str:
@@ -31,7 +31,7 @@ def percent_text(success: Success) -> str:
     >>> percent_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
     '75.0 [30, 95]'
     """
-    return f"{100 * success.rate:.1f} {_percent_range(success.ci95)}"
+    return f"{100 * success.rate:.1f} {percent_range(success.ci95)}"
 
 
 def difference_text(difference: Difference) -> str:
@@ -90,5 +90,5 @@ def threads_text(threads: int) -> str:
     return f"{threads} thread{'' if threads == 1 else 's'}"
 
 
-def _percent_range(interval: Interval) -> str:
+def percent_range(interval: Interval) -> str:
     return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
