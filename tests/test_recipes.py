@@ -64,7 +64,7 @@ def test_a_policy_is_evaluated(work, policy):
     assert line in run("evaluate_policy", f"policy={policy}", *options)
     assert log.read_bytes() == played
     refused = run("evaluate_policy", f"policy={policy}", "demos=demos.h5", *options, expect=2)
-    assert "demos: expected none for lift, which does not tell its ways" in refused
+    assert "task: expected one that tells its ways, got 'Lift', which does not" in refused
 
 
 def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedules):
