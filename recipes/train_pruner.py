@@ -20,12 +20,13 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -78,7 +79,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     if path.exists():
         return load_targets(path, made_for)
     task = find_task(config.task)
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
+    demos = read_demos(config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses)
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
@@ -98,12 +99,11 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
         )
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
     from torchrl_sparse.control.queries import record_queries
-    from torchrl_sparse.envs.for_policy import diffusion_env
     from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
 
     schedules = initial_schedules(config)
     planner = SchedulePlanner.from_pretrained(schedules[0]) if schedules else None
-    n_action_steps = published_shape(config.task).n_action_steps
+    n_action_steps = executed_steps(config.task, policy.source)
     actor = ChunkExecutor(policy.with_plan(planner), n_action_steps=n_action_steps)
     seeds = tuning_seeds(CLOSED_LOOP_SEED, config.rollouts)
     return record_queries(actor, diffusion_env(config.task, policy), seeds)

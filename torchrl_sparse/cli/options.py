@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
+from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
 from torchrl_sparse.storage.json import check_plain
@@ -199,6 +200,10 @@ OPTIONS: dict[str, Any] = {
 
 OPEN_SECTIONS = ("specprune", "options", "train_vla.network")
 """Sections whose entries are those of a dataclass of the library, which checks them."""
+
+
+# ${folder:PATH} in a yaml: where what is made of PATH lies, the folder itself or, beside a file.ckpt, that named `file`
+OmegaConf.register_new_resolver("folder", lambda path: path and path.removesuffix(".ckpt"), replace=True)
 
 
 def check_options(recipe: str, options: Mapping[str, Any]) -> None:

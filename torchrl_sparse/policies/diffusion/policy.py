@@ -262,12 +262,12 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler and planner, to run in ``engine``. Nothing in the files is executed.
+        """Read what `save_pretrained` wrote, with sampler and planner; a ``.ckpt`` as `from_diffusion_policy` does.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        stored = read_pretrained(Path(path))
+        stored = read_diffusion_policy(path) if Path(path).suffix == ".ckpt" else read_pretrained(Path(path))
         policy = cls._assemble(stored, engine)
         if stored.plan is not None:
             policy.plan = load_planner(Path(path) / stored.plan, policy.plan.spec)
