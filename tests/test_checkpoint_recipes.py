@@ -13,7 +13,9 @@ def checkpoint(tmp_path_factory):
 
 
 def test_a_checkpoint_is_calibrated_beside_itself_and_evaluated(checkpoint, tmp_path):
-    assert "latest/bac.json: prune rate" in run("calibrate_bac", f"policy={checkpoint}", "methods=[bac]")
+    assert "latest/bac_unified.json: prune rate" in run(
+        "calibrate_bac", f"policy={checkpoint}", "methods=[bac_unified]"
+    )
     line = run("evaluate_policy", f"policy={checkpoint}", "episodes=1", "horizon=3", f"out={tmp_path}/played")
     assert "success 0/1" in line
 

@@ -7,12 +7,15 @@ there is a task of that name, are made where the option is used, before anything
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
 from torchrl_sparse.storage.json import check_plain
+
+_PACKAGE = Path(__file__).parents[1]
 
 __all__ = ["OPEN_SECTIONS", "OPTIONS", "check_names", "check_options"]
 
@@ -204,6 +207,12 @@ OPEN_SECTIONS = ("specprune", "options", "train_vla.network")
 
 # ${folder:PATH} in a yaml: where what is made of PATH lies, the folder itself or, beside a file.ckpt, that named `file`
 OmegaConf.register_new_resolver("folder", lambda path: path and path.removesuffix(".ckpt"), replace=True)
+# ${shipped:assets/lift}: that folder, or the one that a wheel brought where there is none here
+OmegaConf.register_new_resolver(
+    "shipped",
+    lambda path: next((str(at) for at in (Path(path), _PACKAGE / path) if at.exists()), path),
+    replace=True,
+)
 
 
 def check_options(recipe: str, options: Mapping[str, Any]) -> None:

@@ -103,8 +103,8 @@ class ChunkExecutor(TensorDictModuleBase):
 
         Args:
             observation: ``"state"``, numbers [Ds] of any real dtype, laid out as `DiffusionPolicy.describe` says; ``"image"``
-                and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s, for an
-                `ActionAwareController`. Histories are kept here.
+                and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s,
+                for an `ActionAwareController`. Histories are kept here.
 
         Raises:
             ValueError: naming what is missing, unknown, or of another dtype or shape; nothing is kept of that observation.
