@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
@@ -65,6 +65,7 @@ def main(config: DictConfig) -> None:
     print(f"{path}: {chosen.name}, error {tried[best]:.4f}")
     for spacing, timesteps in starts.items():
         print(f"{spacing}: {list(timesteps)}, error {tried[timesteps]:.4f}")
+    print(benchmark_command(config.task, config.policy, config.out, [chosen.name]))
 
 
 def report(
