@@ -98,7 +98,7 @@ def main(config: DictConfig) -> None:
                 film_masks(name, actors[name], make_env, seeds[0], out)
     except RuntimeError as error:  # no GL library
         print(f"no video: {error}")
-    if config.wandb:
+    if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
     print(f"\nFiles are in {out}")

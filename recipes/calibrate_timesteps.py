@@ -33,7 +33,9 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     policy = DiffusionPolicy.from_pretrained(config.policy)
     task = find_task(config.task)
-    demos = read_demos(config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses)
+    demos = read_demos(
+        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
+    )
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     train_steps = policy.sampler.num_train_timesteps

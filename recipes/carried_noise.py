@@ -33,7 +33,9 @@ def main(config: DictConfig) -> None:
     policy, task = DiffusionPolicy.from_pretrained(config.policy), find_task(config.task)
     train_steps = policy.sampler.num_train_timesteps
     samplers = {name: Sampler.from_name(name, num_train_timesteps=train_steps) for name in config.samplers}
-    demos = read_demos(config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses)
+    demos = read_demos(
+        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
+    )
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     options = {"draws": config.draws, "seed": config.targets.seed, "n_action_steps": n_action_steps}

@@ -41,8 +41,7 @@ from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
 @recipe("train_pruner")
 def main(config: DictConfig) -> None:
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
+    torch.set_num_threads(config.threads or torch.get_num_threads())
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     trainer = make_trainer(config)
     if config.init and not (out / CHECKPOINT).exists():
@@ -61,8 +60,8 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     if config.sampler is not None:
         policy.sampler = Sampler(**config.sampler)
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
-    rated = {"rate_input": options.rate_range is not None}
-    gates = make_gates(config.method, policy, **rated, seed=options.seed, **config.network)
+    sizes = {**config.network, "rate_input": options.rate_range is not None}
+    gates = make_gates(config.method, policy, seed=options.seed, **sizes)
     return PrunerTrainer(gates, policy, calibration_set(policy, config), options)
 
 
@@ -83,7 +82,8 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     if path.exists():
         return load_targets(path, made_for)
     task = find_task(config.task)
-    demos = read_demos(config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses)
+    seen, poses = observed_keys(task.name, policy), task.acts_in_poses
+    demos = read_demos(config.demos, seen, poses=poses, task=task.name)
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:

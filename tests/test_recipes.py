@@ -145,7 +145,7 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
         "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
-        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "wandb=true", f"out={out}",
+        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "logger=wandb", f"out={out}",
     )  # fmt: skip
     output = run("benchmark", *options)
     results = load_results(out / "results.json")
