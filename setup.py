@@ -4,7 +4,7 @@ The extension is optional: without a C++ compiler the package installs all the s
 plain shared library without Python's or PyTorch's headers. Instruction sets are chosen at run time, so there is no -march.
 """
 
-from setuptools import Extension, setup
+from setuptools import Extension, find_packages, setup
 
 NATIVE = Extension(
     "torchrl_sparse.blocks.engine.native._native",
@@ -21,4 +21,22 @@ NATIVE = Extension(
     optional=True,
 )
 
-setup(ext_modules=[NATIVE])
+# Recipes, and a policy to begin with, lie beside the package here and within it where a wheel brings them.
+BESIDE = {
+    "torchrl_sparse.recipes": "recipes",
+    "torchrl_sparse.recipes.examples": "recipes/examples",
+    "torchrl_sparse.recipes.sweeps": "recipes/sweeps",
+    "torchrl_sparse.assets.lift": "assets/lift",
+}
+
+setup(
+    ext_modules=[NATIVE],
+    packages=[*find_packages(include=["torchrl_sparse*"]), *BESIDE],
+    package_dir=BESIDE,
+    package_data={
+        "torchrl_sparse": ["evaluation/figures/*.jinja"],
+        "torchrl_sparse.recipes": ["*.yaml"],
+        "torchrl_sparse.recipes.sweeps": ["*.yaml"],
+        "torchrl_sparse.assets.lift": ["config.json", "model.safetensors", "bac*.json"],
+    },
+)

@@ -41,16 +41,15 @@ from torchrl_sparse.methods.diffusion import check_method, make_controller, meth
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 
 
 @recipe("benchmark")
 def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_task(config.task), Path(config.planners)
-    if config.n_action_steps is None:
-        config.n_action_steps = published_shape(task.name).n_action_steps
     check_names(config, partial(check_method, planners=planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
     first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
     calibration = cache(partial(calibrate_policy, policy, make_env, first_observations))
@@ -103,7 +102,7 @@ def main(config: DictConfig) -> None:
                 film_masks(name, actors[name], make_env, seeds[0], out)
     except RuntimeError as error:  # no GL library
         print(f"no video: {error}")
-    if config.wandb:
+    if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
     print(f"\nFiles are in {out}")

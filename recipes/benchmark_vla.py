@@ -109,7 +109,7 @@ def main(config: DictConfig) -> None:
     for name in config.videos:
         if name in actors:
             film_tokens(name, actors[name], make_env, seeds[0], out)
-    if config.wandb:
+    if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
     print(f"\nFiles are in {out}")

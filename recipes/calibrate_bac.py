@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.mask import prune_rate, query_flops
 from torchrl_sparse.blocks.planner import Dense
-from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -33,16 +33,19 @@ def main(config: DictConfig) -> None:
     seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, Dense().mask(policy.plan.spec))
-    for name in config.methods:
+    made = [
+        Path(config.out) / f"{'_'.join(filter(None, [name, config.sampler]))}.json" for name in config.methods
+    ]
+    for name, path in zip(config.methods, made, strict=True):
         options = {"top_k": config.top_k} if name == "bac" else {}
         schedule = SCHEDULES[name](
             calibration, config.num_updates, policy=policy.fingerprint, objective=config.objective, **options
         )
-        path = Path(config.out) / f"{'_'.join(filter(None, [name, config.sampler]))}.json"
         schedule.save_pretrained(path)
         mask = schedule.mask()
         ratio = query_flops(policy.network, mask) / dense
         print(f"{path}: prune rate {prune_rate(mask):.3f}, {ratio:.3f} of the dense FLOPs")
+    print(benchmark_command(config.task, config.policy, config.out, [path.stem for path in made]))
 
 
 if __name__ == "__main__":

@@ -15,13 +15,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import demonstration_error, search_timesteps
 
@@ -32,8 +33,10 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     policy = DiffusionPolicy.from_pretrained(config.policy)
     task = find_task(config.task)
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
-    n_action_steps = published_shape(task.name).n_action_steps
+    demos = read_demos(
+        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
+    )
+    n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     train_steps = policy.sampler.num_train_timesteps
 
@@ -64,6 +67,7 @@ def main(config: DictConfig) -> None:
     print(f"{path}: {chosen.name}, error {tried[best]:.4f}")
     for spacing, timesteps in starts.items():
         print(f"{spacing}: {list(timesteps)}, error {tried[timesteps]:.4f}")
+    print(benchmark_command(config.task, config.policy, config.out, [chosen.name]))
 
 
 def report(

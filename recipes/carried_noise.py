@@ -15,13 +15,14 @@ from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.carried_noise import plot_carried_noise
 from torchrl_sparse.evaluation.results.carried_noise import CarriedNoiseResults, save_carried_noise
 from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
 
@@ -32,8 +33,10 @@ def main(config: DictConfig) -> None:
     policy, task = DiffusionPolicy.from_pretrained(config.policy), find_task(config.task)
     train_steps = policy.sampler.num_train_timesteps
     samplers = {name: Sampler.from_name(name, num_train_timesteps=train_steps) for name in config.samplers}
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
-    n_action_steps = published_shape(task.name).n_action_steps
+    demos = read_demos(
+        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
+    )
+    n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     options = {"draws": config.draws, "seed": config.targets.seed, "n_action_steps": n_action_steps}
     calls = len(targets) * config.draws * sum(s.num_inference_steps for s in samplers.values())

@@ -27,7 +27,7 @@ from torchrl_sparse.evaluation.statistics.ways import way_entropy
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 
 
 @recipe("evaluate_policy")
@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
 def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
     """Play one episode per seed, read from the log as far as they are there."""
     task = find_task(config.task)
-    n_action_steps = config.n_action_steps or published_shape(task.name).n_action_steps
+    n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     played = {"task": task.name, "n_action_steps": n_action_steps, "horizon": config.horizon}
     first = DEVELOPMENT_SEED if config.seed is None else config.seed
     return evaluate(

@@ -17,7 +17,7 @@ from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
-from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
@@ -36,6 +36,7 @@ from torchrl_sparse.methods.diffusion import check_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
+from torchrl_sparse.training.diffusion.published import executed_steps
 
 
 @recipe("realtime")
@@ -44,6 +45,11 @@ def main(config: DictConfig) -> None:
     for name in config.methods:
         check_method(name, planners)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    if (seen := observed_keys(task.name, policy)) != task.state_keys:  # from which the pose to hold is read
+        raise ValueError(
+            f"policy: expected one that observes {', '.join(task.state_keys)}, got one of {', '.join(seen)}"
+        )
+    config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
     first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
     calibration = cache(partial(calibrate_policy, policy, make_env, first_observations))

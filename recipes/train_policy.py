@@ -53,6 +53,7 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         cameras=cameras,
         image_folder=Path(config.out) / "images",
         poses=task.acts_in_poses,
+        task=task.name,
     )
     if config.init is None:
         policy = untrained_policy(

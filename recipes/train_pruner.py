@@ -18,18 +18,22 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
-from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.recipe import benchmark_command, recipe
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
+from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
-from torchrl_sparse.training.diffusion.published import published_shape
+from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
-from torchrl_sparse.training.pruner.export import export_planner
+from torchrl_sparse.training.pruner.export import export_planner, exported
 from torchrl_sparse.training.pruner.fit import fit_to_masks
 from torchrl_sparse.training.pruner.gates import make_gates
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
@@ -37,8 +41,7 @@ from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
 @recipe("train_pruner")
 def main(config: DictConfig) -> None:
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
+    torch.set_num_threads(config.threads or torch.get_num_threads())
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     trainer = make_trainer(config)
     if config.init and not (out / CHECKPOINT).exists():
@@ -48,6 +51,7 @@ def main(config: DictConfig) -> None:
     if config.logger == "csv" and trainer.step >= config.log_every:
         plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
     print(f"held out: {trainer.validate()}")
+    print(benchmark_command(config.task, config.policy, out, exported(out)))
 
 
 def make_trainer(config: DictConfig) -> PrunerTrainer:
@@ -56,8 +60,8 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     if config.sampler is not None:
         policy.sampler = Sampler(**config.sampler)
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
-    rate_input = options.rate_range is not None
-    gates = make_gates(config.method, policy, rate_input=rate_input, seed=options.seed, **config.network)
+    sizes = {**config.network, "rate_input": options.rate_range is not None}
+    gates = make_gates(config.method, policy, seed=options.seed, **sizes)
     return PrunerTrainer(gates, policy, calibration_set(policy, config), options)
 
 
@@ -78,7 +82,8 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     if path.exists():
         return load_targets(path, made_for)
     task = find_task(config.task)
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
+    seen, poses = observed_keys(task.name, policy), task.acts_in_poses
+    demos = read_demos(config.demos, seen, poses=poses, task=task.name)
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
@@ -96,14 +101,9 @@ def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDi
             f"rollouts: their targets can only be the teacher's; expected targets.source=teacher, "
             f"got {config.targets.source}"
         )
-    from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.control.queries import record_queries
-    from torchrl_sparse.envs.for_policy import diffusion_env
-    from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
-
     schedules = initial_schedules(config)
     planner = SchedulePlanner.from_pretrained(schedules[0]) if schedules else None
-    n_action_steps = published_shape(config.task).n_action_steps
+    n_action_steps = executed_steps(config.task, policy.source)
     actor = ChunkExecutor(policy.with_plan(planner), n_action_steps=n_action_steps)
     seeds = tuning_seeds(CLOSED_LOOP_SEED, config.rollouts)
     return record_queries(actor, diffusion_env(config.task, policy), seeds)

@@ -44,6 +44,8 @@ def policy(work, demos):
 def schedules(work, policy):
     output = run("calibrate_bac", f"policy={policy}", f"out={work}/schedules", "num_updates=7")
     assert "bac.json: prune rate 0." in output
+    found = f"planners={work}/schedules methods=[dense,bac,bac_blockwise,bac_unified]"
+    assert f"next: torchrl-sparse benchmark task=lift policy={policy} {found}" in output
     options = (f"policy={policy}", f"out={work}/schedules", "methods=[bac]")
     output = run("calibrate_bac", *options, "num_updates=2", "sampler=ddpm4")
     assert "bac_ddpm4.json: prune rate 0." in output
@@ -143,7 +145,7 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
         "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
-        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "wandb=true", f"out={out}",
+        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "logger=wandb", f"out={out}",
     )  # fmt: skip
     output = run("benchmark", *options)
     results = load_results(out / "results.json")
@@ -188,7 +190,9 @@ def test_realtime_leaves_a_curve_per_method(work, policy):
 
 def test_report_makes_one_page_of_what_was_measured(work):
     assert "report.html: " in run("report", "runs=assets", f"out={work}/report.html")
-    assert "lift/results.json" in (work / "report.html").read_text()
+    page = (work / "report.html").read_text()
+    for path in [*Path("assets").rglob("results*.json"), *Path("assets").rglob("realtime*.json")]:
+        assert f"{path.relative_to('assets')}" in page
 
 
 def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedules):
@@ -198,6 +202,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
     )  # fmt: skip
     output = run("train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]")
     assert "step 2 of 2, finished" in output
+    assert f"planners={work}/sag methods=[dense,pruner,fixed]" in output
     assert "resumed from step 2" in run(
         "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
     )

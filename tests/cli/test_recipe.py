@@ -139,4 +139,11 @@ def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
     assert not (tmp_path / "out").exists()
     assert run(toy, out) == ""
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["made"]
-    assert "toy is powered by Hydra" in run(toy, "--help")
+    assert run(toy, "--help").endswith("title: ok\nout: ???\n")
+
+
+def test_help_says_what_a_recipe_is_for_and_what_its_options_do():
+    told = run("calibrate_bac", "--help")
+    assert told.startswith("Compute the BAC schedules of a trained policy from one dense query.")
+    assert "samples: 1                                   # queries to average over" in told
+    assert "hydra" not in told

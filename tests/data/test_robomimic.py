@@ -193,3 +193,11 @@ def test_file_without_demonstrations_and_missing_file(tmp_path):
         read_demos(tmp_path / "empty.h5", STATE_KEYS)
     with pytest.raises(FileNotFoundError, match=r"no file .*nowhere\.h5"):
         read_demos(tmp_path / "nowhere.h5", STATE_KEYS)
+
+
+def test_demonstrations_of_another_task_are_refused_with_both_named(path):
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["env_args"] = '{"env_name": "PickPlaceCan", "type": 1, "env_kwargs": {}}'
+    with pytest.raises(ValueError, match=r"expected demonstrations of Lift, got ones of PickPlaceCan"):
+        read_demos(path, STATE_KEYS, poses=False, task="Lift")
+    assert len(read_demos(path, STATE_KEYS, poses=False, task="PickPlaceCan"))

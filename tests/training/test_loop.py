@@ -41,7 +41,7 @@ class Regression(Trainer):
 @pytest.fixture
 def run(tmp_path):
     def run(trainer, evaluate=None):
-        settings = {"out": tmp_path, "logger": "csv", "wandb_mode": "offline"}
+        settings = {"out": tmp_path, "logger": "csv"}
         settings |= {"log_every": 2, "checkpoint_every": 3, "eval_every": 4}
         saved = []
 

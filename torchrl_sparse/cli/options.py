@@ -7,11 +7,15 @@ there is a task of that name, are made where the option is used, before anything
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
 from torchrl_sparse.storage.json import check_plain
+
+_PACKAGE = Path(__file__).parents[1]
 
 __all__ = ["OPEN_SECTIONS", "OPTIONS", "check_names", "check_options"]
 
@@ -53,9 +57,14 @@ OPTIONS: dict[str, Any] = {
     "title": str,
     "sweep": Word,
     "project": Word,
-    "mode": Literal["offline", "online"],
+    "mode": Literal["offline", "online", "disabled"] | None,
+    "sweep.mode": Literal["offline", "online"],
+    "entity": Word | None,
+    "group": Word | None,
+    "name": Word | None,
+    "tags": list[Word],
     "count": Count | None,
-    "wandb": bool,
+    "wandb": Section,
     # methods
     "method": Word,
     "methods": Words,
@@ -175,8 +184,7 @@ OPTIONS: dict[str, Any] = {
     "checkpoint_every": Count,
     "eval_every": Whole,
     "eval_ddim_steps": Count | None,
-    "logger": Literal["csv", "wandb"],
-    "wandb_mode": Literal["offline", "online", "disabled"],
+    "logger": Literal["csv", "wandb"] | None,
     # sizes of networks
     "size": Word,
     "network": Section,
@@ -199,6 +207,16 @@ OPTIONS: dict[str, Any] = {
 
 OPEN_SECTIONS = ("specprune", "options", "train_vla.network")
 """Sections whose entries are those of a dataclass of the library, which checks them."""
+
+
+# ${folder:PATH} in a yaml: where what is made of PATH lies, the folder itself or, beside a file.ckpt, that named `file`
+OmegaConf.register_new_resolver("folder", lambda path: path and path.removesuffix(".ckpt"), replace=True)
+# ${shipped:assets/lift}: that folder, or the one that a wheel brought where there is none here
+OmegaConf.register_new_resolver(
+    "shipped",
+    lambda path: next((str(at) for at in (Path(path), _PACKAGE / path) if at.exists()), path),
+    replace=True,
+)
 
 
 def check_options(recipe: str, options: Mapping[str, Any]) -> None:

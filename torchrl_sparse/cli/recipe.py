@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from functools import wraps
@@ -21,7 +21,7 @@ from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 
-__all__ = ["recipe"]
+__all__ = ["benchmark_command", "recipe"]
 
 _FULL = "HYDRA_FULL_ERROR"
 _MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException, RunFailed)
@@ -44,6 +44,9 @@ def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Ca
 
         @wraps(main)
         def run() -> None:
+            if {"--help", "-h"} & {*sys.argv[1:]}:
+                print(_help(inspect.getmodule(main).__doc__ or "", folder / f"{name}.yaml"))
+                return
             with _one_line_errors():
                 for config in _read_options(folder, name):
                     check_options(name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
@@ -55,14 +58,29 @@ def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Ca
     return decorate
 
 
+def benchmark_command(task: str, policy: str, planners: str | Path, methods: Sequence[str]) -> str:
+    """Return the command that compares what was just made with dense.
+
+    >>> benchmark_command("lift", "runs/lift/policy", "runs/sag", ["pruner"])
+    'next: torchrl-sparse benchmark task=lift policy=runs/lift/policy planners=runs/sag methods=[dense,pruner]'
+    """
+    names = ",".join(["dense", *methods])
+    return f"next: torchrl-sparse benchmark task={task} policy={policy} planners={planners} methods=[{names}]"
+
+
+def _help(purpose: str, options: Path) -> str:
+    """Return what a recipe is for, and its yaml with the comments, without what is Hydra's."""
+    text = options.read_text(encoding="utf-8").rpartition("- _self_")[2].partition("\nhydra:")[0]
+    return f"{purpose.strip()}\n\n{text.strip()}"
+
+
 def _read_options(folder: Path, name: str) -> list[DictConfig]:
-    """Return the options of this command line: one set, several of ``--multirun``, none of ``--help``."""
+    """Return the options of this command line: one set, or several of ``--multirun``."""
     read: list[DictConfig] = []
 
     def note(config: DictConfig) -> None:
         read.append(config)
 
-    note.__module__ = name  # by which Hydra's help calls the program
     hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
     return read
 

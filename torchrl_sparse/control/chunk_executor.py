@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.control.plain import PlainLoop
 
 
 class ChunkExecutor(TensorDictModuleBase):
@@ -18,7 +22,8 @@ class ChunkExecutor(TensorDictModuleBase):
     the policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are
     zero on served steps.
 
-    All state is in keys, so it follows the environment through any collector.
+    All state is in keys, so it follows the environment through any collector. Without TorchRL around it, `reset` and `act` are
+    a robot's loop; the state of that one episode is kept here.
 
     Args:
         policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
@@ -50,6 +55,7 @@ class ChunkExecutor(TensorDictModuleBase):
         self.policy = policy
         self.n_action_steps = n_action_steps
         self.controller = controller
+        self._plain: PlainLoop | None = None
 
     @property
     def in_keys(self):
@@ -80,6 +86,41 @@ class ChunkExecutor(TensorDictModuleBase):
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.QUERIED, due)
         return tensordict.set(keys.ACTION, self._serve(tensordict, age))
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode of `act`: the next observation is its first.
+
+        Args:
+            seed: of the noise, the same as in an environment's episode of this seed; None for torch's global generator.
+
+        Raises:
+            ValueError: if the policy is none that observes a state, such as a VLA.
+        """
+        self._plain = PlainLoop(self, seed)
+
+    def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the action f32 [A] of this step of a plain loop, for one robot.
+
+        Args:
+            observation: ``"state"``, numbers [Ds] of any real dtype, laid out as `DiffusionPolicy.describe` says; ``"image"``
+                and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s,
+                for an `ActionAwareController`. Histories are kept here.
+
+        Raises:
+            ValueError: naming what is missing, unknown, or of another dtype or shape; nothing is kept of that observation.
+
+        Examples:
+            >>> from torchrl_sparse import DiffusionPolicy, Sampler
+            >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+            >>> policy.sampler = Sampler("ddim", 2)
+            >>> actor = ChunkExecutor(policy)
+            >>> actor.reset(seed=0)
+            >>> actor.act({"state": np.zeros(19)}).shape
+            (10,)
+        """
+        if self._plain is None:
+            self.reset()
+        return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
         """Return i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ import h5py
 import numpy as np
 
 from torchrl_sparse.data.hdf5_bounds import text_attribute
+from torchrl_sparse.envs.tasks import TASKS
 from torchrl_sparse.rotations import POSE_DIM
 from torchrl_sparse.storage.json import parse_json
 
-__all__ = ["RecordedControl", "read_control"]
+__all__ = ["RecordedControl", "check_recorded_task", "read_control"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,17 @@ class RecordedControl:
         """
         rotation = actions.reshape(len(actions), -1, POSE_DIM)[..., 3:6]
         return self.arm.get("input_type", "delta") == "delta" and bool(np.abs(rotation).max() <= 1)
+
+
+def check_recorded_task(path: Path, file: h5py.File, task: str) -> None:
+    """Raise ValueError, naming both, if the file says that its demonstrations are of another task here."""
+    text = text_attribute(str(path), file["data"], "env_args")
+    try:
+        recorded = json.loads(text or "{}").get("env_name")
+    except (ValueError, AttributeError, RecursionError):
+        return  # what is wrong with it, `read_control` says where it is needed
+    if isinstance(recorded, str) and recorded != task and recorded in TASKS:
+        raise ValueError(f"{path}: expected demonstrations of {task}, got ones of {recorded}")
 
 
 def read_control(path: str | Path, file: h5py.File) -> RecordedControl | None:

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
 from torchrl_sparse.data.images import read_images
-from torchrl_sparse.data.recorded_control import RecordedControl, read_control
+from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "read_demos"]
@@ -104,6 +104,7 @@ def read_demos(
     cameras: Mapping[str, str] | None = None,
     image_folder: str | Path | None = None,
     poses: bool = True,
+    task: str | None = None,
 ) -> Demonstrations:
     """Read all demonstrations of a robomimic file, in the order of their numbers.
 
@@ -115,14 +116,15 @@ def read_demos(
         image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
             memory by default.
         poses: actions are absolute poses of arms; False takes them as they are, as benchmarks outside robosuite want it.
+        task: name of the task that they are to show; None for any.
 
     Returns:
         f32 demonstrations; poses are converted from rotation vectors to 6-D rotations.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if the file is truncated or malformed, its actions are deltas, or there is no such filter key; the
-            message names file, demonstration and dataset.
+        ValueError: if the file is truncated or malformed, its actions are deltas, it is of another task, or there is no such
+            filter key; the message names file, demonstration and dataset.
 
     Examples:
         >>> demos = read_demos("data/lift.h5", find_robosuite_task("Lift").state_keys)  # doctest: +SKIP
@@ -133,6 +135,8 @@ def read_demos(
         raise ValueError("state_keys: expected at least one observation key, got none")
     with open_demos(path) as file:
         names, control = demo_names(path, file, filter_key), None
+        if task is not None:
+            check_recorded_task(Path(path), file, task)
         # Of files of other simulators only their maker knows whether actions are poses.
         with suppress(ValueError):
             control = read_control(path, file)

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.conventions import Convention, check_convention, object_state
 from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
@@ -51,6 +52,8 @@ class RobosuiteEnv(SeededEnv):
         wrist_camera: camera of ``("observation", "wrist_image")``, e.g. "robot0_eye_in_hand".
         image_size: height and width of the images, pixels.
         object_state: False leaves the objects out of the state, as in image tasks: cameras show them.
+        state_keys: robosuite's names of the observations that make up the state, in order; None for the task's.
+        convention: the version of robosuite whose meaning the objects' state has, see `torchrl_sparse.envs.conventions`.
         fast_render: see `CameraRenderer`.
         instruction: write ``"language_instruction"``; True for the episode's own words. Words of your own are written as
             they are; for a task with several instructions they have to be one of those, and that one counts in every episode.
@@ -78,6 +81,8 @@ class RobosuiteEnv(SeededEnv):
         wrist_camera: str | None = None,
         image_size: int = 84,
         object_state: bool = True,
+        state_keys: Sequence[str] | None = None,
+        convention: Convention = "1.5",
         fast_render: bool = True,
         instruction: bool | str = False,
         reward_shaping: bool = False,
@@ -92,7 +97,11 @@ class RobosuiteEnv(SeededEnv):
         self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
         self._image_size = image_size
-        self._state_keys = self.task.state_keys if object_state else self.task.proprioception_keys
+        own_keys = self.task.state_keys if object_state else self.task.proprioception_keys
+        self._state_keys = own_keys if state_keys is None else tuple(state_keys)
+        self._state_size = self.task.state_size(self._state_keys)
+        check_convention(convention, self.task.name)
+        self._convention: Convention = convention
         self._fast_render = fast_render
         self._instruction = instruction
         if isinstance(instruction, str) and self.task.has_choice:
@@ -108,12 +117,11 @@ class RobosuiteEnv(SeededEnv):
 
     def _describe(self) -> None:
         size = self._image_size
-        slices = [self.task.state_slice(key) for key in self._state_keys]
         if self.action_mode == "absolute":
             action = Unbounded((ABSOLUTE_DIM * self.task.arms,))
         else:
             action = Bounded(-1.0, 1.0, (POSE_DIM * self.task.arms,))
-        self._make_specs(sum(part.stop - part.start for part in slices), action)
+        self._make_specs(self._state_size, action)
         observation = self.observation_spec
         observation[keys.EEF_VEL] = Unbounded((6 * self.task.arms,), device=self.device)
         for key in self._cameras:
@@ -191,18 +199,18 @@ class RobosuiteEnv(SeededEnv):
 
     # -- observations --------------------------------------------------------------------------------------------------
 
-    def raw_observation(self) -> Mapping[str, np.ndarray]:
-        """Return the parts of the state by robosuite's names, f64, in the order in which they are concatenated."""
+    def raw_observation(self, state_keys: Sequence[str] | None = None) -> Mapping[str, np.ndarray]:
+        """Return the parts of the task's state, or those of ``state_keys``, by robosuite's names, f64, in that order."""
         # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
         self.sim_env._update_observables(force=True)
         observed = self.sim_env._get_observations(force_update=True)
-        observed["object"] = observed["object-state"]
-        parts = {name: np.asarray(observed[name]) for name in self.task.state_keys}
+        observed["object"] = object_state(self.task.name, observed, self._convention)
+        wanted = self.task.state_keys if state_keys is None else state_keys
+        parts = {name: np.asarray(observed[name]) for name in wanted}
         return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
 
     def _observe_state(self) -> np.ndarray:
-        parts = self.raw_observation()
-        return np.concatenate([parts[key] for key in self._state_keys])
+        return np.concatenate([*self.raw_observation(self._state_keys).values()])
 
     def _observe(self) -> TensorDict:
         out = super()._observe()

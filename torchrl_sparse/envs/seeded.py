@@ -131,7 +131,7 @@ class SeededEnv(EnvBase):
         return seed
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        reward = self._advance(self._check_action(tensordict.get(keys.ACTION)))
+        reward = self._advance(self._check_action(self._action(tensordict)))
         self._elapsed += 1
         out = self._observe()
         success = out[keys.SUCCESS]
@@ -139,6 +139,15 @@ class SeededEnv(EnvBase):
         out["reward"] = torch.tensor([reward], dtype=torch.float32, device=self.device)
         out["terminated"], out["truncated"], out["done"] = success.clone(), truncated, success | truncated
         return out
+
+    @staticmethod
+    def _action(tensordict: TensorDictBase) -> torch.Tensor:
+        action = tensordict.get(keys.ACTION, None)
+        if action is None and keys.CHUNK in tensordict.keys(True):
+            raise ValueError(
+                "action: expected one, got a chunk of them: an executor is missing, ChunkExecutor(policy), which serves them"
+            )
+        return keys.read(tensordict, keys.ACTION)
 
     def _check_action(self, action: torch.Tensor) -> np.ndarray:
         expected = self.action_spec.shape

@@ -127,6 +127,20 @@ class RobosuiteTask(_Named):
         index = self.state_keys.index(key)
         return slice(sum(sizes[:index]), sum(sizes[: index + 1]))
 
+    def state_size(self, state_keys: Sequence[str]) -> int:
+        """Return how many numbers the observations have together.
+
+        Raises:
+            ValueError: for a name that no low-dimensional policy of the task observes, or one that comes twice.
+        """
+        arms = {f"robot{i}_{name}": size for i in range(self.arms) for name, size in _OBSERVED.items()}
+        sizes = {"object": self.object_dim, **arms}
+        if not state_keys or not set(state_keys) <= sizes.keys() or len({*state_keys}) < len(state_keys):
+            raise ValueError(
+                f"state_keys: expected some of {', '.join(sizes)} for {self.name}, got {', '.join(state_keys) or 'none'}"
+            )
+        return sum(sizes[key] for key in state_keys)
+
     def make(self, **kwargs: Any) -> EnvBase:
         """Make its `torchrl_sparse.envs.robosuite.RobosuiteEnv`."""
         return _load(f"{_ENVS}.robosuite:RobosuiteEnv")(self.name, **kwargs)
@@ -191,6 +205,7 @@ def _load(path: str) -> Any:
 
 _ENVS, _EXPERTS = "torchrl_sparse.envs", "torchrl_sparse.envs.experts"
 _PROPRIOCEPTION = {"eef_pos": 3, "eef_quat_site": 4, "gripper_qpos": 2}
+_OBSERVED = _PROPRIOCEPTION | {"eef_quat": 4}  # of the hand's body, which published policies observe
 
 
 def _expert(place: str) -> str:

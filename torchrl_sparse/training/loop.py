@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.runtime.interrupt import StopSignal
+from torchrl_sparse.runtime.wandb_run import wandb_arguments
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.training.trainer import Trainer
 
@@ -32,8 +33,8 @@ def train(
 
     Args:
         trainer: what to train.
-        settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger`` ("csv" or "wandb") and
-            ``wandb_mode``, of what is logged under ``out/log``; ``log_every``, ``checkpoint_every`` and, with ``evaluate``,
+        settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger``, "csv",
+            under ``out/log``, or "wandb", see `wandb_arguments`; ``log_every``, ``checkpoint_every`` and, with ``evaluate``,
             ``eval_every``, steps between two of each (``eval_every`` 0: none).
         export: write what was trained so far, for its users; return where. Called with each checkpoint.
         evaluate: return the success rate so far, in [0, 1], or None where it cannot be measured.
@@ -94,8 +95,10 @@ def _means(losses: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _make_logger(settings: Mapping[str, Any]) -> Logger:
-    wandb = {"project": "torchrl_sparse", "mode": settings["wandb_mode"], "config": dict(settings)}
-    return get_logger(settings["logger"], str(Path(settings["out"]).resolve()), LOG, wandb_kwargs=wandb)
+    out, kind = Path(settings["out"]).resolve(), settings["logger"]
+    name = f"{settings.get('task', out.name)} {settings.get('method', 'policy')}"
+    wandb = wandb_arguments(settings, out, name) if kind == "wandb" else {}
+    return get_logger(kind, str(out), LOG, wandb_kwargs=wandb)
 
 
 def _forget_after(step: int, folder: Path) -> None:

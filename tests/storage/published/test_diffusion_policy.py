@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from torchrl_sparse import BAC, DiffusionPolicy, Sampler, Uniform, keys
@@ -100,6 +101,7 @@ def test_source_says_how_to_feed_the_policy(checkpoint):
         "task": "lift_lowdim",
         "epoch": 650,
         "n_action_steps": 8,
+        "robosuite": None,
         "state_keys": ["object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
     }
     assert policy.sampler.config == {"kind": "ddpm", "num_inference_steps": 100, "num_train_timesteps": 100}
@@ -150,3 +152,12 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys):
     assert convert([str(tmp_path / "a.ckpt"), str(tmp_path / "out")]) == 1
     assert "a.ckpt: expected a complete zip archive" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("place", ["env_meta", "task.env_meta", "task.env_runner.env_meta"])
+def test_the_version_of_robosuite_is_read_where_it_is_noted(published, tmp_path, place):
+    def note(payload):
+        OmegaConf.update(payload["cfg"], place, {"env_name": "Lift", "env_version": "1.4.1"})
+
+    path = write_checkpoint(tmp_path / "a.ckpt", published, change=note)
+    assert DiffusionPolicy.from_pretrained(path).source["robosuite"] == "1.4.1"

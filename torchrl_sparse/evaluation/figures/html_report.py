@@ -36,9 +36,9 @@ def _plots_of_realtime(results: Realtime) -> dict[str, Callable[..., Path]]:
     return {"success against latency": plot_realtime}
 
 
-_KINDS = {
-    "results.json": (load_results, results_rows, results_note, _plots_of_results),
-    "realtime.json": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
+_KINDS = {  # by the beginning of a file's name: results.json, results_400.json
+    "results": (load_results, results_rows, results_note, _plots_of_results),
+    "realtime": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
 }
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 # From the numbers, instead of a file that may be older than they are.
@@ -74,7 +74,7 @@ class Run:
     @classmethod
     def read(cls, file: Path, name: str) -> Run:
         """Read a file and draw its figures."""
-        load, make_rows, make_note, find_plots = _KINDS[file.name]
+        load, make_rows, make_note, find_plots = _KINDS[_kind(file)]
         try:
             results = load(file)
         except (ValueError, OSError) as error:
@@ -87,15 +87,21 @@ class Run:
         return cls(name, make_rows(results), make_note(results), figures)
 
 
+def _kind(file: Path) -> str:
+    return file.stem.partition("_")[0]
+
+
 def find_runs(root: str | os.PathLike) -> list[Path]:
-    """Return the ``results.json`` and ``realtime.json`` below a folder, sorted.
+    """Return every ``results.json``, ``results_*.json``, ``realtime.json`` and ``realtime_*.json`` below a folder, sorted.
 
     Raises:
         FileNotFoundError: if there is none.
     """
-    found = sorted(path for path in Path(root).rglob("*.json") if path.name in _KINDS)
+    found = sorted(path for path in Path(root).rglob("*.json") if _kind(path) in _KINDS)
     if not found:
-        raise FileNotFoundError(f"{root}: expected {' or '.join(_KINDS)} in it or below it, got none")
+        raise FileNotFoundError(
+            f"{root}: expected {' or '.join(f'{kind}.json' for kind in _KINDS)} in it or below it, got none"
+        )
     return found
 
 

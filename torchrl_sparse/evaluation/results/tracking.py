@@ -8,6 +8,7 @@ from typing import Any
 
 from torchrl_sparse.evaluation.results.report import results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry1
+from torchrl_sparse.runtime.wandb_run import wandb_arguments
 
 __all__ = ["log_benchmark", "tested_method", "trial_metrics"]
 
@@ -39,7 +40,7 @@ def _numbers(method: MethodEntry1) -> dict[str, float]:
 
 
 def log_benchmark(results: AnyResults, folder: Path, config: Mapping[str, Any]) -> None:
-    """Log a finished benchmark as one run. Where to is wandb's to know: an agent, or ``WANDB_MODE=offline`` to keep it here.
+    """Log a finished benchmark as one run, the same as before if it is logged again; see `wandb_arguments`.
 
     Args:
         results: of the benchmark.
@@ -48,7 +49,8 @@ def log_benchmark(results: AnyResults, folder: Path, config: Mapping[str, Any]) 
     """
     import wandb
 
-    with wandb.init(project="torchrl_sparse", dir=folder, config=dict(config)) as run:
+    name = f"{results.task} {', '.join(list(results.methods)[1:])}"
+    with wandb.init(**wandb_arguments(config, folder, name)) as run:
         rows = results_rows(results)
         media: dict[str, Any] = {
             "table": wandb.Table(columns=list(rows[0]), data=[list(row.values()) for row in rows])

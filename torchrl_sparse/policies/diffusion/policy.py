@@ -28,6 +28,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
+from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
@@ -91,8 +92,6 @@ class DiffusionPolicy(TensorDictSequential):
         self.plan = plan  # binds it to this network and sampler
         self.source: dict[str, Any] = {}
         self.eval()
-
-    # -- the parts -----------------------------------------------------------------------------------------------------
 
     @property
     def network(self) -> TransformerForDiffusion:
@@ -211,6 +210,8 @@ class DiffusionPolicy(TensorDictSequential):
         """
         return self.module["denoise"].engine.describe(self.network, self.sampler)
 
+    describe = describe  # "observes the last 2 of\n  state, 19 numbers: …"
+
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
         slot = self.module["denoise"].engine
@@ -262,12 +263,12 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler and planner, to run in ``engine``. Nothing in the files is executed.
+        """Read what `save_pretrained` wrote, with sampler and planner; a ``.ckpt`` as `from_diffusion_policy` does.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        stored = read_pretrained(Path(path))
+        stored = read_diffusion_policy(path) if Path(path).suffix == ".ckpt" else read_pretrained(Path(path))
         policy = cls._assemble(stored, engine)
         if stored.plan is not None:
             policy.plan = load_planner(Path(path) / stored.plan, policy.plan.spec)
@@ -281,8 +282,7 @@ class DiffusionPolicy(TensorDictSequential):
         what the policy was trained for. Nothing in the file is executed.
 
         Raises:
-            FileNotFoundError: if there is no file.
-            CheckpointError: a ValueError that names the file, what was expected in it and what was found.
+            FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.
 
         Examples:
             >>> policy = DiffusionPolicy.from_diffusion_policy("latest.ckpt")  # doctest: +SKIP

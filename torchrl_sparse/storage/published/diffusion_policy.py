@@ -53,6 +53,7 @@ def _read(archive: TorchArchive) -> StoredPolicy:
         "task": config.get("task.name", str, None),
         "epoch": _epoch(payload),
         "n_action_steps": config.get("n_action_steps", int),
+        "robosuite": _robosuite_version(config, payload),
     }
     policy = _READERS[kind](archive, config, tensors, source)
     _nothing_left(tensors)
@@ -106,6 +107,14 @@ _READERS = {
     "DiffusionTransformerLowdimPolicy": _read_low_dim,
     "DiffusionTransformerHybridImagePolicy": _read_images,
 }
+
+
+def _robosuite_version(config: PublishedConfig, payload: Mapping) -> str | None:
+    """Return the version that robomimic's ``env_meta`` notes; None where a checkpoint has none."""
+    if "env_meta" in payload:
+        return PublishedConfig(payload).get("env_meta.env_version", str, None)
+    places = (f"{place}env_meta.env_version" for place in ("", "task.", "task.env_runner."))
+    return next(filter(None, (config.get(place, str, None) for place in places)), None)
 
 
 def _epoch(payload: Mapping) -> int | None:

@@ -52,6 +52,23 @@ def published_shape(task: str) -> PublishedShape:
     return _SHAPES.get(find_task(task).alias, PublishedShape())
 
 
+def executed_steps(task: str, source: Mapping[str, Any], chosen: int | None = None) -> int:
+    """Return how many actions of a chunk are executed: ``chosen``, else what ``source`` says, else what is published.
+
+    Args:
+        task: a name or alias.
+        source: of a policy.
+        chosen: by the user.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    >>> executed_steps("block_push", {}), executed_steps("lift", {"n_action_steps": 4})
+    (1, 4)
+    """
+    return chosen or source.get("n_action_steps") or published_shape(task).n_action_steps
+
+
 def with_published(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``options`` with the published choice for the task where they are None and `PublishedShape` has one.
 

@@ -11,7 +11,7 @@ from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
-__all__ = ["export_planner"]
+__all__ = ["export_planner", "exported"]
 
 
 def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping[str, Any]) -> Path:
@@ -53,3 +53,13 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
     )
     SAGPruner(trainer.gates, info).save_pretrained(folder / "pruner")
     return folder / "pruner"
+
+
+def exported(folder: str | Path) -> list[str]:
+    """Return the names under which a benchmark finds what `export_planner` wrote into ``folder``.
+
+    >>> exported("assets/lift")
+    ['l2c']
+    """
+    names = ("pruner", "fixed.json", "l2c.json", "l2c_noise.json")
+    return [Path(name).stem for name in names if (Path(folder) / name).exists()]

@@ -1,0 +1,59 @@
+"""A plain loop acts as a rollout in the environment does, and what does not fit is refused by name."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys, make_env
+
+
+@pytest.fixture(scope="module")
+def policy():
+    policy = DiffusionPolicy.from_pretrained("assets/lift")
+    policy.sampler = Sampler("ddpm", 3, spacing="logsnr")
+    return policy
+
+
+def test_it_acts_as_in_the_environment(policy):
+    env = make_env("Lift", seeds=[7])
+    actor = ChunkExecutor(policy, n_action_steps=3)
+    expected = env.rollout(7, actor)
+    for _ in range(2):  # the second episode begins anew
+        actor.reset(seed=7)
+        acted = [actor.act({"state": state.double().numpy()}) for state in expected[keys.STATE]]
+        assert acted[0].dtype == np.float32
+        torch.testing.assert_close(torch.from_numpy(np.stack(acted)), expected["action"])
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        ({}, "observation: expected state, got nothing"),
+        ({"state": np.zeros(19), "force": np.zeros(3)}, "observation: expected state, got force, state"),
+        ({"state": np.zeros((1, 19))}, r"state: expected 19 finite numbers in one row, got shape \(1, 19\)"),
+        ({"state": np.zeros(18)}, r"got shape \(18,\)"),
+        ({"state": np.full(19, np.nan)}, "got .nan"),
+        ({"state": np.array(["a"] * 19)}, "got dtype <U1"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name_and_not_kept(policy, observation, message):
+    actor = ChunkExecutor(policy)
+    actor.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        actor.act(observation)
+    good = {"state": np.zeros(19)}
+    after = actor.act(good)
+    actor.reset(seed=1)
+    np.testing.assert_array_equal(after, actor.act(good))
+
+
+def test_a_rollout_without_an_executor_says_that_one_is_missing(policy):
+    with pytest.raises(ValueError, match=r"an executor is missing, ChunkExecutor\(policy\)"):
+        make_env("Lift", seeds=[7]).rollout(3, policy)
+
+
+def test_a_policy_describes_what_it_reads(policy):
+    lines = policy.describe().splitlines()
+    assert lines[0] == "observes the last 2 of"
+    assert len([line for line in lines if line.startswith("    [")]) == 19
+    assert "returns 9 actions of 10 numbers, the first for the present step" in lines

@@ -1,0 +1,89 @@
+"""What is installed: a command that runs every recipe from any folder, and distributions that install."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+from torchrl_sparse.cli.console import main
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_command_lists_every_recipe_with_its_purpose(capsys):
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for path in (ROOT / "recipes").glob("*.py"):
+        (line,) = (line for line in lines if line.split(" ")[0] == path.stem)
+        assert len(line.split()) > 3
+
+
+def test_an_unknown_recipe_is_one_line(capsys):
+    assert main(["benchmrak"]) == 2
+    assert "expected env or one of benchmark" in capsys.readouterr().err
+
+
+def test_a_fault_can_be_reported_with_the_installation(capsys):
+    assert main(["env"]) == 0
+    told = capsys.readouterr().out
+    assert "torchrl 0." in told
+    assert "native engine: " in told
+
+
+def test_a_recipe_runs_from_any_folder_with_overrides(tmp_path):
+    command = [sys.executable, "-c", "from torchrl_sparse.cli.console import main; main()"]
+    options = ["calibrate_bac", f"policy={ROOT}/assets/lift", "methods=[bac_unified]", f"out={tmp_path}/made"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([*command, *options], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert [path.name for path in (tmp_path / "made").iterdir()] == ["bac_unified.json"]
+
+
+def test_the_citation_names_this_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert f'version = "{cited["version"]}"' in (ROOT / "pyproject.toml").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", [None, "/bin/false"], ids=["compiler", "no_compiler"])
+def test_distributions_install_with_and_without_a_compiler(tmp_path, compiler):
+    source = tmp_path / "source"
+    ignored = shutil.ignore_patterns(
+        ".git", ".venv", "build", "dist", "*.so", "*.egg-info", "episodes", "figures"
+    )
+    shutil.copytree(ROOT, source, ignore=ignored)
+    environment = os.environ if compiler is None else os.environ | {"CC": compiler, "CXX": compiler}
+
+    def pip(*arguments):
+        command = [sys.executable, "-m", "pip", "-q", *arguments]
+        subprocess.run(command, check=True, cwd=tmp_path, env=environment)
+
+    pip("install", "--target", str(tmp_path / "tools"), "build")
+    environment = environment | {"PYTHONPATH": str(tmp_path / "tools")}
+    subprocess.run([sys.executable, "-m", "build", str(source)], check=True, cwd=tmp_path, env=environment)
+    (wheel,), (sdist,) = source.glob("dist/*.whl"), source.glob("dist/*.tar.gz")
+    names = zipfile.ZipFile(wheel).namelist()
+    for packed in (
+        "recipes/benchmark.yaml",
+        "recipes/examples/robot_loop.py",
+        "assets/lift/model.safetensors",
+    ):
+        assert f"torchrl_sparse/{packed}" in names
+    assert any(name.endswith(".so") for name in names) == (compiler is None)
+    with tarfile.open(sdist) as archive:
+        assert any(name.endswith("native.cpp") for name in archive.getnames())
+    pip("install", "--no-deps", "--target", str(tmp_path / "installed"), str(wheel))
+    code = "import torchrl_sparse, sys; from torchrl_sparse.cli.console import main; print(torchrl_sparse.__file__); main([])"
+    outside = {name: value for name, value in environment.items() if name != "PYTHONPATH"}
+    outside["PYTHONPATH"] = str(tmp_path / "installed")
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=outside, capture_output=True, text=True, check=True
+    )
+    assert str(tmp_path / "installed") in done.stdout
+    assert "benchmark" in done.stdout

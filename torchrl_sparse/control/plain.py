@@ -1,0 +1,94 @@
+"""What a plain robot loop hands to an executor, and gets back: numpy arrays, checked by name, without TorchRL around them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+
+__all__ = ["PlainLoop"]
+
+
+class PlainLoop:
+    """One robot's episode under an executor: keeps its history and what a query left, as an environment and a collector would.
+
+    Args:
+        executor: a `ChunkExecutor`, whose policy has ``n_obs_steps`` and a ``normalizer``, as a `DiffusionPolicy` has.
+        seed: of the noise, that an environment's episode of this seed has too; None for torch's global generator.
+    """
+
+    def __init__(self, executor: TensorDictModuleBase, seed: int | None):
+        self._executor = executor
+        policy: Any = executor.policy
+        if keys.HISTORY_STATE not in policy.in_keys or not hasattr(policy, "n_obs_steps"):
+            raise ValueError(
+                f"policy: expected one that reads {keys.HISTORY_STATE}, got {type(policy).__name__}"
+            )
+        self._policy, self._seed, self._step = policy, seed, 0
+        past = {key[1]: deque(maxlen=policy.n_obs_steps) for key in executor.in_keys if key[0] == "history"}
+        self._past: dict[str, deque[Tensor]] = past
+        self._now = {key[1] for key in executor.in_keys if key[0] == "observation"} - past.keys()
+        self._carried: TensorDictBase = TensorDict()
+
+    def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the action of this step; see `ChunkExecutor.act`."""
+        if observation.keys() != self._past.keys() | self._now:
+            expected, got = sorted(self._past.keys() | self._now), sorted(observation)
+            raise ValueError(
+                f"observation: expected {', '.join(expected)}, got {', '.join(got) or 'nothing'}"
+            )
+        # everything is checked before anything is kept, so that a refused observation can be handed over again mended
+        read = {name: self._read(name, np.asarray(value)) for name, value in observation.items()}
+        td = self._carried
+        for name, past in self._past.items():
+            past.extend([read[name]] * (1 if past else past.maxlen or 1))
+            td[keys.history(name)] = torch.stack([*past])
+        for name in self._now:
+            td["observation", name] = read[name]
+        td[keys.IS_INIT] = torch.tensor([self._step == 0])
+        if self._seed is not None:
+            td[keys.EPISODE_SEED], td[keys.EPISODE_STEP] = (
+                torch.tensor([self._seed]),
+                torch.tensor([self._step]),
+            )
+        device = self._policy.normalizer.state_scale.device
+        self._carried = self._executor(td.to(device)).detach()
+        self._step += 1
+        return self._carried[keys.ACTION].cpu().numpy()
+
+    def _read(self, name: str, value: np.ndarray) -> Tensor:
+        if name in ("image", "wrist_image"):
+            return _image(name, value, tuple(self._policy.vision.image_size))
+        size = self._policy.normalizer.state_scale.numel() if name == "state" else None
+        return _numbers(name, value, size)
+
+
+def _numbers(name: str, value: np.ndarray, size: int | None) -> Tensor:
+    expected = f"{name}: expected {'' if size is None else f'{size} '}finite numbers in one row"
+    if value.dtype.kind not in "fiu":
+        raise ValueError(f"{expected}, got dtype {value.dtype}")
+    if value.ndim != 1 or size not in (None, len(value)):
+        raise ValueError(f"{expected}, got shape {value.shape}")
+    if not np.isfinite(value).all():
+        raise ValueError(f"{expected}, got {value.tolist()}")
+    return torch.from_numpy(value.astype(np.float32))
+
+
+def _image(name: str, value: np.ndarray, size: tuple[int, int]) -> Tensor:
+    """Return u8 [3, h, w] of an image in that layout or, as cameras give it, in [h, w, 3]."""
+    expected = f"{name}: expected uint8 of shape {(*size, 3)} or {(3, *size)}"
+    if value.dtype != np.uint8:
+        raise ValueError(f"{expected}, got dtype {value.dtype}")
+    if value.shape == (*size, 3):
+        value = value.transpose(2, 0, 1)
+    if value.shape != (3, *size):
+        raise ValueError(f"{expected}, got shape {value.shape}")
+    return torch.from_numpy(value.copy())

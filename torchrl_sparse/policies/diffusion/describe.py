@@ -1,0 +1,44 @@
+"""What a policy is fed with and what it returns, in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def describe(policy: Any) -> str:
+    """Return lines on the observation, with the state's layout and ranges, on the chunk, and on how it was trained.
+
+    A range is what the normaliser maps to [-1, 1], that of the demonstrations.
+
+    Args:
+        policy: a `DiffusionPolicy`, whose method this is.
+
+    >>> from torchrl_sparse import DiffusionPolicy
+    >>> print(DiffusionPolicy.from_pretrained("assets/lift").describe().splitlines()[1])
+      state, 19 numbers: the layout of its task
+    """
+    source, low_high = policy.source, _ranges(policy)
+    names = source.get("state_keys")
+    lines = [
+        f"observes the last {policy.n_obs_steps} of",
+        f"  state, {len(low_high)} numbers: {', '.join(names) if names else 'the layout of its task'}",
+        *(f"    [{i}] {low:.3g} to {high:.3g}" for i, (low, high) in enumerate(low_high)),
+    ]
+    if policy.vision is not None:
+        height, width = policy.vision.image_size
+        lines += [f"  {camera}, uint8 [{height}, {width}, 3]" for camera in policy.vision.cameras]
+    chunk, size = policy.horizon - policy.n_obs_steps + 1, policy.network.output_dim
+    lines.append(f"returns {chunk} actions of {size} numbers, the first for the present step")
+    lines.append(
+        f"in {policy.num_inference_steps} calls of {policy.sampler.name}, {type(policy.plan).__name__}"
+    )
+    lines += [
+        f"{name}: {value}" for name, value in source.items() if name != "state_keys" and value is not None
+    ]
+    return "\n".join(lines)
+
+
+def _ranges(policy: Any) -> list[tuple[float, float]]:
+    scale, offset = policy.normalizer.state_scale, policy.normalizer.state_offset
+    low, high = (-1 - offset) / scale, (1 - offset) / scale
+    return list(zip(low.tolist(), high.tolist(), strict=True))
