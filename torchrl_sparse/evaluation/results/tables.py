@@ -9,7 +9,10 @@ from tabulate import tabulate
 __all__ = ["LEFT", "markdown_table", "select_columns"]
 
 LEFT = frozenset(
-    {"task", "method", "against", "verdict", "time verdict", "latency", "variant", "part of a dense query"}
+    {
+        *("task", "method", "family", "against", "verdict", "time verdict", "budget"),
+        *("latency", "variant", "part of a dense query"),
+    }
 )
 """Columns of words, which are aligned to the left; those of numbers are aligned to the right."""
 
