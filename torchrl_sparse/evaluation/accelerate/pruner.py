@@ -33,6 +33,7 @@ def train_candidate(
     planners: Path,
     *,
     made_for: Mapping[str, Any],
+    n_action_steps: int = 8,
     share: float = 0.05,
 ) -> str:
     """Train the pruner, from where an earlier call was stopped, put it into ``planners``, and return its name there.
@@ -44,6 +45,7 @@ def train_candidate(
         folder: of the checkpoint, the targets and the log.
         planners: where the finished pruner goes.
         made_for: what the targets are of; JSON values.
+        n_action_steps: actions executed of a chunk.
         share: of the demonstrations' windows, see `make_targets`.
 
     Raises:
@@ -53,7 +55,14 @@ def train_candidate(
     path, made_for = folder / "targets.safetensors", {**made_for, "share": share}
     if not path.exists():
         with progress("targets", "window") as show:
-            targets = make_targets(policy, demos, share=share, seed=config.seed, on_progress=show)
+            targets = make_targets(
+                policy,
+                demos,
+                share=share,
+                n_action_steps=n_action_steps,
+                seed=config.seed,
+                on_progress=show,
+            )
         save_targets(path, targets, made_for)
     gates = make_gates(NAME, policy, rate_input=config.rate_range is not None, seed=config.seed)
     trainer = PrunerTrainer(gates, policy, load_targets(path, made_for), config)

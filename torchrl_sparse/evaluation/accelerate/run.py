@@ -143,7 +143,8 @@ def accelerate(
     planners = out / "planners"
     names = _calibrate(policy, targets, grid, planners, made_for, request)
     if pruner is not None:
-        names.append(train_candidate(policy, demos, pruner, out / "training", planners, made_for=made_for))
+        options = {"made_for": made_for, "n_action_steps": request.n_action_steps}
+        names.append(train_candidate(policy, demos, pruner, out / "training", planners, **options))
     methods = make_methods(
         names, policy, num_updates=policy.num_inference_steps, planners=planners, calibration=_no_calibration
     )
