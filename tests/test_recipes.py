@@ -9,13 +9,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.recipe_modules import run
+from tests.recipe_modules import ENVIRONMENT, run
 from torchrl_sparse import DiffusionPolicy, SAGPruner
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results
+from torchrl_sparse.evaluation.results.acceleration import load_acceleration
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
@@ -247,6 +248,46 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         assert iio.imread(work / "sparse" / f"strip_{name}.png").std() > 5
         assert iio.imread(work / "sparse" / f"masks_{name}.png").std() > 5
     assert (work / "sparse" / "rollout_sag@0.5.mp4").exists() or "rendering needs a GL library" in output
+
+
+def test_a_policy_is_accelerated_offline_and_then_played(work, demos, policy, monkeypatch):
+    """The first without a simulator; the second goes on from what the first left."""
+    out = work / "fast"
+    grid = (
+        "samplers=[ddpm4]",
+        "searched=[ddim2]",
+        "cached=[]",
+        "updates=[7]",
+        "intervals=[2]",
+        "strides=[40]",
+    )
+    options = (
+        f"policy={policy}", f"demos={demos}", f"out={out}", "windows=4", "latency_repeats=2", "finalists=1",
+        *(f"candidates.{option}" for option in grid),
+    )  # fmt: skip
+    (work / "blocked").mkdir()
+    (work / "blocked" / "robosuite.py").write_text("raise ImportError('no simulator here')")
+    with monkeypatch.context() as offline:
+        offline.setitem(ENVIRONMENT, "PYTHONPATH", f"{work}/blocked:{Path(__file__).parents[1]}")
+        assert "no episode was played" in run("accelerate_policy", *options, "episodes=0")
+    assert not (out / "episodes").exists()
+    found = load_acceleration(out / "acceleration.json")
+    (searched,) = found.candidates.keys() - {"dense", "ddpm4", "bac7", "uniform2"}
+    assert searched.startswith("ddim_")
+    chosen = DiffusionPolicy.from_pretrained(out / "policy")
+    assert chosen.fingerprint == found.policy
+    timed = (out / "timings.json").read_bytes()
+    output = run("accelerate_policy", *options, "episodes=1", "horizon=9")
+    assert (out / "timings.json").read_bytes() == timed
+    found = load_acceleration(out / "acceleration.json")
+    assert set(found.played) == {"dense", found.chosen}
+    assert "undecided in success" in output
+    assert (
+        out / f"rollout_{found.chosen}.mp4"
+    ).exists() or "no video: rendering needs a GL library" in output
+    assert f"methods=[dense,{found.chosen}] split=test until=decided" in output
+    refused = run("accelerate_policy", *options, "episodes=0", "budget_ms=1e-6", expect=2)
+    assert refused.splitlines()[-1].startswith("budget_ms: expected at least ")
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):

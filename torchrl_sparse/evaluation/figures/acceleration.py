@@ -98,4 +98,8 @@ def _family_legend(axes: Axes, acceleration: Acceleration) -> None:
         for family in FAMILIES
         if family in present
     ]
+    if acceleration.played:
+        ring = {"marker": "o", "linestyle": "", "markersize": 11, "mfc": "none"}
+        handles.append(Line2D([], [], color="#777777", label="played", **ring))
+    handles.append(Line2D([], [], color="#777777", marker="*", linestyle="", markersize=11, label="chosen"))
     axes.legend(handles=handles, loc="best", frameon=False, fontsize=9)
