@@ -253,17 +253,9 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
 def test_a_policy_is_accelerated_offline_and_then_played(work, demos, policy, monkeypatch):
     """The first without a simulator; the second goes on from what the first left."""
     out = work / "fast"
-    grid = (
-        "samplers=[ddpm4]",
-        "searched=[ddim2]",
-        "cached=[]",
-        "updates=[7]",
-        "intervals=[2]",
-        "strides=[40]",
-    )
     options = (
         f"policy={policy}", f"demos={demos}", f"out={out}", "windows=4", "latency_repeats=2", "finalists=1",
-        *(f"candidates.{option}" for option in grid),
+        "candidates={samplers: [ddpm4], searched: [ddim2], cached: [], updates: [7], intervals: [2], strides: [40]}",
     )  # fmt: skip
     (work / "blocked").mkdir()
     (work / "blocked" / "robosuite.py").write_text("raise ImportError('no simulator here')")
@@ -274,20 +266,16 @@ def test_a_policy_is_accelerated_offline_and_then_played(work, demos, policy, mo
     found = load_acceleration(out / "acceleration.json")
     (searched,) = found.candidates.keys() - {"dense", "ddpm4", "bac7", "uniform2"}
     assert searched.startswith("ddim_")
-    chosen = DiffusionPolicy.from_pretrained(out / "policy")
-    assert chosen.fingerprint == found.policy
+    assert DiffusionPolicy.from_pretrained(out / "policy").fingerprint == found.policy
     timed = (out / "timings.json").read_bytes()
     output = run("accelerate_policy", *options, "episodes=1", "horizon=9")
     assert (out / "timings.json").read_bytes() == timed
     found = load_acceleration(out / "acceleration.json")
     assert set(found.played) == {"dense", found.chosen}
     assert "undecided in success" in output
-    assert (
-        out / f"rollout_{found.chosen}.mp4"
-    ).exists() or "no video: rendering needs a GL library" in output
     assert f"methods=[dense,{found.chosen}] split=test until=decided" in output
     refused = run("accelerate_policy", *options, "episodes=0", "budget_ms=1e-6", expect=2)
-    assert refused.splitlines()[-1].startswith("budget_ms: expected at least ")
+    assert "budget_ms: expected at least " in refused
 
 
 def test_unknown_names_are_refused_before_any_work(work, policy):

@@ -71,7 +71,6 @@ def calibrate_candidates(
     *,
     made_for: dict[str, Any],
     n_action_steps: int = 8,
-    on_chain: Callable[[], object] = lambda: None,
 ) -> list[str]:
     """Calibrate all candidates and return the names under which a benchmark finds them, with ``planners=FOLDER``.
 
@@ -84,7 +83,6 @@ def calibrate_candidates(
         folder: of the schedules, and under ``searches`` of the searches for timesteps.
         made_for: what searches depend on beside their own settings; JSON values.
         n_action_steps: actions executed of a chunk.
-        on_chain: called before each chain that a search tries.
 
     Raises:
         ValueError: naming the file, if one in the folder was made for something else; or the grid's field, if a chain in
@@ -92,8 +90,9 @@ def calibrate_candidates(
     """
     _check_fits(policy, grid)
     names = list(grid.samplers)
-    for chain in tqdm(grid.searched, desc=f"{'timesteps':>14}", unit="search"):
-        names.append(_search(policy, targets, chain, grid, folder, made_for, n_action_steps, on_chain))
+    bar = tqdm(grid.searched, desc=f"{'timesteps':>14}", unit="search")
+    for chain in bar:
+        names.append(_search(policy, targets, chain, grid, folder, made_for, n_action_steps, bar.refresh))
     for chain in tqdm([None, *grid.cached], desc=f"{'schedules':>14}", unit="chain"):
         names += _cache_schedules(policy, targets, chain, grid, folder)
     return list(dict.fromkeys(names))

@@ -114,7 +114,7 @@ def accelerate(
         out: folder; what an earlier call of the same policy and demonstrations left there is gone on with.
         request: what is asked for.
         make_env: called as ``make_env(seeds=[...])`` where episodes are asked for, see `diffusion_env`.
-        made_for: names the demonstrations, JSON values; files in ``out`` that were made for others are refused.
+        made_for: names the demonstrations, JSON values; what ``out`` holds of others is refused.
         grid: the candidates.
         pruner: how to train a pruner as a further candidate; None trains nothing.
 
@@ -138,12 +138,16 @@ def accelerate(
     """
     _check_policy(policy)
     made_for = {"policy": policy.fingerprint, **policy.sampler.config, **made_for}
+    made_for |= {"demonstrations": len(demos), "steps": len(demos.data)}
     made_for |= {name: getattr(request, name) for name in ("windows", "seed", "n_action_steps")}
     targets, queries = _from_demonstrations(policy, demos, request)
     planners = out / "planners"
-    names = _calibrate(policy, targets, grid, planners, made_for, request)
+    n_action_steps = request.n_action_steps
+    names = calibrate_candidates(
+        policy, targets, grid, planners, made_for=made_for, n_action_steps=n_action_steps
+    )
     if pruner is not None:
-        options = {"made_for": made_for, "n_action_steps": request.n_action_steps}
+        options = {"made_for": made_for, "n_action_steps": n_action_steps}
         names.append(train_candidate(policy, demos, pruner, out / "training", planners, **options))
     methods = make_methods(
         names, policy, num_updates=policy.num_inference_steps, planners=planners, calibration=_no_calibration
@@ -208,26 +212,6 @@ def _from_demonstrations(
     index = torch.arange(len(spread))[:, None]
     queries.update({keys.EPISODE_SEED: torch.full_like(index, request.seed), keys.EPISODE_STEP: index})
     return targets, queries
-
-
-def _calibrate(
-    policy: DiffusionPolicy,
-    targets: TensorDict,
-    grid: Grid,
-    planners: Path,
-    made_for: dict[str, Any],
-    request: Request,
-) -> list[str]:
-    with tqdm(desc=f"{'chains':>14}", unit="chain", mininterval=1, position=1, leave=False) as bar:
-        return calibrate_candidates(
-            policy,
-            targets,
-            grid,
-            planners,
-            made_for=made_for,
-            n_action_steps=request.n_action_steps,
-            on_chain=bar.update,
-        )
 
 
 def _measure_errors(
