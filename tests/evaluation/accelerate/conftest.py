@@ -11,7 +11,7 @@ def policy(make_network, demos):  # noqa: F811
     """Of a file, so that fp16 changes its weights no more, and with a chain of eight steps."""
     normalizer = Normalizer.fit(demos.data["observation", "state"], demos.data["action"], poses=True)
     network = make_network().half().float()
-    return DiffusionPolicy(network, normalizer, sampler=Sampler("ddpm", 8), engine="torch")
+    return DiffusionPolicy(network, normalizer, sampler=Sampler("ddpm", 8), engine="reference")
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ def test_the_saved_folder_answers_as_the_chosen_method(go, policy, tmp_path, met
             policy.network.pos_emb.mul_(1 + 2**-20)
     found, methods = go()
     save_policy(replace(found, chosen=method), methods[method], tmp_path / "fast", n_action_steps=4)
-    loaded = DiffusionPolicy.from_pretrained(tmp_path / "fast", engine="torch")
+    loaded = DiffusionPolicy.from_pretrained(tmp_path / "fast", engine="reference")
     assert loaded.sampler.config == methods[method].sampler.config
     ours, theirs = methods[method](ask_policy(3)), loaded(ask_policy(3))
     for key in (keys.PRUNE_MASK, keys.CHUNK):

@@ -9,7 +9,7 @@ import torch
 
 from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, episodes_of, fixed_times
 from torchrl_sparse import Uniform
-from torchrl_sparse.evaluation.accelerate import Grid, candidates, run
+from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -42,7 +42,7 @@ def test_every_candidate_is_measured_and_the_most_promising_taken(go, policy, tm
 def test_the_error_of_a_cached_chain_is_that_of_its_mask(go, policy, demos):
     found, methods = go()
     method = methods["uniform6"]
-    targets, _ = run._from_demonstrations(policy, demos, run.Request("lift", n_action_steps=4, windows=12))
+    targets, _ = run._from_demonstrations(policy, demos, Request("lift", n_action_steps=4, windows=12))
     noise = method.sample_noise(targets["diffusion", "seed"].squeeze(-1))
     mask = method.plan.mask(method.plan.spec).expand(len(targets), -1, -1)
     answers = method.denoise(noise, targets["diffusion", "cond"], mask)

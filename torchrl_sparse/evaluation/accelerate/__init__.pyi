@@ -7,7 +7,5 @@ from .deliver import (
     save_policy as save_policy,
     write_acceleration_report as write_acceleration_report,
 )
-from .run import (
-    Request as Request,
-    accelerate as accelerate,
-)
+from .request import Request as Request
+from .run import accelerate as accelerate

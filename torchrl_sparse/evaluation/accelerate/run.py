@@ -15,7 +15,6 @@ Every stage leaves a file, which an interrupted run reads instead of making it a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate.candidates import Grid, calibrate_candidates, family
 from torchrl_sparse.evaluation.accelerate.choice import choose, rank, within_budget
 from torchrl_sparse.evaluation.accelerate.pruner import train_candidate
+from torchrl_sparse.evaluation.accelerate.request import Request
 from torchrl_sparse.evaluation.accelerate.stages import Errors, Timings, read_or_make
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
@@ -50,8 +50,6 @@ from torchrl_sparse.evaluation.results.parts import Percentiles
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
@@ -59,40 +57,7 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import planned_error
 from torchrl_sparse.training.pruner.config import PrunerConfig
 
-__all__ = ["Request", "accelerate"]
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is asked for.
-
-    Attributes:
-        task: a name or alias.
-        budget_ms: milliseconds that 95 % of the queries may take; None asks for the fastest method that is still right.
-        episodes: at most so many of each method, until its verdict is reached; 0 ranks offline and needs no simulator.
-        finalists: methods that are played.
-        margin: of non-inferiority in success, a difference of rates.
-        time_margin: of the mean time to success, a share of dense's.
-        n_action_steps: actions executed of a chunk.
-        windows: of demonstrations, that errors are measured on.
-        seed: of the windows, and of the first episode, see `evaluation_seeds`.
-        repeats: timed queries of each candidate.
-        threads: of the timing.
-        workers: processes that play episodes.
-    """
-
-    task: str
-    budget_ms: float | None = None
-    episodes: int = 0
-    finalists: int = 3
-    margin: float = DEFAULT_MARGIN
-    time_margin: float = DEFAULT_TIME_MARGIN
-    n_action_steps: int = 8
-    windows: int = 200
-    seed: int = 0
-    repeats: int = 30
-    threads: int = 1
-    workers: int = 1
+__all__ = ["accelerate"]
 
 
 def accelerate(
