@@ -8,7 +8,6 @@ spacings do that take no search, among them the rule ``logsnr``.
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -19,12 +18,11 @@ from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
-from torchrl_sparse.training.diffusion.timesteps import demonstration_error, search_timesteps
+from torchrl_sparse.training.diffusion.timesteps import FoundTimesteps, find_timesteps
 
 
 @recipe("calibrate_timesteps")
@@ -38,52 +36,34 @@ def main(config: DictConfig) -> None:
     )
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
-    train_steps = policy.sampler.num_train_timesteps
-
-    def make(**where) -> Sampler:
-        return Sampler(config.kind, num_train_timesteps=train_steps, eta=config.eta, **where)
-
-    starts = {
-        spacing: tuple(
-            make(num_inference_steps=config.num_inference_steps, spacing=spacing).timesteps.tolist()
-        )
-        for spacing in config.spacings
-    }
+    options = {name: config[name] for name in ("eta", "spacings", "strides")}
     with tqdm(desc="chains", unit="chain", mininterval=2) as bar:
-
-        @cache
-        def error(timesteps: tuple[int, ...]) -> float:
-            bar.update()
-            return demonstration_error(
-                policy, targets, make(timesteps=timesteps), n_action_steps=n_action_steps
-            )
-
-        start = min(starts.values(), key=error)
-        best, tried = search_timesteps(error, start, num_train_timesteps=train_steps, strides=config.strides)
-    tried |= {timesteps: error(timesteps) for timesteps in starts.values()}
-    chosen = make(timesteps=best)
-    path = Path(config.out) / f"{chosen.name}.json"
-    write_json(path, report(policy, tried, starts, config))
-    print(f"{path}: {chosen.name}, error {tried[best]:.4f}")
-    for spacing, timesteps in starts.items():
-        print(f"{spacing}: {list(timesteps)}, error {tried[timesteps]:.4f}")
-    print(benchmark_command(config.task, config.policy, config.out, [chosen.name]))
+        found = find_timesteps(
+            policy,
+            targets,
+            config.kind,
+            config.num_inference_steps,
+            **options,
+            n_action_steps=n_action_steps,
+            on_chain=bar.update,
+        )
+    path = Path(config.out) / f"{found.sampler.name}.json"
+    write_json(path, report(policy, found, config))
+    print(f"{path}: {found.sampler.name}, error {found.error:.4f}")
+    for spacing, timesteps in found.spacings.items():
+        print(f"{spacing}: {list(timesteps)}, error {found.tried[timesteps]:.4f}")
+    print(benchmark_command(config.task, config.policy, config.out, [found.sampler.name]))
 
 
-def report(
-    policy: DiffusionPolicy,
-    tried: dict[tuple[int, ...], float],
-    starts: dict[str, tuple[int, ...]],
-    config: DictConfig,
-) -> dict:
+def report(policy: DiffusionPolicy, found: FoundTimesteps, config: DictConfig) -> dict:
     """Return everything that was tried, best first, what the spacings took, and what it was tried with."""
-    ordered = sorted(tried.items(), key=lambda entry: entry[1])
+    ordered = sorted(found.tried.items(), key=lambda entry: entry[1])
     return {
         "policy": policy.fingerprint,
         "settings": OmegaConf.to_container(config, resolve=True),
         "spacings": {
-            spacing: {"timesteps": timesteps, "error": tried[timesteps]}
-            for spacing, timesteps in starts.items()
+            spacing: {"timesteps": timesteps, "error": found.tried[timesteps]}
+            for spacing, timesteps in found.spacings.items()
         },
         "tried": [{"timesteps": timesteps, "error": error} for timesteps, error in ordered],
     }

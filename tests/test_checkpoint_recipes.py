@@ -1,9 +1,14 @@
 """A published checkpoint goes through the recipes as a folder does, and what is made of it lies beside it."""
 
+from pathlib import Path
+
+import h5py
 import pytest
 
-from tests.recipe_modules import run
+from tests.recipe_modules import ENVIRONMENT, run
 from tests.storage.published.checkpoints import LowDimPolicy, write_checkpoint
+from torchrl_sparse import DiffusionPolicy
+from torchrl_sparse.evaluation.results.acceleration import load_acceleration
 
 
 @pytest.fixture(scope="module")
@@ -24,3 +29,36 @@ def test_a_checkpoint_of_another_task_is_refused_with_both_named(checkpoint, tmp
     refused = run("benchmark", "task=can", f"policy={checkpoint}", f"out={tmp_path}/none", expect=2)
     assert "expected one that was trained for PickPlaceCan, got one for lift_lowdim" in refused
     assert not (tmp_path / "none").exists()
+
+
+def robomimic_demos(path):
+    """Collect two, with the hand's rotation under the name that published policies observe."""
+    run("collect_demos", "task=lift", "episodes=2", f"out={path}")
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo.move("obs/robot0_eef_quat_site", "obs/robot0_eef_quat")
+    return path
+
+
+def test_a_checkpoint_is_accelerated_offline_and_then_played(checkpoint, tmp_path, monkeypatch):
+    """The first without a simulator; the second goes on from what the first left."""
+    demos, out = robomimic_demos(tmp_path / "demos.h5"), tmp_path / "fast"
+    options = (
+        f"policy={checkpoint}", f"demos={demos}", f"out={out}", "windows=4", "latency_repeats=2", "finalists=1",
+        "candidates={samplers: [ddpm4], searched: [ddim2], cached: [], updates: [7], intervals: [2], strides: [40]}",
+    )  # fmt: skip
+    (tmp_path / "blocked").mkdir()
+    (tmp_path / "blocked" / "robosuite.py").write_text("raise ImportError('no simulator here')")
+    with monkeypatch.context() as offline:
+        offline.setitem(ENVIRONMENT, "PYTHONPATH", f"{tmp_path}/blocked:{Path(__file__).parents[1]}")
+        assert "no episode was played" in run("accelerate_policy", *options, "episodes=0")
+    assert not (out / "episodes").exists()
+    found = load_acceleration(out / "acceleration.json")
+    (searched,) = found.candidates.keys() - {"dense", "ddpm4", "bac7", "uniform2"}
+    assert searched.startswith("ddim_")
+    assert DiffusionPolicy.from_pretrained(out / "policy").fingerprint == found.policy
+    timed = (out / "timings.json").read_bytes()
+    assert "undecided in success" in run("accelerate_policy", *options, "episodes=1", "horizon=9")
+    assert (out / "timings.json").read_bytes() == timed
+    assert len(load_acceleration(out / "acceleration.json").played) == 2
+    assert "budget_ms: expected" in run("accelerate_policy", *options, "budget_ms=1e-6", expect=2)

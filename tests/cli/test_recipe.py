@@ -124,12 +124,16 @@ main()
 """
 
 
-QUIET = "defaults: [{override hydra/job_logging: disabled}, {override hydra/hydra_logging: disabled}, _self_]\n"
+QUIET = (
+    "defaults: [{override hydra/job_logging: disabled}, {override hydra/hydra_logging: disabled}, _self_]\n"
+)
 
 
 def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
     (tmp_path / "toy.py").write_text(RECIPE)
-    (tmp_path / "toy.yaml").write_text(QUIET + "title: ok\nout: ???\nhydra: {run: {dir: .}, output_subdir: null}\n")
+    (tmp_path / "toy.yaml").write_text(
+        QUIET + "title: ok\nout: ???\nhydra: {run: {dir: .}, output_subdir: null}\n"
+    )
     toy, out = tmp_path / "toy", f"out={tmp_path}/out"
     assert run(toy, out, "title=disk", expect=2) == "results.json: no space left on the volume /data\n"
     assert run(toy, out, "title=worker", expect=2) == "seed: expected 1, got 2\n"

@@ -3,6 +3,7 @@
 ::
 
     torchrl-sparse                                  # the recipes, a line each
+    torchrl-sparse accelerate policy=latest.ckpt task=lift demos=lift.hdf5 budget_ms=5
     torchrl-sparse benchmark task=lift episodes=10  # as python recipes/benchmark.py, with the same options
     torchrl-sparse env                              # versions, engine and machine
 """
@@ -29,6 +30,9 @@ _REPORTED = (
     "numpy",
     "transformers",
 )
+_SHORT = {
+    "accelerate": "accelerate_policy"
+}  # a script of that name would hide the library that diffusers imports
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     >>> main(["nope"])
     2
     """
-    command, *options = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
+    name, *options = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
+    command = _SHORT.get(name, name)
     recipes = {path.stem: path for path in sorted(_recipes().glob("*.py"))}
     if command in ("--help", "-h"):
         print("torchrl-sparse env, or a recipe; torchrl-sparse RECIPE --help shows its options\n")

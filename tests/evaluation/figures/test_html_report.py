@@ -106,5 +106,7 @@ def test_pictures_belong_to_the_nearest_run(runs, tmp_path):
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"expected results.json or realtime.json"):
+    with pytest.raises(
+        FileNotFoundError, match=r"expected acceleration.json or results.json or realtime.json"
+    ):
         find_runs(tmp_path)

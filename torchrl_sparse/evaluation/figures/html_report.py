@@ -1,4 +1,4 @@
-"""Any set of ``results.json`` and ``realtime.json`` as one HTML page that needs nothing else.
+"""Any set of ``results.json``, ``realtime.json`` and ``acceleration.json`` as one HTML page that needs nothing else.
 
 Tables and figures are made from the files alone; pictures and videos that lie beside them are embedded as data URIs. A
 content security policy forbids the page every request, and the template escapes everything that was read from a file.
@@ -13,9 +13,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchrl_sparse.evaluation.figures.acceleration import plot_acceleration
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
+from torchrl_sparse.evaluation.results.acceleration import (
+    Acceleration,
+    acceleration_note,
+    acceleration_rows,
+    load_acceleration,
+)
 from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, realtime_note, realtime_rows
 from torchrl_sparse.evaluation.results.report import results_note, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, Results, load_results
@@ -36,13 +43,18 @@ def _plots_of_realtime(results: Realtime) -> dict[str, Callable[..., Path]]:
     return {"success against latency": plot_realtime}
 
 
+def _plots_of_acceleration(results: Acceleration) -> dict[str, Callable[..., Path]]:
+    return {"error to demonstrations against latency": plot_acceleration}
+
+
 _KINDS = {  # by the beginning of a file's name: results.json, results_400.json
+    "acceleration": (load_acceleration, acceleration_rows, acceleration_note, _plots_of_acceleration),
     "results": (load_results, results_rows, results_note, _plots_of_results),
     "realtime": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
 }
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 # From the numbers, instead of a file that may be older than they are.
-_DRAWN_HERE = ("pareto.png", "realtime.png", "success_within.png")
+_DRAWN_HERE = ("acceleration.png", "pareto.png", "realtime.png", "success_within.png")
 _TEMPLATE = "report.html.jinja"
 
 
@@ -92,7 +104,7 @@ def _kind(file: Path) -> str:
 
 
 def find_runs(root: str | os.PathLike) -> list[Path]:
-    """Return every ``results.json``, ``results_*.json``, ``realtime.json`` and ``realtime_*.json`` below a folder, sorted.
+    """Return the files below a folder that the page can show, sorted.
 
     Raises:
         FileNotFoundError: if there is none.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_pareto"]
+__all__ = ["plain_log_ticks", "plot_pareto"]
 
 _FRONT_COLOR = "#B5B5BA"
 _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
@@ -110,10 +110,18 @@ def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntr
 
 
 def _plain_log_axis(axes: Axes, low: float, high: float) -> None:
-    """Put ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, in plain numbers."""
+    axes.set_xticks(*plain_log_ticks(low, high))
+    axes.minorticks_off()
+
+
+def plain_log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
+    """Return ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, and their plain numbers.
+
+    >>> plain_log_ticks(8, 30)
+    ([10.0, 15.0, 20.0, 30.0], ['10', '15', '20', '30'])
+    """
     for multiples in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
         ticks = [m * 10.0**e for e in range(-6, 7) for m in multiples if low <= m * 10.0**e <= high]
         if len(ticks) >= 3:
             break
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.minorticks_off()
+    return sorted(ticks), [f"{tick:g}" for tick in sorted(ticks)]

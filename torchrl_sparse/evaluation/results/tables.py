@@ -10,15 +10,8 @@ __all__ = ["LEFT", "markdown_table", "select_columns"]
 
 LEFT = frozenset(
     {
-        "task",
-        "method",
-        "against",
-        "verdict",
-        "time verdict",
-        "latency",
-        "variant",
-        "part of a dense query",
-        "at 20 times dense's speed",
+        *("task", "method", "family", "against", "verdict", "time verdict", "budget"),
+        *("latency", "variant", "part of a dense query", "at 20 times dense's speed"),
     }
 )
 """Columns of words, which are aligned to the left; those of numbers are aligned to the right."""

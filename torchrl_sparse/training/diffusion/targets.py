@@ -22,7 +22,15 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, parse_json
 
-__all__ = ["ANSWER_BATCH", "add_queries", "dense_answers", "load_targets", "make_targets", "save_targets"]
+__all__ = [
+    "ANSWER_BATCH",
+    "add_queries",
+    "dense_answers",
+    "load_targets",
+    "make_targets",
+    "planned_answers",
+    "save_targets",
+]
 
 ANSWER_BATCH = 16  # queries that the policy answers at a time
 
@@ -123,9 +131,21 @@ def dense_answers(
     """
     answers: list[Tensor] = []
     for part in queries.split(ANSWER_BATCH):
-        answers.append(policy.denoise(policy.sample_noise(part[keys.SEED].squeeze(-1)), part[keys.COND]))
+        answers.append(_answer(policy, part, None))
         on_progress(sum(map(len, answers)), len(queries))
     return torch.cat(answers)
+
+
+@torch.no_grad()
+def planned_answers(policy: DiffusionPolicy, queries: TensorDictBase) -> Tensor:
+    """Return the policy's actions under its planner, normalised, f32 [N, H, A]; arguments as of `dense_answers`."""
+    parts = queries.select(keys.COND, keys.SEED).split(ANSWER_BATCH)
+    return torch.cat([_answer(policy, part, policy.plan(part)[keys.PRUNE_MASK]) for part in parts])
+
+
+def _answer(policy: DiffusionPolicy, queries: TensorDictBase, mask: Tensor | None) -> Tensor:
+    noise = policy.sample_noise(queries[keys.SEED].squeeze(-1))
+    return policy.denoise(noise, queries[keys.COND], mask, reuse=policy.plan.reuse)
 
 
 def save_targets(path: str | Path, targets: TensorDict, made_for: Mapping[str, Any]) -> None:

@@ -14,14 +14,17 @@ the last word.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 
 from tensordict import TensorDict
+from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler, timesteps_fall
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.targets import dense_answers
+from torchrl_sparse.training.diffusion.targets import dense_answers, planned_answers
 
-__all__ = ["demonstration_error", "search_timesteps"]
+__all__ = ["FoundTimesteps", "demonstration_error", "find_timesteps", "planned_error", "search_timesteps"]
 
 
 def search_timesteps(
@@ -85,9 +88,83 @@ def demonstration_error(
         sampler=sampler,
         engine=policy.engine,
     )
+    return _executed_error(policy, dense_answers(chain, targets), targets, n_action_steps)
+
+
+def planned_error(policy: DiffusionPolicy, targets: TensorDict, *, n_action_steps: int = 8) -> float:
+    """Return the same error of a policy under its own sampler and planner; arguments as of `demonstration_error`."""
+    return _executed_error(policy, planned_answers(policy, targets), targets, n_action_steps)
+
+
+@dataclass(frozen=True)
+class FoundTimesteps:
+    """What `find_timesteps` found.
+
+    Attributes:
+        sampler: the chain of least error.
+        error: its error.
+        spacings: spacing -> the timesteps that it takes.
+        tried: timesteps -> error, of all chains that were tried, those of the spacings among them.
+    """
+
+    sampler: Sampler
+    error: float
+    spacings: dict[str, tuple[int, ...]]
+    tried: dict[tuple[int, ...], float]
+
+
+def find_timesteps(
+    policy: DiffusionPolicy,
+    targets: TensorDict,
+    kind: str,
+    num_inference_steps: int,
+    *,
+    eta: float = 0.0,
+    spacings: Sequence[str] = ("leading", "logsnr"),
+    strides: Sequence[int] = (10, 5, 2),
+    n_action_steps: int = 8,
+    on_chain: Callable[[], object] = lambda: None,
+) -> FoundTimesteps:
+    """Search the timesteps of a chain that come closest to demonstrations, from the best of the spacings on.
+
+    Args:
+        policy: the trained policy; its own sampler and planner do not matter.
+        targets: [N], from data, see `torchrl_sparse.training.diffusion.targets.make_targets`.
+        kind, num_inference_steps, eta: of the sampler.
+        spacings: compared with the search, which begins at the best of them.
+        strides: see `search_timesteps`.
+        n_action_steps: actions executed of a chunk.
+        on_chain: called before each chain that is tried.
+
+    Raises:
+        ValueError: if there is no such sampler.
+    """
+    train_steps = policy.sampler.num_train_timesteps
+
+    def chain(**where) -> Sampler:
+        return Sampler(kind, num_train_timesteps=train_steps, eta=eta, **where)
+
+    @cache
+    def error(timesteps: tuple[int, ...]) -> float:
+        on_chain()
+        return demonstration_error(policy, targets, chain(timesteps=timesteps), n_action_steps=n_action_steps)
+
+    starts = {
+        spacing: tuple(chain(num_inference_steps=num_inference_steps, spacing=spacing).timesteps.tolist())
+        for spacing in spacings
+    }
+    start = min(starts.values(), key=error)
+    best, tried = search_timesteps(error, start, num_train_timesteps=train_steps, strides=strides)
+    tried |= {timesteps: error(timesteps) for timesteps in starts.values()}
+    return FoundTimesteps(chain(timesteps=best), tried[best], starts, tried)
+
+
+def _executed_error(
+    policy: DiffusionPolicy, answers: Tensor, targets: TensorDict, n_action_steps: int
+) -> float:
     first = policy.n_obs_steps - 1
     executed = slice(first, first + n_action_steps)
-    return (dense_answers(chain, targets) - targets["target"])[:, executed].abs().mean().item()
+    return (answers - targets["target"])[:, executed].abs().mean().item()
 
 
 def _moves(timesteps: tuple[int, ...], stride: int) -> list[tuple[int, ...]]:

@@ -1,0 +1,89 @@
+"""What the stages of an acceleration leave behind, so that one that was killed goes on where it was.
+
+Each file says what it was made for; under other settings it is refused, or made anew where that costs little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypeVar
+
+from torchrl_sparse.evaluation.latency.measure import Latency, Machine
+from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
+
+__all__ = ["Errors", "Search", "Timings", "read_or_make"]
+
+
+class _Stage(Protocol):
+    made_for: dict[str, Any]
+
+
+S = TypeVar("S", bound=_Stage)
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search for timesteps: the method of least error, its error, and how many chains were tried."""
+
+    format: Literal["torchrl_sparse.search/1"]
+    made_for: dict[str, Any]
+    method: str
+    error: float
+    tried: int
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of methods to demonstrations."""
+
+    format: Literal["torchrl_sparse.errors/1"]
+    made_for: dict[str, Any]
+    errors: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Latencies of methods, measured together, and where."""
+
+    format: Literal["torchrl_sparse.timings/1"]
+    made_for: dict[str, Any]
+    machine: Machine
+    timings: dict[str, Latency]
+
+
+def read_or_make(
+    path: Path, kind: type[S], made_for: Mapping[str, Any], make: Callable[[], S], *, anew: bool = False
+) -> S:
+    """Return what the file holds or, where there is none, make and write it.
+
+    Args:
+        path: of the JSON file.
+        kind: dataclass of its content.
+        made_for: what the content depends on; JSON values.
+        make: called at most once.
+        anew: whether to make again, instead of refusing, what was made for something else.
+
+    Raises:
+        ValueError: naming the file, if it is malformed, or was made for something else.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "errors.json"
+        >>> errors = Errors("torchrl_sparse.errors/1", {"seed": 1}, {"dense": 0.5})
+        >>> read_or_make(path, Errors, {"seed": 1}, lambda: errors) == read_or_make(path, Errors, {"seed": 1}, None)
+        True
+    """
+    if path.exists():
+        found = read_json(path, kind)
+        differing = describe_differences(found.made_for, to_plain(made_for))
+        if not differing:
+            return found
+        if not anew:
+            raise ValueError(
+                f"{path}: made with other settings: {differing}; choose another out or move it away"
+            )
+    made = make()
+    write_json(path, made)
+    return made

@@ -1,0 +1,205 @@
+"""``acceleration.json``: every way to run one policy faster, measured, and the one that was chosen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from torchrl_sparse.evaluation.latency.measure import Machine
+from torchrl_sparse.evaluation.results.parts import Difference, Percentiles, Success, TimeDifference, require
+from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry
+from torchrl_sparse.evaluation.results.text import (
+    count_text,
+    difference_text,
+    milliseconds_text,
+    ratio_text,
+    threads_text,
+    verdict_text,
+)
+from torchrl_sparse.storage.json import read_json, write_json
+
+__all__ = [
+    "FAMILIES",
+    "Acceleration",
+    "Candidate",
+    "Family",
+    "Played",
+    "acceleration_note",
+    "acceleration_rows",
+    "load_acceleration",
+    "save_acceleration",
+    "verdict_line",
+]
+
+Family = Literal["stochastic", "cached", "deterministic", "pruner"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to run the policy, measured without a simulator.
+
+    Attributes:
+        family: a chain that draws noise in its steps ("stochastic"), one that does not ("deterministic"), a "cached" schedule
+            over a chain, or a learned "pruner".
+        error: mean absolute difference of executed actions to demonstrated ones, normalised.
+        latency_s: of a query, interleaved with all others.
+    """
+
+    family: Family
+    error: float
+    latency_s: Percentiles
+
+    def __post_init__(self) -> None:
+        require(self.error >= 0, "error", "0 or more", self.error)
+
+
+@dataclass(frozen=True)
+class Played:
+    """What episodes said of one method, beside dense on the same seeds; see `MethodEntry`."""
+
+    success: Success
+    paired_vs_dense: Difference
+    time_vs_dense: TimeDifference
+
+    @classmethod
+    def of(cls, entry: MethodEntry) -> Played:
+        """Take it from a benchmark's entry."""
+        return cls(entry.success, entry.paired_vs_dense, entry.time_vs_dense)
+
+    @property
+    def is_right(self) -> bool:
+        """Whether it is non-inferior to dense in success and in time."""
+        return self.paired_vs_dense.verdict == self.time_vs_dense.verdict == "non-inferior"
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """The content of an ``acceleration.json``.
+
+    Attributes:
+        task: name of the task.
+        policy: fingerprint of the policy.
+        windows: of demonstrations, that errors were measured on.
+        machine: of the latencies.
+        candidates: method -> what was measured; the dense policy, which nothing is discarded against, among them.
+        ranking: methods within the budget, the most promising first.
+        chosen: the method that the saved policy runs.
+        played: method -> what episodes said; empty where none were played.
+        budget_ms: of the 95th percentile of a query's latency; None for "faster than dense".
+    """
+
+    acceleration: Literal[1]
+    task: str
+    policy: str
+    windows: int
+    machine: Machine
+    candidates: dict[str, Candidate]
+    ranking: list[str]
+    chosen: str
+    played: dict[str, Played]
+    budget_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        require(DENSE in self.candidates, "candidates", f"the key {DENSE!r}", sorted(self.candidates))
+        for name in self.ranking:
+            require(name in self.candidates, "ranking", "candidates", name)
+        require(self.chosen in self.ranking, "chosen", "one of the ranking", self.chosen)
+        for name in self.played:
+            require(name in {DENSE, *self.ranking}, "played", "methods of the ranking", name)
+
+    def speedup(self, name: str) -> float:
+        """Return the ratio of dense's median latency to that of a method."""
+        return self.candidates[DENSE].latency_s.p50 / self.candidates[name].latency_s.p50
+
+
+def load_acceleration(path: str | os.PathLike) -> Acceleration:
+    """Read an ``acceleration.json``.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: naming file and key, if it is of another kind or does not agree with itself.
+    """
+    return read_json(path, Acceleration)
+
+
+def save_acceleration(acceleration: Acceleration, path: str | os.PathLike) -> Path:
+    """Write an ``acceleration.json`` in one piece or not at all; return the path."""
+    return write_json(path, acceleration)
+
+
+def acceleration_rows(acceleration: Acceleration) -> list[dict[str, str]]:
+    """Return the rows of its table: the dense policy, the ranking in order, and what is over the budget."""
+    ranking = acceleration.ranking
+    over = [name for name in acceleration.candidates if name not in {DENSE, *ranking}]
+    over.sort(key=lambda name: acceleration.candidates[name].latency_s.p95)
+    return [_row(acceleration, name) for name in [DENSE, *ranking, *over]]
+
+
+def acceleration_note(acceleration: Acceleration) -> str:
+    """Return the lines that explain the table."""
+    machine, budget = acceleration.machine, acceleration.budget_ms
+    allowed, first = (
+        "faster than dense",
+        "the fastest that is no farther from demonstrations than dense, else the nearest",
+    )
+    if budget is not None:
+        allowed, first = f"within {budget:g} ms in 95 % of the queries", "the one of least error"
+    return (
+        f"{verdict_line(acceleration)} {acceleration.task}: {len(acceleration.candidates) - 1} candidates, of which "
+        f"{len(acceleration.ranking)} are {allowed}, in the order in which they would be played: of every family in turn "
+        f"{first}. Error: of executed actions to those of {acceleration.windows} windows of demonstrations, normalised; "
+        "whether it predicts success is to be measured, so episodes have the last word. Latency of a query, all candidates "
+        f"interleaved in one process, on {machine.cpu}, {threads_text(machine.threads)}, PyTorch {machine.torch}, "
+        f"{machine.date}."
+    )
+
+
+def verdict_line(acceleration: Acceleration) -> str:
+    """Say in a sentence or two what was chosen and how sure that is."""
+    name, played = acceleration.chosen, acceleration.played
+    latency = acceleration.candidates[name].latency_s
+    chosen = (
+        f"{name}: {milliseconds_text(latency.p50)} ms a query (95th percentile {milliseconds_text(latency.p95)} ms), "
+        f"{acceleration.speedup(name):.1f} times as fast as dense."
+    )
+    if name not in played:
+        return f"{chosen} Chosen offline, by the error to demonstrations alone: no episode was played."
+    ours, dense = played[name], played[DENSE]
+    counts = f"It solved {count_text(ours.success)}, dense {count_text(dense.success)}"
+    if ours.is_right:
+        return f"{chosen} {counts}: non-inferior to dense in success and in time."
+    found = f"{ours.paired_vs_dense.verdict} in success, {ours.time_vs_dense.verdict} in time"
+    return f"{chosen} {counts}: {found}. No method played is shown to be as good as dense; this one comes nearest."
+
+
+def _row(acceleration: Acceleration, name: str) -> dict[str, str]:
+    candidate, played = acceleration.candidates[name], acceleration.played.get(name)
+    return {
+        "method": f"{name} (chosen)" if name == acceleration.chosen else name,
+        "family": "baseline" if name == DENSE else candidate.family,
+        "error": f"{candidate.error:.4f}",
+        "p50, ms": milliseconds_text(candidate.latency_s.p50),
+        "p95, ms": milliseconds_text(candidate.latency_s.p95),
+        "speed-up": f"{acceleration.speedup(name):.2f}×",
+        "budget": "" if name == DENSE else "within" if name in acceleration.ranking else "over",
+        **(_episode_cells(name, played) if acceleration.played else {}),
+    }
+
+
+def _episode_cells(name: str, played: Played | None) -> Mapping[str, str]:
+    cells = dict.fromkeys(("success", "vs dense, points", "verdict", "time vs dense", "time verdict"), "")
+    if played is None:
+        return cells
+    cells["success"] = count_text(played.success)
+    if name == DENSE:
+        return cells
+    return cells | {
+        "vs dense, points": difference_text(played.paired_vs_dense),
+        "verdict": verdict_text(played.paired_vs_dense),
+        "time vs dense": ratio_text(played.time_vs_dense),
+        "time verdict": verdict_text(played.time_vs_dense),
+    }
