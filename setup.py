@@ -4,11 +4,16 @@ The extension is optional: without a C++ compiler the package installs all the s
 plain shared library without Python's or PyTorch's headers. Instruction sets are chosen at run time, so there is no -march.
 """
 
+from pathlib import Path
+
 from setuptools import Extension, setup
+
+FOLDER = Path("torchrl_sparse/blocks/engine/native")
 
 NATIVE = Extension(
     "torchrl_sparse.blocks.engine.native._native",
-    sources=["torchrl_sparse/blocks/engine/native/native.cpp"],
+    sources=[str(FOLDER / "native.cpp")],
+    depends=[str(header) for header in sorted(FOLDER.glob("*.h"))],
     # A product may be fused with a sum; nothing else that changes results is allowed.
     extra_compile_args=[
         "-g0",
@@ -17,7 +22,9 @@ NATIVE = Extension(
         "-ffp-contract=fast",
         "-fno-math-errno",
         "-fvisibility=default",
+        "-pthread",
     ],
+    extra_link_args=["-pthread"],
     optional=True,
 )
 

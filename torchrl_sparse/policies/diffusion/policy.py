@@ -203,7 +203,7 @@ class DiffusionPolicy(TensorDictSequential):
         self.module["denoise"].engine = EngineSlot(name)
 
     def engine_info(self) -> str:
-        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
+        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``; where
         ``"auto"`` had to do without the native one, also why.
 
         Raises:

@@ -9,7 +9,7 @@ what it returns is packed here:
 * An observation's embedding and the first layer of its encoder are one matrix.
 * Position embeddings are biases of the layers before them, one row for each token.
 
-Heads are padded to multiples of 16, rows to whole panels. ``native.cpp`` declares the same structures.
+Heads are padded to multiples of 16, rows to whole panels. ``denoise.h`` declares the same structures.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class _Layer(ctypes.Structure):
 
 
 class Model(ctypes.Structure):
-    """``struct Model`` of native.cpp."""
+    """``struct Model`` of denoise.h."""
 
     _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps"]
     _fields_ = [
@@ -71,7 +71,7 @@ class PackedNetwork:
             :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`.
 
     Attributes:
-        model: the structure that native.cpp reads.
+        model: the structure that denoise.h reads.
 
     Raises:
         ValueError: naming a weight that has another shape than the network was made with.
