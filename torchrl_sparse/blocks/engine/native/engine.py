@@ -1,8 +1,8 @@
 """The native engine: one call of compiled code for each action chunk, on the CPU.
 
 ``denoise.h`` holds the loop and ``team.h`` the threads, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the
-weights and tables that they read, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads the mask as it goes: unlike
-the PyTorch engine's, its program is the mask.
+weights and tables that they read, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads
+the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 """
 
 from __future__ import annotations
