@@ -22,13 +22,13 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.blocks.saved import load_planner, save_beside
-from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -121,6 +121,10 @@ class DiffusionPolicy(TensorDictSequential):
             self._install(value, self.sampler)
         elif name == "sampler":
             self._install(self.plan, value)
+        elif name == "noise":
+            if value not in NOISES:
+                raise ValueError(f"noise: expected one of {list(NOISES)}, got {value!r}")
+            self.module["denoise"].noise = value
         else:
             super().__setattr__(name, value)
 
@@ -144,6 +148,7 @@ class DiffusionPolicy(TensorDictSequential):
         policy = DiffusionPolicy(self.network, self.normalizer, sampler=sampler, plan=plan, **shared)
         policy.source = self.source
         policy.module["encode"].noise_stream = self.noise_stream
+        policy.noise = self.noise
         return policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
@@ -160,6 +165,14 @@ class DiffusionPolicy(TensorDictSequential):
     def noise_stream(self) -> int:
         """Which of the noises that an episode could have had it draws; see `with_noise`."""
         return self.module["encode"].noise_stream
+
+    @property
+    def noise(self) -> str:
+        """What a seed stands for: ``"torch"``, the noise of PyTorch's generator, with which everything here was measured, or
+        ``"philox"``, that of `torchrl_sparse.networks.diffusion.philox`, which exported policies draw too. Assign the other to
+        change it.
+        """
+        return self.module["denoise"].noise
 
     # -- numbers about it ----------------------------------------------------------------------------------------------
 
@@ -230,7 +243,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
-        return sample_noise(seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
+        return NOISES[self.noise](seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, *, reuse: Reuse = "block"
@@ -259,6 +272,32 @@ class DiffusionPolicy(TensorDictSequential):
         plan = save_beside(self.plan, Path(path))
         stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
         write_pretrained(Path(path), stored, half=half)
+
+    def export(self, path: str | Path, *, weights: str = "float32") -> None:
+        """Write one file that a robot runs without Python or PyTorch, through the C interface of
+        ``torchrl_sparse/blocks/engine/native/tsp.h``: network, normaliser, sampler and planner.
+
+        It answers as this policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
+
+        Args:
+            path: of the file, e.g. ``"lift.tsp"``.
+            weights: see `torchrl_sparse.blocks.engine.NativeEngine`.
+
+        Raises:
+            ValueError: naming what cannot be exported: cameras, a network that the native engine does not run, or a planner of
+                one's own that looks at the observation.
+
+        Examples:
+            >>> import tempfile
+            >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+            >>> policy.sampler = Sampler("ddim", timesteps=[87, 20])
+            >>> policy.export(Path(tempfile.mkdtemp()) / "lift.tsp")
+        """
+        if self.vision is not None:
+            raise ValueError(f"export: expected a policy of states, got cameras {list(self.vision.cameras)}")
+        facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
+        parts = self.network, self.normalizer, self.sampler, self.plan
+        export_policy(Path(path), *parts, weights=weights, facts=facts)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:

@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.engine.native.library import (
     library,
     native_available,
 )
-from torchrl_sparse.blocks.engine.native.packing import PackedNetwork
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
@@ -37,7 +37,6 @@ __all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
 
 MAX_THREADS = 64  # of a team, see team.h
 
-_WEIGHTS = ("float32", "float16", "bfloat16")
 _MAX_OBS_STEPS = 63
 
 
@@ -136,11 +135,10 @@ class NativeEngine:
         supported, reason = native_supports(network)
         if not supported:
             raise ValueError(f"native engine: {reason}")
-        if weights not in _WEIGHTS:
-            raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {weights!r}")
         if threads is not None:
             check_size("threads", threads, MAX_THREADS)
         self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
+        self._dtype = weight_type(weights)
         self._level = instruction_level(instruction_set)
         self._dense = torch.zeros(
             sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
@@ -236,7 +234,7 @@ class NativeEngine:
         version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
         if known != version:
-            packed = PackedNetwork(self._network, self._sampler, getattr(torch, self._weights))
+            packed = PackedNetwork(self._network, self._sampler, self._dtype)
             self._packed = (version, packed)
         return packed
 

@@ -35,7 +35,9 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.tensors import check_shapes
 
-__all__ = ["Model", "PackedNetwork"]
+__all__ = ["Model", "PackedNetwork", "weight_type"]
+
+_WEIGHTS = ("float32", "float16", "bfloat16")
 
 _HEAD = 16  # heads are padded to whole vectors
 
@@ -174,6 +176,13 @@ class PackedNetwork:
 
     def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
         return self._arena.matrix(weight, bias, self._weights)
+
+
+def weight_type(name: str) -> torch.dtype:
+    """Return the type of weights of that name, or raise ValueError if there is none."""
+    if name not in _WEIGHTS:
+        raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
+    return getattr(torch, name)
 
 
 def _parts(tensor: Tensor) -> Tensor:

@@ -65,6 +65,10 @@ class NativePruner:
         weights: with at most `MAX_HIDDEN` hidden activations; they are copied. The compiled library has to be there.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
 
+    Attributes:
+        packed: the structure that denoise.h reads.
+        hidden: activations of its hidden layers.
+
     Raises:
         ValueError: if this CPU does not have the instruction set.
 
@@ -80,7 +84,8 @@ class NativePruner:
         self._level = instruction_level(instruction_set)
         self._arena = Arena()
         with torch.no_grad():
-            self._pruner = self._pack(weights)
+            self.packed = self._pack(weights)
+        self.hidden = len(weights.last[0][0])
         self._features = weights.obs[0].shape[1]
         self._shape = weights.cells.shape[:2]
 
@@ -129,4 +134,4 @@ class NativePruner:
             )
         features = features.contiguous()
         where = self._level, torch.get_num_threads()
-        library().sparse_prune(*where, byref(self._pruner), len(features), features.data_ptr(), logits, masks)
+        library().sparse_prune(*where, byref(self.packed), len(features), features.data_ptr(), logits, masks)
