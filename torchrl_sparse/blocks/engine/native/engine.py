@@ -31,6 +31,7 @@ from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
@@ -184,6 +185,41 @@ class NativeEngine:
             where = self._level, threads, byref(packed.model)
             library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
+
+    def answer(
+        self, noise: Tensor, state: Tensor, normalizer: Normalizer, mask: Tensor, reuse: Reuse = "block"
+    ) -> tuple[Tensor, Tensor] | None:
+        """Return condition f32 [B, To, D] and chunk f32 [B, H - To + 1, A] of states, both as PyTorch rounds them, in one call.
+
+        Args:
+            noise: f32 [B, K, H, A].
+            state: f32 [B, To, D] in the units of the environment.
+            normalizer: with f32 buffers on the CPU.
+            mask: bool [K, 3L], valid, of every row.
+            reuse: see :meth:`denoise`.
+
+        Returns:
+            None if a state is not finite.
+        """
+        packed, rows = self._current(), len(state)
+        packed.check(noise=noise, cond=state)
+        threads, horizon, past = self._num_threads(rows), noise.shape[2], state.shape[1] - 1
+        cond, actions = torch.empty_like(state), noise.new_empty(rows, *noise.shape[2:])
+        chunk = noise.new_empty(rows, horizon - past, noise.shape[3])
+        slots = num_buffers(reuse, self._dense.shape[1])
+        vectors = (
+            normalizer.state_scale,
+            normalizer.state_offset,
+            normalizer.action_scale,
+            normalizer.action_offset,
+        )
+        units = (c_void_p * 4)(*(vector.data_ptr() for vector in vectors))
+        tensors = (tensor.data_ptr() for tensor in (state, cond, actions, chunk))
+        with self._scratch(packed, threads) as scratch:
+            where = self._level, threads, byref(packed.model)
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), units, *tensors
+            finite = library().sparse_answer(*where, *query, scratch.data_ptr())
+        return (cond, chunk) if finite else None
 
     def _num_threads(self, rows: int) -> int:
         """Return how many threads a batch of ``rows`` uses; more than there are panels in the narrowest product would wait."""

@@ -6,6 +6,7 @@
 
 #include "denoise.h"
 #include "team.h"
+#include "units.h"
 
 namespace {
 
@@ -15,14 +16,15 @@ struct Batch {
     const Model& m;
     const int32_t rows, slots;
     const uint8_t* const pruned;
+    const size_t mask;  // from a row's to the next; 0 if all have the same
     const float *const noise, *const cond;
     float *const actions, *const scratch;
-    const size_t piece;
+    const size_t piece = Buffers(m, slots, nullptr, nullptr).size;
     std::atomic<int32_t> next{0};
 
     void query(const Member& who, ptrdiff_t row, float* own, float* shared) const {
         const ptrdiff_t chunk = (ptrdiff_t)m.horizon * m.action_dim;
-        level.denoise(m, who, pruned + row * m.steps * 3 * m.layers, slots, noise + row * m.steps * chunk,
+        level.denoise(m, who, pruned + row * mask, slots, noise + row * m.steps * chunk,
                       cond + row * m.obs_steps * m.cond_dim, actions + row * chunk, own, shared);
     }
 
@@ -59,10 +61,24 @@ int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(
 // [horizon][action_dim]. The latest outputs are kept in `slots` places: one for each block, 3 (one for each type), or 1.
 void sparse_denoise(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
                     const float* noise, const float* cond, float* actions, float* scratch) {
-    const size_t piece = Buffers(*m, slots, nullptr, nullptr).size;
-    Batch batch{LEVELS[level], *m, n, slots, pruned, noise, cond, actions, scratch, piece};
+    Batch batch{LEVELS[level], *m, n, slots, pruned, (size_t)m->steps * 3 * m->layers, noise, cond, actions, scratch};
     auto task = [&](const Member& who) { batch.work(who); };
     run(threads, task);
+}
+
+// The same from states to chunks [horizon - obs_steps + 1][action_dim] in the units of the environment, with one mask for all
+// rows; cond and actions are written too. Returns 0, and nothing else happens, if a state is not finite.
+int32_t sparse_answer(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
+                      const float* noise, const Units* units, const float* states, float* cond, float* actions, float* chunks,
+                      float* scratch) {
+    if (!normalise(*units, states, (size_t)n * m->obs_steps, m->cond_dim, cond)) return 0;
+    Batch batch{LEVELS[level], *m, n, slots, pruned, 0, noise, cond, actions, scratch};
+    auto task = [&](const Member& who) { batch.work(who); };
+    run(threads, task);
+    const size_t past = m->obs_steps - 1, steps = m->horizon - past, dim = m->action_dim;
+    for (size_t row = 0; row < (size_t)n; row++)
+        unnormalise(*units, actions + (row * m->horizon + past) * dim, steps, dim, chunks + row * steps * dim);
+    return 1;
 }
 
 // To be timed by the caller: runs the blocks of `kind` (0 SA, 1 CA, 2 FFN) of all layers.
@@ -74,6 +90,7 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
 
 // What lies at n places.
 void sparse_gather(int32_t n, const float* const* places, float* values) {
+    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);  // none is in a cache, and they are nowhere near each other
     for (int32_t i = 0; i < n; i++) values[i] = *places[i];
 }
 

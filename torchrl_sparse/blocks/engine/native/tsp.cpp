@@ -13,6 +13,7 @@
 
 #include "denoise.h"
 #include "philox.h"
+#include "units.h"
 
 namespace {
 
@@ -67,7 +68,7 @@ struct tsp_policy {
     Matrix* folds;
     uint8_t* mask;
     const char* description;
-    const float *state_scale, *state_offset, *action_scale, *action_offset;
+    Units units;
     float *scratch, *noise, *features, *actions, *logits;
     int32_t* order;
     char* text;  // ends with a zero, which the file's need not
@@ -161,10 +162,10 @@ class Reader {
         m.layer = p_.layers;
         at_ = lines(sizeof(Header));
         p_.description = take<char>(h.description);
-        p_.state_scale = take<float>(h.cond_dim);
-        p_.state_offset = take<float>(h.cond_dim);
-        p_.action_scale = take<float>(h.action_dim);
-        p_.action_offset = take<float>(h.action_dim);
+        p_.units.state_scale = take<float>(h.cond_dim);
+        p_.units.state_offset = take<float>(h.cond_dim);
+        p_.units.action_scale = take<float>(h.action_dim);
+        p_.units.action_offset = take<float>(h.action_dim);
         m.embed = matrix(h.action_dim, h.width, F32, h.horizon);
         m.head = matrix(h.width, h.action_dim, F32);
         m.encode_up = matrix(h.cond_dim, 4 * h.width, F32, h.obs_steps);
@@ -295,8 +296,6 @@ void decide(tsp_policy& p) {
     for (int32_t i = pruner.first; i < p.cells; i++) p.mask[i] = p.logits[i] > threshold;
 }
 
-bool finite(float value) { return value - value == 0; }
-
 }  // namespace
 
 extern "C" {
@@ -339,18 +338,12 @@ tsp_info tsp_describe(const tsp_policy* policy) {
 int tsp_query(tsp_policy* policy, const float* history, uint64_t seed, float* chunk) {
     tsp_policy& p = *policy;
     const Header& h = p.h;
-    for (int32_t i = 0; i < h.obs_steps * h.cond_dim; i++)
-        if (!finite(history[i])) return TSP_NOT_FINITE;
-    for (int32_t i = 0; i < h.obs_steps * h.cond_dim; i++) {
-        const volatile float scaled = history[i] * p.state_scale[i % h.cond_dim];  // rounded before the sum, as in PyTorch
-        p.features[i] = scaled + p.state_offset[i % h.cond_dim];
-    }
+    if (!normalise(p.units, history, h.obs_steps, h.cond_dim, p.features)) return TSP_NOT_FINITE;
     philox::fill(seed, (size_t)h.steps * h.horizon * h.action_dim, p.noise);
     if (h.plan == PRUNER) decide(p);
     LEVELS[p.level].denoise(p.model, Member{}, p.mask, h.slots, p.noise, p.features, p.actions, p.scratch, p.scratch);
-    const float* action = p.actions + (size_t)(h.obs_steps - 1) * h.action_dim;
-    const int32_t n = (h.horizon - h.obs_steps + 1) * h.action_dim;
-    for (int32_t i = 0; i < n; i++) chunk[i] = (action[i] - p.action_offset[i % h.action_dim]) / p.action_scale[i % h.action_dim];
+    const int32_t past = h.obs_steps - 1;
+    unnormalise(p.units, p.actions + (size_t)past * h.action_dim, h.horizon - past, h.action_dim, chunk);
     return TSP_OK;
 }
 
