@@ -8,6 +8,8 @@ every bit of them.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -51,9 +53,14 @@ def answer_directly(
     tensordict.set(keys.PRUNE_MASK, mask.repeat(*batch, 1, 1) if batch else mask.clone())
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
     tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
-    flops = mask_flops(NetworkSizes.of(network), mask)
-    tensordict.set(keys.FLOPS, flops.repeat(*batch, 1) if batch else flops.view(1))
+    tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
     return True
+
+
+@lru_cache(maxsize=64)
+def _flops(sizes: NetworkSizes, mask: Tensor) -> float:
+    """Count the FLOPs of a planner's mask, once: it is never written to, and as a key a tensor is itself alone."""
+    return mask_flops(sizes, mask).item()
 
 
 def _known(encode: ObservationEncoder, plan: Planner, denoise: ActionDenoiser) -> bool:
