@@ -8,6 +8,7 @@ Writes OUT/engine.json, a table and a bar chart per case. Times are medians, all
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,6 +21,7 @@ from torchrl_sparse.evaluation.figures.latency import plot_engine_times
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
 from torchrl_sparse.evaluation.latency.first_calls import first_calls
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
+from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, stage_seconds
 from torchrl_sparse.evaluation.results.engine_report import (
     SCHEMA,
     EngineResults,
@@ -82,7 +84,11 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
             device=config.device,
             on_round=show,
         )
-    return shape_results(case, variants, latency, config.threads, first)
+    shape = shape_results(case, variants, latency, config.threads, first)
+    if entry.shape == "image":
+        policy = image_policy(network, width=16 if config.quick else 64)
+        shape = replace(shape, stage_s=stage_seconds(policy, image_query(policy, entry.batch), repeats))
+    return shape
 
 
 def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:

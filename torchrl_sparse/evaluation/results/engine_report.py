@@ -81,6 +81,7 @@ class EngineShape:
         rows: by the name of the variant, ``"<runner> <kind>"``.
         program_build_s: that the program of a new mask takes to build.
         all_pruned_step_s: of a step that computes nothing, by runner.
+        stage_s: of the parts of a whole dense query of an image policy, by the policy's stages; None elsewhere.
     """
 
     threads: int
@@ -90,6 +91,7 @@ class EngineShape:
     rows: dict[str, EngineRow]
     program_build_s: float
     all_pruned_step_s: dict[str, float]
+    stage_s: dict[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,11 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
     on_gpu = any(row.peak_bytes is not None for row in shape.rows.values())
     table = markdown_table(select_columns(engine_rows(shape), COLUMNS + GPU_COLUMNS * on_gpu))
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape.all_pruned_step_s.items()]
-    return "\n\n".join([head, table, f"A step that computes nothing takes {', '.join(steps)}."])
+    text = [head, table, f"A step that computes nothing takes {', '.join(steps)}."]
+    if shape.stage_s:
+        stages = [f"{name} {1e3 * seconds:.2f} ms" for name, seconds in shape.stage_s.items()]
+        text.append(f"A whole dense query, cameras included: {', '.join(stages)}.")
+    return "\n\n".join(text)
 
 
 def engine_rows(shape: EngineShape) -> list[dict[str, str]]:
