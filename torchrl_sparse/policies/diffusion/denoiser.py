@@ -17,10 +17,18 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["NOISES", "ActionDenoiser"]
+__all__ = ["NOISES", "ActionDenoiser", "check_noise"]
 
 NOISES = {"torch": sample_noise, "philox": philox_noise}
-"""What a seed stands for -> the function that draws it."""
+"""What a seed stands for -> the function that draws it: PyTorch's generator, with which everything here was measured, or
+`torchrl_sparse.networks.diffusion.philox`, as exported policies do."""
+
+
+def check_noise(name: str) -> str:
+    """Return ``name``, or raise ValueError unless it is in :data:`NOISES`."""
+    if name not in NOISES:
+        raise ValueError(f"noise: expected one of {list(NOISES)}, got {name!r}")
+    return name
 
 
 class ActionDenoiser(TensorDictModuleBase):

@@ -1,4 +1,8 @@
-"""The parts of a policy as one file that C runs."""
+"""A policy as one file that a robot runs without Python or PyTorch, through the C interface of
+``torchrl_sparse/blocks/engine/native/tsp.h``: network, normaliser, sampler and planner.
+
+It answers as the policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +19,44 @@ from torchrl_sparse.blocks.engine.native.tsp import ExportedPlan, write_tsp
 from torchrl_sparse.blocks.mask import num_buffers
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
+from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 
 __all__ = ["export_policy"]
 
 
 def export_policy(
     path: Path,
-    network: TransformerForDiffusion,
-    normalizer: Normalizer,
-    sampler: Sampler,
+    encode: ObservationEncoder,
     plan: Planner,
+    denoise: ActionDenoiser,
     *,
     weights: str,
     facts: dict[str, Any],
 ) -> None:
-    """Write the file of :meth:`DiffusionPolicy.export`; ``facts`` about the policy go into its description."""
+    """Write the stages of a policy as one file; ``policy.export(path)`` calls it.
+
+    Args:
+        path: of the file, e.g. ``"lift.tsp"``.
+        encode, plan, denoise: the stages.
+        weights: see `torchrl_sparse.blocks.engine.NativeEngine`.
+        facts: about the policy, for the file's description.
+
+    Raises:
+        ValueError: naming what cannot be exported: cameras, a network that the native engine does not run, or a planner of
+            one's own that looks at the observation.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_sparse import DiffusionPolicy, Sampler
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> policy.sampler = Sampler("ddim", timesteps=[87, 20])
+        >>> policy.export(Path(tempfile.mkdtemp()) / "lift.tsp")
+    """
+    network, normalizer, sampler = denoise.network, denoise.normalizer, denoise.sampler
+    if (vision := encode.condition.vision) is not None:
+        raise ValueError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
     supported, reason = native_supports(network)
     if not supported:
         raise ValueError(f"export: {reason}")

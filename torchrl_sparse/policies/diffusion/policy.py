@@ -6,7 +6,6 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,10 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
+from torchrl_sparse.policies.diffusion.fingerprint import weights_fingerprint
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
@@ -123,9 +123,7 @@ class DiffusionPolicy(TensorDictSequential):
         elif name == "sampler":
             self._install(self.plan, value)
         elif name == "noise":
-            if value not in NOISES:
-                raise ValueError(f"noise: expected one of {list(NOISES)}, got {value!r}")
-            self.module["denoise"].noise = value
+            self.module["denoise"].noise = check_noise(value)
         else:
             super().__setattr__(name, value)
 
@@ -155,8 +153,7 @@ class DiffusionPolicy(TensorDictSequential):
     def with_noise(self, stream: int) -> DiffusionPolicy:
         """Return a policy of the same networks, planner and sampler that draws other noise: what chance alone does.
 
-        Args:
-            stream: 0 is the noise of every other policy.
+        Stream 0 is the noise of every other policy.
         """
         policy = self.with_plan(self.plan)
         policy.module["encode"].noise_stream = stream
@@ -169,10 +166,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @property
     def noise(self) -> str:
-        """What a seed stands for: ``"torch"``, the noise of PyTorch's generator, with which everything here was measured, or
-        ``"philox"``, that of `torchrl_sparse.networks.diffusion.philox`, which exported policies draw too. Assign the other to
-        change it.
-        """
+        """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
 
     # -- numbers about it ----------------------------------------------------------------------------------------------
@@ -199,13 +193,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def fingerprint(self) -> str:
         """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        digest = hashlib.sha256()
-        for part in (self.network, self.vision):
-            if part is not None:
-                digest.update(repr(sorted(part.config.items())).encode())
-                for name, value in sorted(part.state_dict().items()):
-                    digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
-        return digest.hexdigest()[:16]
+        return weights_fingerprint(self.network, self.vision)
 
     @property
     def engine(self) -> EngineName:
@@ -227,8 +215,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
-        slot = self.module["denoise"].engine
-        return engine_block_costs(slot.get(self.network, self.sampler))
+        return engine_block_costs(self.module["denoise"].engine.get(self.network, self.sampler))
 
     def refresh(self) -> None:
         """Read all weights anew in the next query.
@@ -276,30 +263,9 @@ class DiffusionPolicy(TensorDictSequential):
         write_pretrained(Path(path), stored, half=half)
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
-        """Write one file that a robot runs without Python or PyTorch, through the C interface of
-        ``torchrl_sparse/blocks/engine/native/tsp.h``: network, normaliser, sampler and planner.
-
-        It answers as this policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
-
-        Args:
-            path: of the file, e.g. ``"lift.tsp"``.
-            weights: see `torchrl_sparse.blocks.engine.NativeEngine`.
-
-        Raises:
-            ValueError: naming what cannot be exported: cameras, a network that the native engine does not run, or a planner of
-                one's own that looks at the observation.
-
-        Examples:
-            >>> import tempfile
-            >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
-            >>> policy.sampler = Sampler("ddim", timesteps=[87, 20])
-            >>> policy.export(Path(tempfile.mkdtemp()) / "lift.tsp")
-        """
-        if self.vision is not None:
-            raise ValueError(f"export: expected a policy of states, got cameras {list(self.vision.cameras)}")
+        """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
-        parts = self.network, self.normalizer, self.sampler, self.plan
-        export_policy(Path(path), *parts, weights=weights, facts=facts)
+        export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
@@ -324,11 +290,6 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             FileNotFoundError: if there is no file.
             CheckpointError: a ValueError that names the file, what was expected in it and what was found.
-
-        Examples:
-            >>> policy = DiffusionPolicy.from_diffusion_policy("latest.ckpt")  # doctest: +SKIP
-            >>> policy.source["state_keys"]  # doctest: +SKIP
-            ['object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos']
         """
         return cls._assemble(read_diffusion_policy(path), engine)
 
