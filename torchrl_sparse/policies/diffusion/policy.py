@@ -142,9 +142,8 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             ValueError: if the planner was made for another policy or sampler.
         """
-        sampler = self.sampler if sampler is None else sampler
-        shared = {"vision": self.vision, "engine": self.engine}
-        policy = DiffusionPolicy(self.network, self.normalizer, sampler=sampler, plan=plan, **shared)
+        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
+        policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
         policy.source = self.source
         policy.module["encode"].noise_stream = self.noise_stream
         policy.noise = self.noise
