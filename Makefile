@@ -7,7 +7,10 @@ BIN := $(VENV)/bin
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml setup.py torchrl_sparse/blocks/engine/native/native.cpp
+NATIVE := torchrl_sparse/blocks/engine/native
+HEADERS := $(wildcard $(NATIVE)/*.h)
+
+$(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
@@ -31,14 +34,14 @@ docs: install
 
 # The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.
 SANITIZE := -fsanitize=address,undefined -fno-sanitize-recover=undefined
-build/sanitize/native.so: torchrl_sparse/blocks/engine/native/native.cpp
+build/sanitize/native.so: $(NATIVE)/native.cpp $(HEADERS)
 	mkdir -p $(@D)
-	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -shared -fPIC -o $@ $<
+	g++ -std=c++17 -O1 -g -fno-omit-frame-pointer $(SANITIZE) -ffp-contract=fast -pthread -shared -fPIC -o $@ $<
 
 sanitize: install build/sanitize/native.so
 	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
 		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
-		$(BIN)/python -m pytest tests/blocks/engine/native -k "not library"
+		$(BIN)/python -m pytest tests/blocks/engine/native tests/policies/diffusion/test_export.py -k "not library"
 
 # Half an hour of faults, see tests/torture/README.md; MINUTES=5 for less. Linux with g++.
 MINUTES ?= 30

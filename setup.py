@@ -4,11 +4,16 @@ The extension is optional: without a C++ compiler the package installs all the s
 plain shared library without Python's or PyTorch's headers. Instruction sets are chosen at run time, so there is no -march.
 """
 
+from pathlib import Path
+
 from setuptools import Extension, find_packages, setup
+
+FOLDER = Path("torchrl_sparse/blocks/engine/native")
 
 NATIVE = Extension(
     "torchrl_sparse.blocks.engine.native._native",
-    sources=["torchrl_sparse/blocks/engine/native/native.cpp"],
+    sources=[str(FOLDER / "native.cpp")],
+    depends=[str(header) for header in sorted(FOLDER.glob("*.h"))],
     # A product may be fused with a sum; nothing else that changes results is allowed.
     extra_compile_args=[
         "-g0",
@@ -17,7 +22,9 @@ NATIVE = Extension(
         "-ffp-contract=fast",
         "-fno-math-errno",
         "-fvisibility=default",
+        "-pthread",
     ],
+    extra_link_args=["-pthread"],
     optional=True,
 )
 
@@ -34,7 +41,11 @@ setup(
     packages=[*find_packages(include=["torchrl_sparse*"]), *BESIDE],
     package_dir=BESIDE,
     package_data={
-        "torchrl_sparse": ["evaluation/figures/*.jinja"],
+        "torchrl_sparse": [
+            "evaluation/figures/*.jinja",
+            "blocks/engine/native/*.[ch]*",
+            "blocks/engine/native/CMakeLists.txt",
+        ],
         "torchrl_sparse.recipes": ["*.yaml"],
         "torchrl_sparse.recipes.sweeps": ["*.yaml"],
         "torchrl_sparse.assets.lift": ["config.json", "model.safetensors", "bac*.json"],

@@ -1,14 +1,17 @@
 """Benchmark the engines: what a query costs in the published implementation, and in ours, dense and pruned.
 
     python recipes/benchmark_engine.py out=outputs/engine threads=1
+    python recipes/benchmark_engine.py out=outputs/engine_gpu device=cuda
 
 Writes OUT/engine.json, a table and a bar chart per case. Times are medians, all variants of a case interleaved in one process.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
@@ -16,7 +19,9 @@ from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.latency import plot_engine_times
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
+from torchrl_sparse.evaluation.latency.first_calls import first_calls
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
+from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, stage_seconds
 from torchrl_sparse.evaluation.results.engine_report import (
     SCHEMA,
     EngineResults,
@@ -36,8 +41,11 @@ QUICK_STEPS = 20
 @recipe("benchmark_engine")
 def main(config: DictConfig) -> None:
     out = Path(config.out)
-    results = EngineResults(SCHEMA, describe_machine(threads=config.threads), {})
-    for entry in config.cases:
+    on_gpu = torch.device(config.device).type == "cuda"
+    if on_gpu and not torch.cuda.is_available():
+        raise ValueError(f"device: expected one that this machine and PyTorch have, got {config.device!r}")
+    results = EngineResults(SCHEMA, describe_machine(config.device, config.threads), {})
+    for entry in config.gpu_cases if on_gpu else config.cases:
         name = f"{entry.shape}_b{entry.batch}"
         with num_threads(config.threads):
             results.shapes[name] = run_case(name, entry, config)
@@ -53,6 +61,7 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
     network, bac_mask = make_network(entry.shape, quick=config.quick), None
     if entry.shape == "low_dim" and config.policy is not None and not config.quick:
         network, bac_mask = load_trained(Path(config.policy))
+    network.to(config.device)
     # Compiling takes minutes and changes nothing with the batch, so one case shows it.
     compiled = config.compile and not config.quick and entry.get("compile", False)
     case = EngineCase(
@@ -65,15 +74,21 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
     variants = case.variants()
     if compiled:
         drop_uncompilable(variants)
+    first = first_calls(case, variants)
     repeats = 1 if config.quick else entry.repeats
     with progress(name, "round", repeats) as show:
         latency = measure_latency(
             {variant: case_variant.call for variant, case_variant in variants.items()},
             repeats=repeats,
             warmup=1 if config.quick else config.warmup,
+            device=config.device,
             on_round=show,
         )
-    return shape_results(case, variants, latency, config.threads)
+    shape = shape_results(case, variants, latency, config.threads, first)
+    if entry.shape == "image":
+        policy = image_policy(network, width=16 if config.quick else 64)
+        shape = replace(shape, stage_s=stage_seconds(policy, image_query(policy, entry.batch), repeats))
+    return shape
 
 
 def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:

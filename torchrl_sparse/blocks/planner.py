@@ -198,6 +198,11 @@ class StaticPlanner(Planner):
         self._mask = mask
 
     @property
+    def static_mask(self) -> Tensor | None:
+        """The mask bool [K, 3L] that every query gets; None before :meth:`bind`."""
+        return self._mask
+
+    @property
     def fingerprint(self) -> str:
         """A name of the bound mask."""
         return tensors_fingerprint({"mask": self.mask(self.spec)})

@@ -142,6 +142,7 @@ OPTIONS: dict[str, Any] = {
     "compile": bool,
     "batch": Count,
     "cases": Annotated[list[Section], Field(min_length=1)],
+    "gpu_cases": Annotated[list[Section], Field(min_length=1)],
     "shape": Word,
     "threads": Count | None,
     "engine": Word,

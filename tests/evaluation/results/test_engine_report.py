@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import imageio.v3 as iio
 import pytest
@@ -13,6 +14,7 @@ from tests.recipe_modules import RECIPES, load_recipe
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
+from torchrl_sparse.evaluation.latency.first_calls import first_calls
 from torchrl_sparse.evaluation.latency.limits import measure_bandwidth, measure_multiply_adds
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
@@ -106,6 +108,28 @@ def test_an_unknown_shape_is_refused():
         ValueError, match=r"shape: expected one of \['low_dim', 'image', 'kitchen'\], got 'moon'"
     ):
         make_network("moon")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_the_recipe_says_so_in_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, str(RECIPE), "quick=true", "device=cuda", f"out={tmp_path / 'out'}"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("device: expected one that this machine and PyTorch have, got 'cuda'")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_variant_that_answers_otherwise_is_never_timed(case):
+    variant = case.variants()["torch dense"]
+    wrong = replace(variant, call=lambda: variant.call() + 1)
+    assert first_calls(case, {"torch dense": variant})["torch dense"].seconds > 0
+    with pytest.raises(
+        ValueError, match=r"^torch dense: expected the actions of the reference up to 0\.0001, got"
+    ):
+        first_calls(case, {"torch dense": wrong})
 
 
 def test_recipe_writes_results_and_charts(tmp_path):

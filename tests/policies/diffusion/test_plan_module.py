@@ -136,4 +136,5 @@ def test_a_mask_is_validated_once_a_query(policy, engine, monkeypatch):
         monkeypatch.setattr(module, "validate_mask", counted)
     policy.engine = engine
     policy(request(2))
-    assert len(calls) == 1
+    # Compiled code takes a mask that does not depend on the observation as it was validated when it was bound.
+    assert len(calls) == (0 if policy.engine_info().startswith("native") else 1)

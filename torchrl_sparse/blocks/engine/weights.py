@@ -60,8 +60,7 @@ class WeightWatch:
             members = self._members = _Members.of(self._network)
         addresses = [p.data_ptr() for p in members.parameters]
         addresses += [p.is_contiguous() for p in members.parameters]  # a matrix may be turned where it lies
-        # Tensors made in inference mode count no versions.
-        versions = [0 if p.is_inference() else p._version for p in members.parameters]
+        versions = [p._version for p in members.counted]
         known, places = self._places  # read and replaced in one go: other threads may do the same
         if known != addresses:
             check_weights(self._network)
@@ -86,6 +85,7 @@ class _Members:
     held: list[list]
     known: list[int]
     parameters: list[nn.Parameter]
+    counted: list[nn.Parameter]  # tensors made in inference mode count no versions
 
     @classmethod
     def of(cls, network: nn.Module) -> _Members:
@@ -93,7 +93,8 @@ class _Members:
         holders = [holder for holder in holders if holder]
         held = [list(holder.values()) for holder in holders]
         known = [id(member) for members in held for member in members]
-        return cls(holders, held, known, list(network.parameters()))
+        parameters = list(network.parameters())
+        return cls(holders, held, known, parameters, [p for p in parameters if not p.is_inference()])
 
     def identities(self) -> list[int]:
         return [id(member) for holder in self.holders for member in holder.values()]

@@ -62,15 +62,19 @@ class QueryKind:
     sampler: Sampler
     mask: Tensor | None = None
 
+    def to(self, device: torch.device) -> QueryKind:
+        """Return it with its mask on ``device``."""
+        return self if self.mask is None else QueryKind(self.sampler, self.mask.to(device))
+
     def evaluations(self) -> Tensor | None:
         """Count how often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
-        return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0)
+        return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0).cpu()
 
     def row_evaluations(self, batch: int) -> int | Tensor:
         """Count how often each block is computed, every row by itself, i64 [3L]; one number if all are as often."""
         if self.mask is None:
             return batch * self.sampler.num_inference_steps
-        return (~self.mask).sum(dim=(0, 1))
+        return (~self.mask).sum(dim=(0, 1)).cpu()
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ class EngineCase:
     """One network, one batch, all kinds of queries.
 
     Args:
-        network: the denoiser, in eval mode.
+        network: the denoiser, in eval mode, on the device that is to run everything.
         batch: rows B; each has a random mask of its own where masks are random.
         num_steps: denoising steps K of the dense query.
         compiled: also run the eager baseline through ``torch.compile``.
@@ -114,17 +118,20 @@ class EngineCase:
         bac_mask: Tensor | None = None,
     ) -> None:
         self.network, self.batch, self._compiled = network, batch, compiled
+        self.device = network.pos_emb.device
         self._ddpm = Sampler("ddpm", num_steps, num_steps)
         generator = torch.Generator().manual_seed(0)
         self.cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)
+        self.cond = self.cond.to(self.device)
         shape = (batch, network.horizon, network.input_dim)
-        initial = torch.randn(shape, generator=generator)
+        initial = torch.randn(shape, generator=generator).to(self.device)
         # The eager baseline's sampler draws the steps' noise from a generator with this seed, in this order.
-        drawn = torch.Generator().manual_seed(_DRAWN_SEED)
-        steps = [torch.randn(shape, generator=drawn) for _ in range(num_steps - 1)]
+        drawn = torch.Generator(self.device).manual_seed(_DRAWN_SEED)
+        steps = [torch.randn(shape, generator=drawn, device=self.device) for _ in range(num_steps - 1)]
         self.noise = torch.stack([initial, *steps], dim=1)
         mask = self._calibrate_bac() if bac_mask is None else bac_mask
-        self.queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
+        queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
+        self.queries = {kind: query.to(self.device) for kind, query in queries.items()}
 
     def reference(self, kind: str) -> Tensor:
         """Return the reference engine's answer to a query, [B, H, A]."""
@@ -171,7 +178,7 @@ class EngineCase:
         mask = None if query.mask is None else query.mask[0]
 
         def call() -> Tensor:
-            generator = torch.Generator().manual_seed(_DRAWN_SEED)
+            generator = torch.Generator(self.device).manual_seed(_DRAWN_SEED)
             return eager.denoise(self.noise[:, 0], self.cond, mask, generator=generator)
 
         return call

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -13,8 +12,11 @@ from torchrl_sparse.blocks.engine.program import build_program
 from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.runtime.clock import synchronised_clock
 
 __all__ = ["block_weights", "measure_bandwidth", "measure_multiply_adds", "program_seconds"]
+
+_CPU = torch.device("cpu")
 
 
 def block_weights(network: TransformerForDiffusion) -> tuple[int, int, int]:
@@ -26,35 +28,36 @@ def block_weights(network: TransformerForDiffusion) -> tuple[int, int, int]:
 def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> float:
     """Measure the bytes per second at which this thread reads as much as one denoising step's weights, again and again.
 
-    The best of ``repeats``.
+    The best of ``repeats``; of a network on a GPU, that is what reads.
     """
     size = network.n_layer * sum(block_weights(network))
-    array = torch.ones(size)
-    return 4 * size / min(_timed(array.sum, repeats))
+    array = torch.ones(size, device=network.pos_emb.device)
+    return 4 * size / min(_timed(array.sum, repeats, array.device))
 
 
-def measure_multiply_adds(size: int = 1536, repeats: int = 5) -> float:
+def measure_multiply_adds(size: int = 1536, repeats: int = 5, device: torch.device = _CPU) -> float:
     """Measure the FLOPs (2 * MAC) per second of a large product of f32 matrices in PyTorch, the best of ``repeats``.
 
     Of the two libraries that PyTorch may have for it the faster one counts: on AMD's CPUs MKL's vectors are half as wide as
     oneDNN's.
     """
-    matrix, out = torch.ones(size, size), torch.ones(size, size)
-    products = torch.mm, make_linear(matrix, torch.zeros(size))
-    best = min(min(_timed(lambda product=product: product(matrix, out), repeats)) for product in products)
+    matrix, out = (torch.ones(size, size, device=device) for _ in range(2))
+    products = torch.mm, make_linear(matrix, torch.zeros(size, device=device))
+    times = [_timed(lambda product=product: product(matrix, out), repeats, device) for product in products]
+    best = min(map(min, times))
     return 2 * size**3 / best
 
 
 def program_seconds(case: EngineCase, repeats: int = 50) -> float:
     """Measure the median seconds that the program of a new random mask takes to build."""
-    mask = case.queries["random91"].mask[0].numpy()
+    mask = case.queries["random91"].mask[0].cpu().numpy()
     return statistics.median(_timed(lambda: build_program(mask), repeats))
 
 
-def _timed(call: Callable[[], Any], repeats: int) -> list[float]:
+def _timed(call: Callable[[], Any], repeats: int, device: torch.device = _CPU) -> list[float]:
     samples = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = synchronised_clock(device)
         call()
-        samples.append(time.perf_counter() - start)
+        samples.append(synchronised_clock(device) - start)
     return samples

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant
+from torchrl_sparse.evaluation.latency.first_calls import FirstCall
 from torchrl_sparse.evaluation.latency.limits import (
     block_weights,
     measure_bandwidth,
@@ -34,6 +35,7 @@ __all__ = [
 ]
 
 SCHEMA = 1
+GPU_COLUMNS = ("first call, ms", "peak memory, MB")
 COLUMNS = ("variant", "p50, ms", "p10 – p90", "× eager", "× own dense", "max error")
 
 
@@ -50,6 +52,8 @@ class EngineRow:
         limit_s: what reading the weights of all computed blocks takes, once per evaluation, at the shape's bandwidth.
         f32_limit_s: what multiplying with these weights takes, for every row that computes them, at the shape's rate of
             products; None for bf16.
+        first_s: of the first call, with everything that is done once; None in older files.
+        peak_bytes: of a GPU's memory; None on a CPU.
     """
 
     p50_s: float
@@ -61,6 +65,8 @@ class EngineRow:
     max_err: float
     limit_s: float
     f32_limit_s: float | None
+    first_s: float | None = None
+    peak_bytes: int | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,7 @@ class EngineShape:
         rows: by the name of the variant, ``"<runner> <kind>"``.
         program_build_s: that the program of a new mask takes to build.
         all_pruned_step_s: of a step that computes nothing, by runner.
+        stage_s: of the parts of a whole dense query of an image policy, by the policy's stages; None elsewhere.
     """
 
     threads: int
@@ -84,6 +91,7 @@ class EngineShape:
     rows: dict[str, EngineRow]
     program_build_s: float
     all_pruned_step_s: dict[str, float]
+    stage_s: dict[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -96,7 +104,11 @@ class EngineResults:
 
 
 def shape_results(
-    case: EngineCase, variants: Mapping[str, Variant], latency: Mapping[str, Latency], threads: int
+    case: EngineCase,
+    variants: Mapping[str, Variant],
+    latency: Mapping[str, Latency],
+    threads: int,
+    first: Mapping[str, FirstCall] | None = None,
 ) -> EngineShape:
     """Put together what was measured of one case, and measure what the machine can do at best.
 
@@ -105,8 +117,9 @@ def shape_results(
         variants: its variants.
         latency: of each of them, measured interleaved.
         threads: that were used.
+        first: the first call of each of them, if it was watched.
     """
-    bandwidth, multiply_adds = measure_bandwidth(case.network), measure_multiply_adds()
+    bandwidth, multiply_adds = measure_bandwidth(case.network), measure_multiply_adds(device=case.device)
     expected = {kind: case.reference(kind) for kind in case.queries}
     rows = {}
     for name, variant in variants.items():
@@ -121,6 +134,8 @@ def shape_results(
             max_err=(variant.call() - expected[variant.kind]).abs().max().item(),
             limit_s=_bytes_read(case, variant) / bandwidth,
             f32_limit_s=_product_flops(case, variant) / multiply_adds if variant.in_f32 else None,
+            first_s=first[name].seconds if first else None,
+            peak_bytes=first[name].peak_bytes if first else None,
         )
     return EngineShape(
         threads=threads,
@@ -182,9 +197,14 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
         f"products of {shape.f32_gflops_per_s:.0f} GFLOP/s, "
         f"program built in {1e3 * shape.program_build_s:.2f} ms"
     )
-    table = markdown_table(select_columns(engine_rows(shape), COLUMNS))
+    on_gpu = any(row.peak_bytes is not None for row in shape.rows.values())
+    table = markdown_table(select_columns(engine_rows(shape), COLUMNS + GPU_COLUMNS * on_gpu))
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape.all_pruned_step_s.items()]
-    return "\n\n".join([head, table, f"A step that computes nothing takes {', '.join(steps)}."])
+    text = [head, table, f"A step that computes nothing takes {', '.join(steps)}."]
+    if shape.stage_s:
+        stages = [f"{name} {1e3 * seconds:.2f} ms" for name, seconds in shape.stage_s.items()]
+        text.append(f"A whole dense query, cameras included: {', '.join(stages)}.")
+    return "\n\n".join(text)
 
 
 def engine_rows(shape: EngineShape) -> list[dict[str, str]]:
@@ -202,4 +222,6 @@ def _engine_row(variant: str, row: EngineRow) -> dict[str, str]:
         "max error": f"{row.max_err:.1e}",
         "memory alone, ms": f"{1e3 * row.limit_s:.1f}",
         "f32 arithmetic alone, ms": "" if row.f32_limit_s is None else f"{1e3 * row.f32_limit_s:.1f}",
+        "first call, ms": "" if row.first_s is None else f"{1e3 * row.first_s:.1f}",
+        "peak memory, MB": "" if row.peak_bytes is None else f"{row.peak_bytes / 1e6:.0f}",
     }

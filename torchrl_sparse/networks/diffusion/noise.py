@@ -44,8 +44,8 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
     noise = torch.empty(len(seed), num_steps, *chunk_shape)
     for row, value in zip(noise, seed.tolist(), strict=True):
         generator = torch.Generator().manual_seed(value)
-        row[:1] = torch.randn(1, *chunk_shape, generator=generator)
-        row[1:] = torch.randn(num_steps - 1, *chunk_shape, generator=generator)
+        row[:1].normal_(generator=generator)
+        row[1:].normal_(generator=generator)
     return noise.to(seed.device)
 
 

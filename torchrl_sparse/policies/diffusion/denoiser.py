@@ -12,11 +12,23 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.noise import sample_noise
+from torchrl_sparse.networks.diffusion.philox import philox_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["ActionDenoiser"]
+__all__ = ["NOISES", "ActionDenoiser", "check_noise"]
+
+NOISES = {"torch": sample_noise, "philox": philox_noise}
+"""What a seed stands for -> the function that draws it: PyTorch's generator, with which everything here was measured, or
+`torchrl_sparse.networks.diffusion.philox`, as exported policies do."""
+
+
+def check_noise(name: str) -> str:
+    """Return ``name``, or raise ValueError unless it is in :data:`NOISES`."""
+    if name not in NOISES:
+        raise ValueError(f"noise: expected one of {list(NOISES)}, got {name!r}")
+    return name
 
 
 class ActionDenoiser(TensorDictModuleBase):
@@ -37,6 +49,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self.normalizer = normalizer
         self.sampler = sampler
         self.engine = EngineSlot(engine)
+        self.noise = "torch"
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
@@ -46,7 +59,8 @@ class ActionDenoiser(TensorDictModuleBase):
             for value in (tensordict.get(keys.COND), keys.read(tensordict, keys.PRUNE_MASK))
         )
         shape = (self.network.horizon, self.network.input_dim)
-        noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
+        seed = tensordict.get(keys.SEED).reshape(-1)
+        noise = NOISES[self.noise](seed, self.sampler.num_inference_steps, shape)
         dtype = self.network.pos_emb.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
         actions = self._follow_rules(noise, cond, mask, keys.read(tensordict, keys.REUSE).reshape(-1))

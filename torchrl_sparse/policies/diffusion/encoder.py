@@ -60,6 +60,7 @@ class ObservationEncoder(TensorDictModuleBase):
         vision: encoder of the cameras, if there are any.
 
     Attributes:
+        state_shape: (To, Ds).
         noise_stream: which of the noises that an episode could have had; 0 unless another is assigned.
 
     Raises:
@@ -81,7 +82,7 @@ class ObservationEncoder(TensorDictModuleBase):
                 f"network: expected cond_dim {features + state} (image features {features}, state {state}), "
                 f"got {network.cond_dim}"
             )
-        self._state_shape = (network.n_obs_steps, state)
+        self.state_shape = (network.n_obs_steps, state)
         self.noise_stream = 0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -91,13 +92,13 @@ class ObservationEncoder(TensorDictModuleBase):
         frozen = encoder is not None and not self.training
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             tensordict.set(keys.COND, self.condition(tensordict))
-        return tensordict.set(keys.SEED, self._seed(tensordict))
+        return tensordict.set(keys.SEED, self.seed(tensordict))
 
     def _check(self, state: Tensor) -> None:
-        if tuple(state.shape[-2:]) != self._state_shape:
+        if tuple(state.shape[-2:]) != self.state_shape:
             raise ValueError(
-                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self._state_shape[0]}, "
-                f"{self._state_shape[1]}], got {list(state.shape)}"
+                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self.state_shape[0]}, "
+                f"{self.state_shape[1]}], got {list(state.shape)}"
             )
         if state.is_meta or state.is_complex() or state.layout != torch.strided:
             raise ValueError(
@@ -109,7 +110,8 @@ class ObservationEncoder(TensorDictModuleBase):
                 f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
             )
 
-    def _seed(self, tensordict: TensorDictBase) -> Tensor:
+    def seed(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the seed of each query's noise, i64 [*B, 1]."""
         seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
         if seed is None or step is None:
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)

@@ -6,7 +6,6 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,16 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.blocks.saved import load_planner, save_beside
-from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.export import export_policy
+from torchrl_sparse.policies.diffusion.fingerprint import weights_fingerprint
+from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -120,6 +121,8 @@ class DiffusionPolicy(TensorDictSequential):
             self._install(value, self.sampler)
         elif name == "sampler":
             self._install(self.plan, value)
+        elif name == "noise":
+            self.module["denoise"].noise = check_noise(value)
         else:
             super().__setattr__(name, value)
 
@@ -138,18 +141,17 @@ class DiffusionPolicy(TensorDictSequential):
         Raises:
             ValueError: if the planner was made for another policy or sampler.
         """
-        sampler = self.sampler if sampler is None else sampler
-        shared = {"vision": self.vision, "engine": self.engine}
-        policy = DiffusionPolicy(self.network, self.normalizer, sampler=sampler, plan=plan, **shared)
+        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
+        policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
         policy.source = self.source
         policy.module["encode"].noise_stream = self.noise_stream
+        policy.noise = self.noise
         return policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
         """Return a policy of the same networks, planner and sampler that draws other noise: what chance alone does.
 
-        Args:
-            stream: 0 is the noise of every other policy.
+        Stream 0 is the noise of every other policy.
         """
         policy = self.with_plan(self.plan)
         policy.module["encode"].noise_stream = stream
@@ -159,6 +161,11 @@ class DiffusionPolicy(TensorDictSequential):
     def noise_stream(self) -> int:
         """Which of the noises that an episode could have had it draws; see `with_noise`."""
         return self.module["encode"].noise_stream
+
+    @property
+    def noise(self) -> str:
+        """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
+        return self.module["denoise"].noise
 
     # -- numbers about it ----------------------------------------------------------------------------------------------
 
@@ -184,13 +191,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def fingerprint(self) -> str:
         """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        digest = hashlib.sha256()
-        for part in (self.network, self.vision):
-            if part is not None:
-                digest.update(repr(sorted(part.config.items())).encode())
-                for name, value in sorted(part.state_dict().items()):
-                    digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
-        return digest.hexdigest()[:16]
+        return weights_fingerprint(self.network, self.vision)
 
     @property
     def engine(self) -> EngineName:
@@ -202,7 +203,7 @@ class DiffusionPolicy(TensorDictSequential):
         self.module["denoise"].engine = EngineSlot(name)
 
     def engine_info(self) -> str:
-        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
+        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``; where
         ``"auto"`` had to do without the native one, also why.
 
         Raises:
@@ -214,8 +215,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
-        slot = self.module["denoise"].engine
-        return engine_block_costs(slot.get(self.network, self.sampler))
+        return engine_block_costs(self.module["denoise"].engine.get(self.network, self.sampler))
 
     def refresh(self) -> None:
         """Read all weights anew in the next query.
@@ -231,7 +231,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
-        return sample_noise(seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
+        return NOISES[self.noise](seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, *, reuse: Reuse = "block"
@@ -243,7 +243,8 @@ class DiffusionPolicy(TensorDictSequential):
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
         try:
-            tensordict = super().forward(tensordict)
+            if not answer_directly(tensordict, *self.module.values()):
+                tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error
         seconds = synchronised_clock(device) - start
@@ -260,6 +261,11 @@ class DiffusionPolicy(TensorDictSequential):
         plan = save_beside(self.plan, Path(path))
         stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
         write_pretrained(Path(path), stored, half=half)
+
+    def export(self, path: str | Path, *, weights: str = "float32") -> None:
+        """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
+        facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
+        export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
@@ -283,11 +289,6 @@ class DiffusionPolicy(TensorDictSequential):
 
         Raises:
             FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.
-
-        Examples:
-            >>> policy = DiffusionPolicy.from_diffusion_policy("latest.ckpt")  # doctest: +SKIP
-            >>> policy.source["state_keys"]  # doctest: +SKIP
-            ['object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos']
         """
         return cls._assemble(read_diffusion_policy(path), engine)
 

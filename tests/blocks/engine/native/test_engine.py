@@ -243,7 +243,7 @@ def test_what_it_cannot_run_is_refused_with_the_reason():
         NativeEngine(make_network(), sampler, weights="int8")
     with pytest.raises(ValueError, match="instruction_set: expected one of"):
         NativeEngine(make_network(), sampler, instruction_set="mmx")
-    with pytest.raises(ValueError, match="threads: expected at least 1"):
+    with pytest.raises(ValueError, match="threads: expected a whole number from 1 to 64, got 0"):
         NativeEngine(make_network(), sampler, threads=0)
 
 

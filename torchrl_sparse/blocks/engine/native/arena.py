@@ -1,4 +1,4 @@
-"""Matrices and constants in the memory layout of ``native.cpp``.
+"""Matrices and constants in the memory layout of ``denoise.h``.
 
 A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into panels of 32 columns,
 [part][panel][row][32].
@@ -18,12 +18,12 @@ from torch.nn import functional
 __all__ = ["PANEL", "Arena", "Matrix", "pack_panels"]
 
 PANEL, PART = 32, 256
-_TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as native.cpp numbers them
+_TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as denoise.h numbers them
 _CACHE_LINE = 64
 
 
 class Matrix(ctypes.Structure):
-    """``struct Matrix`` of native.cpp; :meth:`Arena.matrix` makes one."""
+    """``struct Matrix`` of denoise.h; :meth:`Arena.matrix` makes one."""
 
     _fields_ = [
         *((name, c_void_p) for name in ("weight", "bias")),
@@ -32,7 +32,7 @@ class Matrix(ctypes.Structure):
 
 
 def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Lay a matrix out in the order in which ``native.cpp`` reads it.
+    """Lay a matrix out in the order in which ``denoise.h`` reads it.
 
     Args:
         weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).

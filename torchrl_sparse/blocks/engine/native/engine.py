@@ -1,15 +1,14 @@
 """The native engine: one call of compiled code for each action chunk, on the CPU.
 
-``native.cpp`` holds the loop, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the weights and tables that
-it reads, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads the mask as it goes: unlike
-the PyTorch engine's, its program is the mask.
+``denoise.h`` holds the loop and ``team.h`` the threads, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the
+weights and tables that they read, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads
+the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import byref, c_float, c_void_p
 from functools import partial
@@ -19,22 +18,26 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.costs import folded_block_macs
+from torchrl_sparse.blocks.engine.native.arena import PANEL
 from torchrl_sparse.blocks.engine.native.library import (
     INSTRUCTION_SETS,
     instruction_level,
     library,
     native_available,
 )
-from torchrl_sparse.blocks.engine.native.packing import PackedNetwork
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["NativeEngine", "native_supports"]
+__all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
 
-_WEIGHTS = ("float32", "float16", "bfloat16")
+MAX_THREADS = 64  # of a team, see team.h
+
 _MAX_OBS_STEPS = 63
 
 
@@ -85,8 +88,11 @@ class NativeEngine:
 
     The weights are packed when the engine is made, and again when the network's have changed (see
     :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). A row of a batch is computed exactly as it would be
-    alone. Rows are spread over ``threads`` threads, of which the caller's is one; a query is never split, so that more
-    threads than rows change nothing. Calls from several threads may overlap.
+    alone, and with the same sums in the same order on any number of threads. Of a batch every thread takes whole rows;
+    rows that are left and fewer than threads are each computed by all threads together, as a single query is.
+
+    Calls from several threads, and to several engines, may overlap: one of them has the threads, the others run in the
+    caller's. Between queries the threads sleep.
 
     Args:
         network: the denoiser, in eval mode; see :func:`native_supports`.
@@ -94,11 +100,12 @@ class NativeEngine:
         weights: ``"float32"``; ``"float16"`` for half the memory; ``"bfloat16"`` for half the memory and, on a CPU
             with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
-        threads: for the rows of a batch; None takes ``torch.get_num_threads()`` at each call.
+        threads: with the caller's; None takes ``torch.get_num_threads()`` at each call, of which a single query uses
+            no more than one for each 32 of the embedding's size, and none at 1.
 
     Attributes:
         name: ``"native"``.
-        detail: instruction set and weight type.
+        detail: instruction set, weight type and the threads of a single query.
 
     Raises:
         ValueError: if the engine cannot run the network or the instruction set, with the reason.
@@ -129,11 +136,10 @@ class NativeEngine:
         supported, reason = native_supports(network)
         if not supported:
             raise ValueError(f"native engine: {reason}")
-        if weights not in _WEIGHTS:
-            raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {weights!r}")
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads: expected at least 1, got {threads}")
+        if threads is not None:
+            check_size("threads", threads, MAX_THREADS)
         self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
+        self._dtype = weight_type(weights)
         self._level = instruction_level(instruction_set)
         self._dense = torch.zeros(
             sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
@@ -151,7 +157,9 @@ class NativeEngine:
 
     @property
     def detail(self) -> str:
-        return f"{INSTRUCTION_SETS[self._level]}, {self._weights} weights"
+        threads = self._num_threads(rows=1)
+        team = f"{threads} thread{'s' if threads > 1 else ''}"
+        return f"{INSTRUCTION_SETS[self._level]}, {self._weights} weights, {team}"
 
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
@@ -170,16 +178,54 @@ class NativeEngine:
         actions = noise.new_empty(len(cond), *noise.shape[2:])
         if not len(cond):
             return actions
-        query = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
-        rows = iter(range(len(cond)))
-
-        def work() -> None:
-            with self._scratch(packed) as scratch:
-                for row in rows:  # each thread takes the next: one that is held up holds up nothing else
-                    self._run(packed, slots, row, *query, actions, scratch)
-
-        _run_in_threads(work, min(self._threads or torch.get_num_threads(), len(cond)))
+        mask, noise, cond = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
+        threads = self._num_threads(len(cond))
+        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), actions.data_ptr()
+        with self._scratch(packed, threads) as scratch:
+            where = self._level, threads, byref(packed.model)
+            library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
+
+    def answer(
+        self, noise: Tensor, state: Tensor, normalizer: Normalizer, mask: Tensor, reuse: Reuse = "block"
+    ) -> tuple[Tensor, Tensor] | None:
+        """Return condition f32 [B, To, D] and chunk f32 [B, H - To + 1, A] of states, both as PyTorch rounds them, in one call.
+
+        Args:
+            noise: f32 [B, K, H, A].
+            state: f32 [B, To, D] in the units of the environment.
+            normalizer: with f32 buffers on the CPU.
+            mask: bool [K, 3L], valid, of every row.
+            reuse: see :meth:`denoise`.
+
+        Returns:
+            None if a state is not finite.
+        """
+        packed, rows = self._current(), len(state)
+        packed.check(noise=noise, cond=state)
+        threads, horizon, past = self._num_threads(rows), noise.shape[2], state.shape[1] - 1
+        cond, actions = torch.empty_like(state), noise.new_empty(rows, *noise.shape[2:])
+        chunk = noise.new_empty(rows, horizon - past, noise.shape[3])
+        slots = num_buffers(reuse, self._dense.shape[1])
+        vectors = (
+            normalizer.state_scale,
+            normalizer.state_offset,
+            normalizer.action_scale,
+            normalizer.action_offset,
+        )
+        units = (c_void_p * 4)(*(vector.data_ptr() for vector in vectors))
+        tensors = (tensor.data_ptr() for tensor in (state, cond, actions, chunk))
+        with self._scratch(packed, threads) as scratch:
+            where = self._level, threads, byref(packed.model)
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), units, *tensors
+            finite = library().sparse_answer(*where, *query, scratch.data_ptr())
+        return (cond, chunk) if finite else None
+
+    def _num_threads(self, rows: int) -> int:
+        """Return how many threads a batch of ``rows`` uses; more than there are panels in the narrowest product would wait."""
+        if self._threads is not None:
+            return self._threads
+        return min(torch.get_num_threads(), max(rows, -(-self._network.n_emb // PANEL)), MAX_THREADS)
 
     def refresh(self) -> None:
         """Pack the weights anew in the next query."""
@@ -187,11 +233,11 @@ class NativeEngine:
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
-        packed = self._current()
-        scratch = self._new_scratch(packed).zero_()
+        packed, threads = self._current(), self._num_threads(rows=1)
+        scratch = self._new_scratch(packed, threads).zero_()
 
         def walk(kind: int) -> None:
-            library().sparse_blocks(self._level, byref(packed.model), kind, scratch.data_ptr())
+            library().sparse_blocks(self._level, threads, byref(packed.model), kind, scratch.data_ptr())
 
         return time_blocks(walk, self._network.n_layer, repeats, scratch.device)
 
@@ -199,36 +245,32 @@ class NativeEngine:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
         return folded_block_macs(self._network)
 
-    def _run(self, packed, slots: int, row: int, mask, noise, cond, actions, scratch) -> None:
-        mask, noise, cond, actions = (
-            tensor.data_ptr() + row * tensor.stride(0) * tensor.element_size()
-            for tensor in (mask, noise, cond, actions)
-        )
-        library().sparse_denoise(
-            self._level, byref(packed.model), mask, slots, noise, cond, actions, scratch.data_ptr()
-        )
-
     @contextmanager
-    def _scratch(self, packed: PackedNetwork) -> Iterator[Tensor]:
+    def _scratch(self, packed: PackedNetwork, threads: int) -> Iterator[Tensor]:
         """Lend memory for one call at a time, from a stock that grows to as many as there are calls at a time."""
         try:
             scratch = self._stock.pop()
         except IndexError:
-            scratch = self._new_scratch(packed)
+            scratch = None
+        if scratch is None or scratch.numel() < threads * self._piece(packed):
+            scratch = self._new_scratch(packed, threads)
         yield scratch
         self._stock.append(scratch)
 
-    def _new_scratch(self, packed: PackedNetwork) -> Tensor:
-        """Allocate on a cache line, as PyTorch always does, with a slot for each block: enough for every reuse rule."""
-        size = library().sparse_scratch(byref(packed.model), self._dense.shape[1])
-        return torch.empty(size, dtype=torch.float32, device="cpu")
+    def _new_scratch(self, packed: PackedNetwork, threads: int) -> Tensor:
+        """Allocate on a cache line, as PyTorch always does."""
+        return torch.empty(threads * self._piece(packed), dtype=torch.float32, device="cpu")
+
+    def _piece(self, packed: PackedNetwork) -> int:
+        """Return the floats that a thread needs, with a slot for each block: enough for every reuse rule."""
+        return library().sparse_scratch(byref(packed.model), self._dense.shape[1])
 
     def _current(self) -> PackedNetwork:
         """Return the packed weights, packed anew if the network has changed."""
         version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
         if known != version:
-            packed = PackedNetwork(self._network, self._sampler, getattr(torch, self._weights))
+            packed = PackedNetwork(self._network, self._sampler, self._dtype)
             self._packed = (version, packed)
         return packed
 
@@ -237,15 +279,3 @@ class NativeEngine:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
         if mask is not None and not mask.is_cpu:
             raise ValueError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")
-
-
-def _run_in_threads(work: Callable[[], None], threads: int) -> None:
-    """Run ``work`` as often at the same time; one of the threads is the caller's."""
-    if threads == 1:
-        work()
-        return
-    with ThreadPoolExecutor(threads - 1) as pool:
-        tasks = [pool.submit(work) for _ in range(threads - 1)]
-        work()
-    for task in tasks:
-        task.result()

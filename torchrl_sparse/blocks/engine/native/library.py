@@ -23,10 +23,14 @@ _SIGNATURES = {
     "sparse_levels": (c_int32, []),
     "sparse_model_size": (c_int64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
-    "sparse_denoise": (None, [c_int32, c_void_p, c_void_p, c_int32, *[c_void_p] * 4]),
-    "sparse_blocks": (None, [c_int32, c_void_p, c_int32, c_void_p]),
+    "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 4]),
+    "sparse_answer": (
+        c_int32,
+        [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 7],
+    ),
+    "sparse_blocks": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p]),
     "sparse_gather": (None, [c_int32, *[c_void_p] * 2]),
-    "sparse_prune": (None, [c_int32, c_void_p, c_int32, *[c_void_p] * 3]),
+    "sparse_prune": (None, [c_int32, c_int32, c_void_p, c_int32, *[c_void_p] * 3]),
 }
 
 

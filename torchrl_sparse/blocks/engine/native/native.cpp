@@ -1,654 +1,107 @@
-// The denoising loop of one query of a Diffusion Policy transformer, for one CPU thread: plain C++17, no dependency.
-//
-// Python (engine.py) folds and packs the weights once, and calls `sparse_denoise` through ctypes once for every action chunk.
-// What is computed here, and why it is exact, is in folding.py and packing.py; this file is about doing it at the speed of
-// the machine.
-//
-// * With 5 to 16 rows of activations, a matrix product is limited by the multiply-adds only if each weight is loaded once.
-//   Weights are therefore packed in panels of 32 columns, which a tile of all rows x 32 columns reads front to back while
-//   its sums stay in registers; and in parts of 256 inputs, of which all rows stay in the L1 cache for all panels.
-// * Nothing is allocated and nothing is shared: all memory of a call is `scratch`, so that any number of threads may call.
-// * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.
-// * The kernels are written once, with the vector types of GCC and Clang, and compiled for four instruction sets by
-//   including this file in itself. The caller chooses one at run time.
+// The compiled engine as Python calls it, through ctypes (library.py), which releases the interpreter's lock.
 
-#ifndef VECTOR  // ---------------------------------------------------------------------- what is compiled only once
-
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
-#if defined(__x86_64__)
-#include <immintrin.h>
-#endif
 
-extern "C" {
-
-enum Type : int32_t { F32, F16, BF16 };
-
-// A packed matrix [part][columns / 32][inputs of the part][32]. Of BF16, two inputs count as one: they lie side by side.
-struct Matrix {
-    const void* weight;
-    const float* bias;  // [columns], or one row of it for each row of the result
-    int32_t rows, columns, bias_stride;
-    Type type;
-};
-
-struct Layer {
-    Matrix qkv, out, up, down;  // LayerNorm's gain and shift and 1/sqrt(head size) are folded in
-    Matrix kv;                  // cross-attention: memory token -> its keys and values
-    const Matrix* fold;         // [2][heads]: key -> what it weighs normalised activations with, value -> what it adds
-    const float* query_bias;    // [heads * padded head size]
-    const float* cross_bias;    // [padded width]
-};
-
-struct Model {
-    int32_t horizon, width, layers, heads, obs_steps, action_dim, cond_dim, steps, causal;
-    int32_t history;            // 0 unless the sampler reads earlier clean predictions
-    float clip;
-    const Layer* layer;
-    Matrix embed, head, encode_up, encode_down;  // embed and encode_up have a bias for each row: it holds the positions
-    const float* time_key;      // [steps][layers][heads][padded width], the folded keys of the time tokens
-    const float* time_value;    // likewise
-    const float* time_bias;     // [steps][layers][heads]
-    const float* coefficients;  // [steps][8], see coefficients.py
-    const float* valid;         // [padded width]: 1 for each column, 0 for the padding
-};
-
-// The MLP of a pruner, see pruner.py. A cell is a block of a denoising step.
-struct Pruner {
-    Matrix obs, middle;  // observation -> what it adds to every cell; cell -> its second hidden layer
-    const float* cells;  // [count][padded width]: what a cell is without an observation
-    const float* last;   // [padded width]
-    float bias;          // of the last layer
-    int32_t count;       // of cells
-    int32_t first;       // cells of the first step, which is never pruned
-};
-}
+#include "denoise.h"
+#include "team.h"
+#include "units.h"
 
 namespace {
 
-enum Activation { GELU, MISH };
-constexpr int PANEL = 32, PART = 256;
-constexpr int MAX_HIDDEN = 256;   // of a pruner
-constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
-using half = uint16_t;
-struct Pair { uint16_t first, second; };  // of BF16
+// Queries of one network and their memory: a piece of `piece` floats for each of `threads` threads, on cache lines.
+struct Batch {
+    const Level& level;
+    const Model& m;
+    const int32_t rows, slots;
+    const uint8_t* const pruned;
+    const size_t mask;  // from a row's to the next; 0 if all have the same
+    const float *const noise, *const cond;
+    float *const actions, *const scratch;
+    const size_t piece = Buffers(m, slots, nullptr, nullptr).size;
+    std::atomic<int32_t> next{0};
 
-constexpr int padded(int n) { return (n + PANEL - 1) / PANEL * PANEL; }
-// Rows are one cache line longer than needed: powers of two would put all rows of a column in one set of the cache.
-constexpr int stride(int n) { return padded(n) + 16; }
+    void query(const Member& who, ptrdiff_t row, float* own, float* shared) const {
+        const ptrdiff_t chunk = (ptrdiff_t)m.horizon * m.action_dim;
+        level.denoise(m, who, pruned + row * mask, slots, noise + row * m.steps * chunk,
+                      cond + row * m.obs_steps * m.cond_dim, actions + row * chunk, own, shared);
+    }
 
-// The memory of one call, cut out of `scratch`, and its strides. Sizes in floats; every part starts on a cache line.
-struct Buffers {
-    // Of folded vectors, of activations, of one and of all padded heads, of hidden activations, of scores.
-    const int width, ld, head, inner, ldh, lanes;
-    float *x, *y, *qkv, *mixed, *hidden, *rounded, *eps, *sample, *constant, *latest;
-    float* cleans;  // [2][horizon]: the clean predictions of the step before and of the one before it
-    float *token, *key, *value, *key_bias, *scores;  // memory tokens of cross-attention: [layers][1 + obs_steps][heads]
-    size_t size;
-    Buffers(const Model& m, int slots, float* at)
-        : width(padded(m.width)), ld(stride(m.width)), head((m.width / m.heads + 15) / 16 * 16), inner(m.heads * head),
-          ldh(stride(4 * m.width)), lanes(padded(m.horizon * m.heads)) {
-        float* const begin = at;
-        auto take = [&at](size_t n) { float* p = at; at += (n + 15) / 16 * 16; return p; };
-        const int tokens = m.horizon > m.obs_steps ? m.horizon : m.obs_steps, memory = 1 + m.obs_steps;
-        x = take(tokens * ld);
-        y = take(tokens * ld);
-        qkv = take(tokens * stride(3 * padded(inner)));
-        mixed = take(tokens * stride(inner));
-        hidden = take(tokens * ldh);
-        rounded = take(tokens * ldh);
-        eps = take(m.horizon * stride(m.action_dim));
-        sample = take(m.horizon * stride(m.action_dim));
-        cleans = take(2 * m.horizon * stride(m.action_dim));
-        constant = take(m.horizon * width);
-        latest = take((size_t)slots * m.horizon * ld);
-        token = take(m.obs_steps * ld);
-        const size_t folded = (size_t)m.layers * memory * m.heads;
-        key = take(folded * width);
-        value = take(folded * width);
-        key_bias = take(folded);
-        scores = take((size_t)(m.horizon > memory ? m.horizon : memory) * lanes);
-        size = at - begin;
+    // Rows go to one thread each, the next to whichever is free; those that are left and fewer than threads, to all together.
+    void work(const Member& who) {
+        const int32_t alone = rows / who.size * who.size;
+        float* const own = scratch + who.rank * piece;
+        for (int32_t row; (row = next.fetch_add(1)) < alone;) query(Member{}, row, own, own);
+        for (int32_t row = alone; row < rows; row++) {
+            who.meet();
+            query(who, row, own, scratch);
+        }
     }
 };
 
-}  // namespace
+template <class Task>
+void run(int32_t threads, Task& task) {
+    Team::run(threads, [](const Member& who, void* data) { (*static_cast<Task*>(data))(who); }, &task);
+}
 
-#define EXPANDED(text) _Pragma(#text)
-#define PRAGMA(text) EXPANDED(text)
-
-#define LEVEL portable
-#define VECTOR 4
-#include "native.cpp"
-#if defined(__x86_64__)
-#define LEVEL avx2
-#define VECTOR 8
-#define TARGET "avx2,fma,f16c"
-#include "native.cpp"
-#define LEVEL avx512
-#define VECTOR 16
-#define TARGET "avx512f,avx2,fma,f16c"
-#include "native.cpp"
-#define LEVEL avx512_bf16
-#define VECTOR 16
-#define TARGET "avx512bf16,avx512f,avx2,fma,f16c"
-#define DOT_BF16
-#include "native.cpp"
-#endif
-
-namespace {
-struct Level {
-    decltype(&portable::denoise) denoise;
-    decltype(&portable::run_blocks) run_blocks;
-    decltype(&portable::prune) prune;
-};
-const Level LEVELS[] = {
-    {portable::denoise, portable::run_blocks, portable::prune},
-#if defined(__x86_64__)
-    {avx2::denoise, avx2::run_blocks, avx2::prune},
-    {avx512::denoise, avx512::run_blocks, avx512::prune},
-    {avx512_bf16::denoise, avx512_bf16::run_blocks, avx512_bf16::prune},
-#endif
-};
 }  // namespace
 
 extern "C" {
 
-// Instruction sets that this CPU can run: the first 1 to 4 of LEVELS.
-int32_t sparse_levels() {
-#if defined(__x86_64__)
-    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return 1;
-    if (!__builtin_cpu_supports("avx512f")) return 2;
-    return __builtin_cpu_supports("avx512bf16") ? 4 : 3;
-#else
-    return 1;
-#endif
-}
+int32_t sparse_levels() { return levels(); }
 
 // For the caller to compare with its own: a library that was built from other sources reads other structures.
 int64_t sparse_model_size() { return (int64_t)sizeof(Model); }
 
-// Floats that a call needs as scratch, which must start on a cache line (64 bytes).
-int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(*m, slots, nullptr).size; }
+// Floats that each thread needs as scratch, which must start on a cache line (64 bytes).
+int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(*m, slots, nullptr, nullptr).size; }
 
-// pruned [steps][3 * layers], noise [steps][horizon][action_dim], cond [obs_steps][cond_dim] -> actions [horizon][action_dim].
-// The latest outputs are kept in `slots` places: one for each block, 3 (one for each type), or 1.
-void sparse_denoise(int32_t level, const Model* m, const uint8_t* pruned, int32_t slots, const float* noise,
-                    const float* cond, float* actions, float* scratch) {
-    LEVELS[level].denoise(*m, pruned, slots, noise, cond, actions, scratch);
+// For each of n rows: pruned [steps][3 * layers], noise [steps][horizon][action_dim], cond [obs_steps][cond_dim] -> actions
+// [horizon][action_dim]. The latest outputs are kept in `slots` places: one for each block, 3 (one for each type), or 1.
+void sparse_denoise(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
+                    const float* noise, const float* cond, float* actions, float* scratch) {
+    Batch batch{LEVELS[level], *m, n, slots, pruned, (size_t)m->steps * 3 * m->layers, noise, cond, actions, scratch};
+    auto task = [&](const Member& who) { batch.work(who); };
+    run(threads, task);
+}
+
+// The same from states to chunks [horizon - obs_steps + 1][action_dim] in the units of the environment, with one mask for all
+// rows; cond and actions are written too. Returns 0, and nothing else happens, if a state is not finite.
+int32_t sparse_answer(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
+                      const float* noise, const Units* units, const float* states, float* cond, float* actions, float* chunks,
+                      float* scratch) {
+    if (!normalise(*units, states, (size_t)n * m->obs_steps, m->cond_dim, cond)) return 0;
+    Batch batch{LEVELS[level], *m, n, slots, pruned, 0, noise, cond, actions, scratch};
+    auto task = [&](const Member& who) { batch.work(who); };
+    run(threads, task);
+    const size_t past = m->obs_steps - 1, steps = m->horizon - past, dim = m->action_dim;
+    for (size_t row = 0; row < (size_t)n; row++)
+        unnormalise(*units, actions + (row * m->horizon + past) * dim, steps, dim, chunks + row * steps * dim);
+    return 1;
 }
 
 // To be timed by the caller: runs the blocks of `kind` (0 SA, 1 CA, 2 FFN) of all layers.
-void sparse_blocks(int32_t level, const Model* m, int32_t kind, float* scratch) {
-    LEVELS[level].run_blocks(*m, kind, scratch);
+void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind, float* scratch) {
+    const size_t piece = Buffers(*m, 3, nullptr, nullptr).size;
+    auto task = [&](const Member& who) { LEVELS[level].run_blocks(*m, who, kind, scratch + who.rank * piece, scratch); };
+    run(threads, task);
 }
 
 // What lies at n places.
 void sparse_gather(int32_t n, const float* const* places, float* values) {
+    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);  // none is in a cache, and they are nowhere near each other
     for (int32_t i = 0; i < n; i++) values[i] = *places[i];
 }
 
 // observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.
-void sparse_prune(int32_t level, const Pruner* pruner, int32_t n, const float* observations, float* logits, uint8_t* masks) {
-    for (ptrdiff_t i = 0; i < n; i++)
-        LEVELS[level].prune(*pruner, observations + i * pruner->obs.rows, logits ? logits + i * pruner->count : nullptr,
-                            masks ? masks + i * pruner->count : nullptr);
+void sparse_prune(int32_t level, int32_t threads, const Pruner* pruner, int32_t n, const float* observations, float* logits,
+                  uint8_t* masks) {
+    auto task = [&](const Member& who) {
+        for (ptrdiff_t i = 0; i < n; i++)
+            LEVELS[level].prune(*pruner, who, observations + i * pruner->obs.rows, logits ? logits + i * pruner->count : nullptr,
+                                masks ? masks + i * pruner->count : nullptr);
+    };
+    run(threads, task);
 }
 }
-
-#else  // -------------------------------------------------------------- compiled once for each instruction set
-// No function of another header may be called here: the linker could keep the copy for the wrong instruction set.
-
-#if !defined(TARGET)
-#elif defined(__clang__)
-PRAGMA(clang attribute push(__attribute__((target(TARGET))), apply_to = function))
-#else
-#pragma GCC push_options
-PRAGMA(GCC target(TARGET))
-#endif
-
-namespace {
-namespace LEVEL {
-
-#define INLINE static inline __attribute__((always_inline))
-typedef float V __attribute__((vector_size(4 * VECTOR)));
-typedef int32_t I __attribute__((vector_size(4 * VECTOR)));
-typedef half H __attribute__((vector_size(2 * VECTOR)));
-typedef float Unaligned __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
-typedef half UnalignedHalf __attribute__((vector_size(2 * VECTOR), aligned(2), may_alias));
-
-constexpr int REGISTERS = VECTOR == 16 ? 32 : 16;
-// Rows of a tile. 16 are the longest published horizon; 6 rows x 2 vectors of sums, 2 of weights and 1 of activations fill
-// 15 of 16 registers.
-constexpr int MAX_ROWS = VECTOR == 16 ? 16 : 6;
-
-INLINE V load(const float* p) { return *(const Unaligned*)p; }
-INLINE V load(const Pair* p) { return *(const Unaligned*)p; }
-INLINE void store(float* p, V v) { *(Unaligned*)p = v; }
-INLINE V splat(float f) { return f - V{}; }  // not V{} + f, which is not f if f is -0 and so costs an addition
-
-INLINE V load(const half* p) {
-#if VECTOR == 16
-    return _mm512_cvtph_ps(_mm256_loadu_si256((const __m256i*)p));
-#elif VECTOR == 8
-    return _mm256_cvtph_ps(_mm_loadu_si128((const __m128i*)p));
-#else
-    const I bits = __builtin_convertvector(*(const UnalignedHalf*)p, I);
-    // The exponents of f16 and f32 differ by 112; multiplying is right for subnormal numbers as well.
-    const V magnitude = (V)((bits & 0x7fff) << 13) * 0x1p112f;
-    return (V)((I)magnitude | (bits & 0x8000) << 16);
-#endif
-}
-
-// sums + weights * activations: of one input, or of a pair of them.
-INLINE V accumulate(V sums, V weights, V x, const float*) { return sums + weights * x; }
-INLINE V accumulate(V sums, V weights, V x, const half*) { return sums + weights * x; }
-INLINE V accumulate(V sums, V weights, V x, const Pair*) {
-#if defined(DOT_BF16)
-    return _mm512_dpbf16_ps(sums, (__m512bh)weights, (__m512bh)x);
-#else
-    const int second = ~0xffff;  // BF16 is the upper half of F32
-    sums += (V)((I)weights << 16) * (V)((I)x << 16);
-    return sums + (V)((I)weights & second) * (V)((I)x & second);
-#endif
-}
-
-INLINE float sum(V v) {
-#if VECTOR == 16
-    return _mm512_reduce_add_ps(v);
-#else
-    float total = 0;
-    for (int i = 0; i < VECTOR; i++) total += v[i];
-    return total;
-#endif
-}
-
-// e^x for x <= 88, to 1e-7; at most e^-87 instead of anything smaller.
-INLINE V exponential(V x) {
-    x = x > -87.f ? x : splat(-87.f);
-    const V shifted = x * 1.44269504f + 12582912.f;  // 1.5 * 2^23: rounds to an integer, kept in the lowest bits
-    const V n = shifted - 12582912.f;
-    const V r = (x - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
-    V p = splat(1 / 5040.f);
-    p = p * r + 1 / 720.f;
-    p = p * r + 1 / 120.f;
-    p = p * r + 1 / 24.f;
-    p = p * r + 1 / 6.f;
-    p = p * r + .5f;
-    p = p * r + 1.f;
-    p = p * r + 1.f;
-    return p * (V)(((I)shifted - 0x4b400000 + 127) << 23);
-}
-
-// x * Phi(x), the exact ("erf") GELU. Phi(-t) = e^(-t^2/2) R(t), where R is a polynomial in 1 / (1 + t/4), fitted to 3e-9:
-// the result is closer to the exact one than 0.5 x (1 + erf(x/sqrt 2)) in f32, which cancels for negative x.
-INLINE V gelu(V x) {
-    const V t = x < 0.f ? -x : x;
-    const V s = 1.f / (1.f + .25f * t);
-    V p = splat(-0.0891343507619017f);
-    p = p * s + 0.32901832999352676f;
-    p = p * s - 0.2403634955249936f;
-    p = p * s + 0.25131202873702246f;
-    p = p * s + 0.04349856146156995f;
-    p = p * s + 0.1060035273473261f;
-    p = p * s + 0.09966539603291726f;
-    p = p * s * exponential(-.5f * t * t);
-    return x * (x < 0.f ? p : 1.f - p);
-}
-
-INLINE V relu(V x) { return x > 0.f ? x : V{}; }
-
-// x * tanh(ln(1 + e^x)), written with e^x alone.
-INLINE V mish(V x) {
-    const V e = exponential(x < 20.f ? x : splat(20.f));
-    const V n = e * (e + 2.f);
-    return x * (n / (n + 2.f));
-}
-
-// y[row] = start[row] + x[row] * panel, for MR rows and the 32 columns of a panel, in strips of as many vectors as there are
-// registers for. The processor does not fetch fast enough by itself what comes next: panels lie one behind the other.
-template <int MR, class T>
-void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const float* start, ptrdiff_t ld_start, float* y,
-          ptrdiff_t ldy) {
-    constexpr int N = 2 * MR + 3 <= REGISTERS ? 2 : 1, AHEAD = 1280 / MR;
-    for (int strip = 0; strip < PANEL; strip += N * VECTOR) {
-        const float* x = input;
-        const T* w = panel + strip;
-        V sums[MR][N], weights[N];
-#pragma GCC unroll 16
-        for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) sums[m][n] = load(start + m * ld_start + strip + n * VECTOR);
-        for (int k = 0; k < rows; k++, w += PANEL, x++) {
-            for (int n = 0; n < N; n++) {
-                __builtin_prefetch(w + AHEAD * PANEL + n * VECTOR, 0, 2);
-                weights[n] = load(w + n * VECTOR);
-            }
-#pragma GCC unroll 16
-            for (int m = 0; m < MR; m++) {
-                const V f = splat(x[m * ldx]);
-                for (int n = 0; n < N; n++) sums[m][n] = accumulate(sums[m][n], weights[n], f, w);
-            }
-        }
-#pragma GCC unroll 16
-        for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, sums[m][n]);
-    }
-}
-
-template <int MR, class T>
-INLINE void tiles(int count, const float* x, int ldx, const T* w, int rows, const float* b, int ldb, float* y, int ldy) {
-    if constexpr (MR > 0) {
-        if (count == MR) return tile<MR>(x, ldx, w, rows, b, ldb, y, ldy);
-        tiles<MR - 1>(count, x, ldx, w, rows, b, ldb, y, ldy);
-    }
-}
-
-// y [n, columns] = x [n, rows] * weight + bias.
-template <class T>
-void multiply(const float* x, int ldx, int n, const Matrix& a, float* y, int ldy) {
-    const int groups = (n + MAX_ROWS - 1) / MAX_ROWS;
-    const T* w = (const T*)a.weight;
-    for (int k = 0; k < a.rows; k += PART) {
-        const int depth = a.rows - k < PART ? a.rows - k : PART;
-        const float* const start = k ? y : a.bias;  // y holds the sums so far
-        const int ld_start = k ? ldy : a.bias_stride;
-        for (int c = 0; c < a.columns; c += PANEL, w += (size_t)depth * PANEL)
-            for (int g = 0; g < groups; g++) {
-                const int m = n * g / groups, count = n * (g + 1) / groups - m;
-                tiles<MAX_ROWS>(count, x + m * ldx + k, ldx, w, depth, start + m * ld_start + c, ld_start,
-                                y + m * ldy + c, ldy);
-            }
-    }
-}
-
-INLINE float dot(const float* a, const float* c, int n) {
-    V total{};
-    for (int j = 0; j < n; j += VECTOR) total += load(a + j) * load(c + j);
-    return sum(total);
-}
-
-// One query.
-struct Query {
-    const Model& m;
-    const Buffers b;
-    const int slots;
-
-    Query(const Model& m, int slots, float* scratch) : m(m), b(m, slots, scratch), slots(slots) {}
-
-    // Whether action t may not look at action s or, in the memory, at token s.
-    bool hidden(int s, int t) const { return m.causal && s > t; }
-
-    void product(const float* x, int ldx, int n, const Matrix& a, float* y, int ldy) const {
-        if (a.type == F32) return multiply<float>(x, ldx, n, a, y, ldy);
-        if (a.type == F16) return multiply<half>(x, ldx, n, a, y, ldy);
-        const int ld_rounded = b.ldh / 2;
-        for (int t = 0; t < n; t++) round(x + t * ldx, 2 * a.rows, b.rounded + t * ld_rounded);
-        multiply<Pair>(b.rounded, ld_rounded, n, a, y, ldy);
-    }
-
-    // f32 to BF16, to nearest even. `x` is padded to whole vectors.
-    static void round(const float* x, int n, float* pairs) {
-        for (int j = 0; j < n; j += VECTOR) {
-            const I bits = (I)load(x + j);
-            *(UnalignedHalf*)((half*)pairs + j) = __builtin_convertvector((bits + 0x7fff + (bits >> 16 & 1)) >> 16, H);
-        }
-    }
-
-    // y = (x - mean) / std of every row; gain and shift are in the weights that follow.
-    void normalise(const float* x, float* y) const {
-        for (int t = 0; t < m.horizon; t++, x += b.ld, y += b.ld) {
-            V total{}, squares{};
-            for (int j = 0; j < b.width; j += VECTOR) total += load(x + j);
-            const float mean = sum(total) / m.width;
-            for (int j = 0; j < b.width; j += VECTOR) {
-                const V centred = (load(x + j) - mean) * load(m.valid + j);
-                squares += centred * centred;
-                store(y + j, centred);
-            }
-            const float scale = 1.f / __builtin_sqrtf(sum(squares) / m.width + 1e-5f);
-            for (int j = 0; j < b.width; j += VECTOR) store(y + j, load(y + j) * scale);
-        }
-    }
-
-    // Scores lie as [key][lane], a lane being one head of one query: n keys are summed up without leaving the vector.
-    float& score(int key, int t, int h) const { return b.scores[(size_t)key * b.lanes + t * m.heads + h]; }
-
-    void softmax(int n) const {
-        for (int lane = 0; lane < b.lanes; lane += VECTOR) {
-            float* const s = b.scores + lane;
-            V most = load(s), total{};
-            for (int i = 1; i < n; i++) {
-                const V v = load(s + (size_t)i * b.lanes);
-                most = v > most ? v : most;
-            }
-            for (int i = 0; i < n; i++) {
-                const V e = exponential(load(s + (size_t)i * b.lanes) - most);
-                store(s + (size_t)i * b.lanes, e);
-                total += e;
-            }
-            const V scale = 1.f / total;
-            for (int i = 0; i < n; i++) store(s + (size_t)i * b.lanes, load(s + (size_t)i * b.lanes) * scale);
-        }
-    }
-
-    void self_attention(const Layer& layer, float* d) const {
-        const int part = padded(b.inner), ldq = stride(3 * part), ldm = stride(b.inner), head = b.head;
-        product(b.y, b.ld, m.horizon, layer.qkv, b.qkv, ldq);
-        const float *keys = b.qkv + part, *values = keys + part;
-        for (int t = 0; t < m.horizon; t++)
-            for (int h = 0; h < m.heads; h++)
-                for (int s = 0; s < m.horizon; s++)
-                    score(s, t, h) = hidden(s, t) ? UNSEEN : dot(b.qkv + t * ldq + h * head, keys + s * ldq + h * head, head);
-        softmax(m.horizon);
-        for (int t = 0; t < m.horizon; t++)
-            for (int h = 0; h < m.heads; h++)
-                for (int j = h * head; j < h * head + head; j += VECTOR) {
-                    V total{};
-                    for (int s = 0; s < m.horizon && !hidden(s, t); s++) total += load(values + s * ldq + j) * score(s, t, h);
-                    store(b.mixed + t * ldm + j, total);
-                }
-        product(b.mixed, ldm, m.horizon, layer.out, d, b.ld);
-    }
-
-    // Index of the first of the folded vectors of a layer.
-    size_t memory(int layer) const { return (size_t)layer * (1 + m.obs_steps) * m.heads; }
-
-    static void copy(const float* from, size_t n, float* to) {
-        for (size_t i = 0; i < n; i++) to[i] = from[i];
-    }
-
-    // Scores and outputs are products with the folded memory: 1 + obs_steps vectors for each head and side.
-    void cross_attention(int step, int index, float* d) const {
-        const size_t time = ((size_t)step * m.layers + index) * m.heads;
-        float *const keys = b.key + memory(index) * b.width, *const values = b.value + memory(index) * b.width;
-        float* const key_bias = b.key_bias + memory(index);
-        copy(m.time_key + time * b.width, (size_t)m.heads * b.width, keys);
-        copy(m.time_value + time * b.width, (size_t)m.heads * b.width, values);
-        copy(m.time_bias + time, m.heads, key_bias);
-        // Token 0 is the denoising step, which all actions see; token s the observation s - 1.
-        for (int t = 0; t < m.horizon; t++)
-            for (int s = 0; s <= m.obs_steps; s++)
-                for (int h = 0; h < m.heads; h++) {
-                    const int i = s * m.heads + h;
-                    const bool unseen = hidden(s - 1, t);
-                    score(s, t, h) = unseen ? UNSEEN : dot(b.y + t * b.ld, keys + (size_t)i * b.width, b.width) + key_bias[i];
-                }
-        softmax(1 + m.obs_steps);
-        for (int t = 0; t < m.horizon; t++)
-            for (int j = 0; j < b.width; j += VECTOR) {
-                V total = load(m.layer[index].cross_bias + j);
-                for (int s = 0; s <= m.obs_steps && !hidden(s - 1, t); s++)
-                    for (int h = 0; h < m.heads; h++)
-                        total += load(values + (size_t)(s * m.heads + h) * b.width + j) * score(s, t, h);
-                store(d + t * b.ld + j, total);
-            }
-    }
-
-    void activate(int n, Activation kind) const {
-        for (int t = 0; t < n; t++)
-            for (float* p = b.hidden + t * b.ldh, *end = p + padded(4 * m.width); p < end; p += VECTOR)
-                store(p, kind == GELU ? gelu(load(p)) : mish(load(p)));
-    }
-
-    void feed_forward(const Layer& layer, float* d) const {
-        product(b.y, b.ld, m.horizon, layer.up, b.hidden, b.ldh);
-        activate(m.horizon, GELU);
-        product(b.hidden, b.ldh, m.horizon, layer.down, d, b.ld);
-    }
-
-    // x += what a block adds.
-    void compute(int step, int block) const {
-        float* const d = b.latest + (size_t)(block % slots) * m.horizon * b.ld;
-        const int index = block / 3;
-        normalise(b.x, b.y);
-        if (block % 3 == 0) self_attention(m.layer[index], d);
-        if (block % 3 == 1) cross_attention(step, index, d);
-        if (block % 3 == 2) feed_forward(m.layer[index], d);
-        for (int i = 0; i < m.horizon * b.ld; i += VECTOR) store(b.x + i, load(b.x + i) + load(d + i));
-    }
-
-    // to [horizon, width] = from + what the blocks first .. last-1 add, in one pass.
-    void reuse(const float* from, int ld_from, float* to, int ld_to, int first, int last) const {
-        const bool shared = slots < 3 * m.layers;  // a slot counts as often as its blocks occur
-        const int begin = shared ? 0 : first, end = shared ? slots : last;
-        for (int t = 0; t < m.horizon; t++)
-            for (int j = 0; j < b.width; j += VECTOR) {
-                V total = load(from + t * ld_from + j);
-                for (int s = begin; s < end; s++) {
-                    const int before = slots - 1 - s;
-                    const float times = shared ? (last + before) / slots - (first + before) / slots : 1;
-                    total += load(b.latest + ((size_t)s * m.horizon + t) * b.ld + j) * times;
-                }
-                store(to + t * ld_to + j, total);
-            }
-    }
-
-    // Encodes the observations and folds them into the cross-attention of every layer.
-    void encode(const float* cond) const {
-        const int n = m.obs_steps, part = padded(b.inner), ldk = stride(2 * part);
-        product(cond, m.cond_dim, n, m.encode_up, b.hidden, b.ldh);
-        activate(n, MISH);
-        product(b.hidden, b.ldh, n, m.encode_down, b.token, b.ld);
-        for (int i = 0; i < m.layers; i++) {
-            const Layer& layer = m.layer[i];
-            const size_t first = memory(i) + m.heads;  // behind the vectors of the time token
-            product(b.token, b.ld, n, layer.kv, b.qkv, ldk);
-            for (int side = 0; side < 2; side++)
-                for (int h = 0; h < m.heads; h++)
-                    product(b.qkv + side * part + h * b.head, ldk, n, layer.fold[side * m.heads + h],
-                            (side ? b.value : b.key) + (first + h) * b.width, m.heads * b.width);
-            for (int o = 0; o < n; o++)
-                for (int h = 0; h < m.heads; h++)
-                    b.key_bias[first + o * m.heads + h] = dot(b.qkv + o * ldk + h * b.head, layer.query_bias + h * b.head, b.head);
-        }
-    }
-
-    // Predicts the noise from the residual stream and takes the sampler's step, with MEMORY of earlier clean predictions.
-    template <bool MEMORY>
-    void advance(int step, const float* noise) const {
-        normalise(b.x, b.y);
-        const int lda = stride(m.action_dim);
-        product(b.y, b.ld, m.horizon, m.head, b.eps, lda);
-        const float* c = m.coefficients + 8 * step;
-        float* const previous = b.cleans;
-        float* const earlier = previous + m.horizon * lda;
-        for (int t = 0; t < m.horizon; t++)
-            for (int j = 0; j < m.action_dim; j++) {
-                float& sample = b.sample[t * lda + j];
-                const float eps = b.eps[t * lda + j];
-                float clean = (sample - c[0] * eps) / c[1];
-                clean = clean > m.clip ? m.clip : clean < -m.clip ? -m.clip : clean;
-                float next = c[2] * clean + c[3] * sample + c[4] * eps;
-                if constexpr (MEMORY) {
-                    const int at = t * lda + j;
-                    next += c[5] * previous[at] + c[6] * earlier[at];
-                    earlier[at] = previous[at];
-                    previous[at] = clean;
-                }
-                sample = noise ? next + c[7] * noise[t * m.action_dim + j] : next;
-            }
-    }
-
-    void run(const uint8_t* pruned, const float* noise, const float* cond, float* actions) const {
-        const int lda = stride(m.action_dim), size = m.horizon * m.action_dim, blocks = 3 * m.layers;
-        encode(cond);
-        Matrix constant = m.embed;  // of a step without a computed block: what all of them add goes into the bias
-        constant.bias = b.constant;
-        bool known = false;  // whether b.constant is of the latest outputs
-        for (int t = 0; t < m.horizon; t++) copy(noise + t * m.action_dim, m.action_dim, b.sample + t * lda);
-        if (m.history)
-            for (int i = 0; i < 2 * m.horizon * lda; i++) b.cleans[i] = 0;
-        for (int step = 0; step < m.steps; step++, pruned += blocks) {
-            const bool empty = run_end(pruned, 0, blocks) == blocks;
-            if (empty && !known) reuse(m.embed.bias, b.width, b.constant, b.width, 0, blocks);
-            known = empty;
-            product(b.sample, lda, m.horizon, empty ? constant : m.embed, b.x, b.ld);
-            for (int block = empty ? blocks : 0, end; block < blocks; block = end + 1) {
-                end = run_end(pruned, block, blocks);
-                if (end > block) reuse(b.x, b.ld, b.x, b.ld, block, end);
-                if (end < blocks) compute(step, end);
-            }
-            const float* const gaussian = step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr;
-            m.history ? advance<true>(step, gaussian) : advance<false>(step, gaussian);
-        }
-        for (int t = 0; t < m.horizon; t++) copy(b.sample + t * lda, m.action_dim, actions + t * m.action_dim);
-    }
-
-    // The first computed block from `block` on: pruned ones before it add a sum of what is there already.
-    static int run_end(const uint8_t* pruned, int block, int blocks) {
-        while (block < blocks && pruned[block]) block++;
-        return block;
-    }
-};
-
-void denoise(const Model& m, const uint8_t* pruned, int slots, const float* noise, const float* cond, float* actions,
-             float* scratch) {
-    Query(m, slots, scratch).run(pruned, noise, cond, actions);
-}
-
-void run_blocks(const Model& m, int kind, float* scratch) {
-    for (int layer = 0; layer < m.layers; layer++) Query(m, 3, scratch).compute(0, 3 * layer + kind);
-}
-
-// One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
-void prune(const Pruner& p, const float* observation, float* logits, uint8_t* mask) {
-    // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
-    constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
-    constexpr int ld = stride(MAX_HIDDEN);
-    alignas(64) float added[ld], x[GROUP * ld], y[GROUP * ld];
-    const int width = p.middle.columns;
-    multiply<float>(observation, 0, 1, p.obs, added, 0);
-    for (int first = 0; first < p.count; first += GROUP) {
-        const int n = p.count - first < GROUP ? p.count - first : GROUP;
-        for (int c = 0; c < n; c++)
-            for (int j = 0; j < width; j += VECTOR) {
-                const float* const cell = p.cells + (size_t)(first + c) * width + j;
-                __builtin_prefetch(cell + 2 * GROUP * width);  // a policy's weights have driven the cells out of the cache
-                store(x + c * ld + j, relu(load(cell) + load(added + j)));
-            }
-        multiply<float>(x, ld, n, p.middle, y, ld);
-        for (int c = 0; c < n; c++) {
-            V total{};
-            for (int j = 0; j < width; j += VECTOR) total += relu(load(y + c * ld + j)) * load(p.last + j);
-            const float logit = p.bias + sum(total);
-            if (logits) logits[first + c] = logit;
-            if (mask) mask[first + c] = logit > 0.f && first + c >= p.first;
-        }
-    }
-}
-
-#undef INLINE
-}  // namespace LEVEL
-}  // namespace
-
-#if !defined(TARGET)
-#elif defined(__clang__)
-#pragma clang attribute pop
-#else
-#pragma GCC pop_options
-#endif
-#undef LEVEL
-#undef VECTOR
-#undef TARGET
-#undef DOT_BF16
-#endif

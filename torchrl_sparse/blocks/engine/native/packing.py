@@ -9,7 +9,7 @@ what it returns is packed here:
 * An observation's embedding and the first layer of its encoder are one matrix.
 * Position embeddings are biases of the layers before them, one row for each token.
 
-Heads are padded to multiples of 16, rows to whole panels. ``native.cpp`` declares the same structures.
+Heads are padded to multiples of 16, rows to whole panels. ``denoise.h`` declares the same structures.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.tensors import check_shapes
 
-__all__ = ["Model", "PackedNetwork"]
+__all__ = ["Model", "PackedNetwork", "weight_type"]
+
+_WEIGHTS = ("float32", "float16", "bfloat16")
 
 _HEAD = 16  # heads are padded to whole vectors
 
@@ -49,7 +51,7 @@ class _Layer(ctypes.Structure):
 
 
 class Model(ctypes.Structure):
-    """``struct Model`` of native.cpp."""
+    """``struct Model`` of denoise.h."""
 
     _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps"]
     _fields_ = [
@@ -71,7 +73,7 @@ class PackedNetwork:
             :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`.
 
     Attributes:
-        model: the structure that native.cpp reads.
+        model: the structure that denoise.h reads.
 
     Raises:
         ValueError: naming a weight that has another shape than the network was made with.
@@ -174,6 +176,13 @@ class PackedNetwork:
 
     def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
         return self._arena.matrix(weight, bias, self._weights)
+
+
+def weight_type(name: str) -> torch.dtype:
+    """Return the type of weights of that name, or raise ValueError if there is none."""
+    if name not in _WEIGHTS:
+        raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
+    return getattr(torch, name)
 
 
 def _parts(tensor: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The MLP of a learned planner in the compiled code of ``native.cpp``: a product with all cells of a mask, and nothing
+"""The MLP of a learned planner in the compiled code of ``denoise.h``: a product with all cells of a mask, and nothing
 kept between.
 
 PyTorch takes four passes over an activation of [K * 3L, hidden]; here a dozen cells at a time stay in the L1 cache.
@@ -19,11 +19,11 @@ from torchrl_sparse.blocks.engine.native.library import instruction_level, libra
 
 __all__ = ["MAX_HIDDEN", "NativePruner", "PrunerWeights"]
 
-MAX_HIDDEN = 256  # of native.cpp, which keeps a dozen cells on the stack
+MAX_HIDDEN = 256  # of denoise.h, which keeps a dozen cells on the stack
 
 
 class _Pruner(ctypes.Structure):
-    """``struct Pruner`` of native.cpp."""
+    """``struct Pruner`` of denoise.h."""
 
     _fields_ = [
         *((name, Matrix) for name in ("obs", "middle")),
@@ -58,11 +58,16 @@ class NativePruner:
     """Computes by how much pruning is preferred to keeping, for every block. Not differentiable.
 
     The two linear layers before the sum over cells are one here, and of the last layer's two logits the difference. A
-    row of a batch is computed exactly as it would be alone. Calls from several threads may overlap.
+    row of a batch is computed exactly as it would be alone, on ``torch.get_num_threads()`` threads, whose number changes
+    nothing. Calls from several threads may overlap.
 
     Args:
         weights: with at most `MAX_HIDDEN` hidden activations; they are copied. The compiled library has to be there.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
+
+    Attributes:
+        packed: the structure that denoise.h reads.
+        hidden: activations of its hidden layers.
 
     Raises:
         ValueError: if this CPU does not have the instruction set.
@@ -79,7 +84,8 @@ class NativePruner:
         self._level = instruction_level(instruction_set)
         self._arena = Arena()
         with torch.no_grad():
-            self._pruner = self._pack(weights)
+            self.packed = self._pack(weights)
+        self.hidden = len(weights.last[0][0])
         self._features = weights.obs[0].shape[1]
         self._shape = weights.cells.shape[:2]
 
@@ -127,5 +133,5 @@ class NativePruner:
                 f"got {features.dtype} {list(features.shape)} on {features.device}"
             )
         features = features.contiguous()
-        pruner = byref(self._pruner)
-        library().sparse_prune(self._level, pruner, len(features), features.data_ptr(), logits, masks)
+        where = self._level, torch.get_num_threads()
+        library().sparse_prune(*where, byref(self.packed), len(features), features.data_ptr(), logits, masks)

@@ -1,0 +1,23 @@
+"""Parts of a query of an image policy."""
+
+import pytest
+import torch
+
+from torchrl_sparse.evaluation.latency.engine_cases import make_network
+from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, stage_seconds
+
+
+def test_a_whole_query_of_the_image_shape_is_timed_by_parts():
+    torch.manual_seed(0)
+    policy = image_policy(make_network("image", quick=True), width=16)
+    query = image_query(policy, batch=2)
+    seconds = stage_seconds(policy, query, repeats=2)
+    assert list(seconds) == ["encode", "plan", "denoise"]
+    assert min(seconds.values()) > 0
+    assert set(query.keys()) == {"history", "episode"}
+    assert policy(query)["vla_action", "chunk"].shape[0] == 2
+
+
+def test_a_condition_without_room_for_features_is_refused():
+    with pytest.raises(ValueError, match=r"^cond_dim: expected more than the features' 128, got 19$"):
+        image_policy(make_network("low_dim", quick=True), width=16)

@@ -1,0 +1,246 @@
+"""Exported policies: a C program gives the chunks of Python, to the last bit, and nothing in a file can hurt it."""
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+import zlib
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_sparse import DiffusionPolicy
+from torchrl_sparse.blocks.engine.native import NativeEngine, native_available, tsp
+from torchrl_sparse.blocks.planner import Planner, StaticPlanner
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
+
+AVAILABLE, REASON = native_available()
+pytestmark = [
+    pytest.mark.skipif(not AVAILABLE, reason=REASON),
+    pytest.mark.skipif(not (shutil.which("cc") and shutil.which("c++")), reason="no compiler"),
+]
+SOURCES = Path(tsp.__file__).parent
+FUZZ = Path(__file__).parents[2] / "blocks/engine/native/tsp_fuzz.c"
+FLAGS = [
+    "-O3",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-exceptions",
+    "-fno-rtti",
+]  # as CMakeLists.txt has them
+# With `make sanitize`: compiling that takes longer than all other tests here.
+SANITIZE = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+SANITIZED = "SANITIZED_NATIVE" in os.environ
+
+
+def build(folder, program, cpp_flags, c_flags=()):
+    """Compile the library and a C program that is linked with it, by the C compiler: nothing of C++ is needed."""
+    for command in (
+        ["c++", "-std=c++17", *cpp_flags, "-c", SOURCES / "tsp.cpp", "-o", folder / "tsp.o"],
+        ["cc", *c_flags, f"-I{SOURCES}", program, folder / "tsp.o", "-lm", "-o", folder / program.stem],
+    ):
+        run(command, check=True)
+    return folder / program.stem
+
+
+def run(command, **options):
+    """Without the libraries that a sanitized Python has loaded before all others."""
+    environment = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
+    return subprocess.run([str(part) for part in command], env=environment, **options)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tsp")
+
+
+@pytest.fixture(scope="module")
+def example(folder):
+    return build(folder, SOURCES / "example.c", FLAGS)
+
+
+def make_policy(sampler=None, plan=None, **sizes):
+    torch.manual_seed(0)
+    sizes = {"horizon": 6, "n_obs_steps": 2, "cond_dim": 5, "n_layer": 2, "n_emb": 32} | sizes
+    network = TransformerForDiffusion(input_dim=7, output_dim=7, **sizes)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    state, action = torch.randn(50, sizes["cond_dim"]), 3 * torch.randn(50, 7)
+    normalizer = Normalizer.fit(state, action, state_mode="range", poses=False)
+    policy = DiffusionPolicy(network, normalizer, sampler=sampler or Sampler("ddpm", 8), plan=plan)
+    policy.noise = "philox"
+    return policy
+
+
+def run_example(example, path, history, seeds):
+    lines = [
+        f"{seed} " + " ".join(value.hex() for value in row.double().flatten().tolist())
+        for seed, row in zip(seeds, history, strict=True)
+    ]
+    done = run([example, path], input="\n".join(lines), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return torch.tensor([[float.fromhex(word) for word in line.split()] for line in done.stdout.splitlines()])
+
+
+def check_equal(example, policy, path, **options):
+    """Export, and compare the answers to some queries bit by bit."""
+    policy.export(path, **options)
+    network, seeds = policy.network, [0, 1, 2**40 + 3, 2**63 - 1]
+    history = torch.randn(
+        4, network.n_obs_steps, network.cond_dim, generator=torch.Generator().manual_seed(1)
+    )
+    with torch.no_grad():
+        data = TensorDict({"history": {"state": history}}, [4])
+        policy.module["encode"](data)
+        data["diffusion", "seed"] = torch.tensor(seeds)[:, None]
+        for stage in ("plan", "denoise"):
+            policy.module[stage](data)
+    expected = data["vla_action", "chunk"]
+    assert expected.isfinite().all()
+    got = run_example(example, path, history, seeds)
+    assert torch.equal(got, expected.flatten(1))
+    assert not torch.equal(got[0], got[1])
+
+
+class Half(StaticPlanner):
+    def __init__(self, reuse):
+        super().__init__()
+        self.reuse = reuse
+
+    def mask(self, spec):
+        mask = (
+            torch.rand(spec.num_inference_steps, spec.num_blocks, generator=torch.Generator().manual_seed(0))
+            < 0.5
+        )
+        mask[0] = False
+        return mask
+
+
+def make_pruner(policy, **options):
+    shape = (policy.n_obs_steps, policy.network.cond_dim)
+    torch.manual_seed(1)
+    network = PrunerNetwork(policy.sampler.timesteps.tolist(), policy.num_blocks, shape, **options)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.4)
+    rates = (0.2, 0.8) if network.rate_input else None
+    return SAGPruner(network, PrunerInfo(policy.fingerprint, policy.sampler.name, 0.5, rates))
+
+
+@pytest.mark.parametrize("name", ["ddpm8", "ddim_87_20", "ddim_90_50_10_eta0.5", "unipc5", "sde2m4"])
+def test_every_kind_of_sampler(example, tmp_path, name):
+    check_equal(example, make_policy(Sampler.from_name(name)), tmp_path / "policy.tsp")
+
+
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
+def test_masks_under_every_rule(example, tmp_path, reuse):
+    check_equal(example, make_policy(plan=Half(reuse)), tmp_path / "policy.tsp")
+
+
+@pytest.mark.parametrize("options", [{}, {"rate_input": True, "hidden": 20}], ids=["decides", "at a rate"])
+def test_pruners(example, tmp_path, options):
+    policy = make_policy()
+    policy.plan = make_pruner(policy, **options)
+    check_equal(example, policy, tmp_path / "policy.tsp")
+
+
+@pytest.mark.parametrize("weights", ["float16", "bfloat16"])
+@pytest.mark.parametrize(
+    "sizes", [{"n_emb": 42, "n_head": 3, "cond_dim": 3}, {"horizon": 3, "n_obs_steps": 3, "n_emb": 96}]
+)
+def test_half_precision_and_other_sizes(example, tmp_path, weights, sizes):
+    policy = make_policy(**sizes)
+    engine = NativeEngine(policy.network, policy.sampler, weights=weights)
+    policy.module["denoise"].engine.get = lambda *_: engine
+    check_equal(example, policy, tmp_path / "policy.tsp", weights=weights)
+
+
+def test_a_trained_policy_in_two_steps(example, tmp_path):
+    policy = DiffusionPolicy.from_pretrained("assets/lift")
+    policy.sampler, policy.noise = Sampler("ddim", timesteps=[87, 20]), "philox"
+    check_equal(example, policy, tmp_path / "lift.tsp")
+
+
+def test_what_is_wrong_with_a_file_is_one_line(example, tmp_path):
+    path = tmp_path / "policy.tsp"
+    make_policy().export(path)
+    whole = path.read_bytes()
+
+    def refused(content):
+        path.write_bytes(content)
+        done = run([example, path], input="", capture_output=True, text=True)
+        assert done.returncode == 2
+        assert done.stdout == ""
+        (line,) = done.stderr.splitlines()
+        assert line.startswith(f"{path}: ")
+        return line.removeprefix(f"{path}: ")
+
+    assert refused(b"") == refused(b"x" * 200) == "expected an exported policy (.tsp)"
+    newer = whole[:8] + (2).to_bytes(4, "little") + whole[12:]
+    assert refused(newer) == "version: expected 1, got 2; export the policy again"
+    assert refused(whole[:-64]) == f"size: expected {len(whole)} bytes, got {len(whole) - 64}"
+    assert re.fullmatch(
+        r"checksum: expected \w{8}, got \w{8}; the file is damaged", refused(whole[:-1] + b"\x01")
+    )
+    header = tsp._Header.from_buffer_copy(whole)
+    header.heads = 5
+    changed = bytearray(bytes(header) + whole[ctypes.sizeof(header) :])
+    changed[12:16] = zlib.crc32(changed[16:]).to_bytes(4, "little")
+    assert refused(changed) == "heads: expected a divisor of width 32, got 5"
+    path.unlink()
+    done = run([example, path], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, f"{path}: expected a file that can be read\n")
+
+
+def test_no_damaged_file_does_harm(example, folder, tmp_path):
+    """A file that was damaged on purpose, its checksum made good, may be run and must be safe."""
+    policy = make_policy(
+        Sampler("ddpm", 2), n_emb=8, n_layer=1, n_head=2, horizon=2, cond_dim=1, n_obs_steps=1
+    )
+    policy.plan = make_pruner(policy, rate_input=True, hidden=4, width=4, obs_width=2)
+    path = tmp_path / "policy.tsp"
+    policy.export(path)
+    if SANITIZED:
+        program = build(tmp_path, FUZZ, [*SANITIZE, *FLAGS[1:]], SANITIZE)
+    else:
+        program = tmp_path / "fuzz"
+        run(["cc", f"-I{SOURCES}", FUZZ, folder / "tsp.o", "-lm", "-o", program], check=True)
+    done = run([program, path, 61 if SANITIZED else 509], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.fullmatch(r"0 taken, [1-9]\d* harmless\n", done.stdout)
+
+
+class Looks(Planner):
+    def masks(self, cond):
+        return torch.zeros(len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool)
+
+
+def with_camera():
+    vision = VisionEncoder(["image"], image_size=(64, 64), crop_size=(64, 64), width=16)
+    plain = make_policy(cond_dim=5)
+    network = make_policy(cond_dim=5 + vision.feature_dim).network
+    return DiffusionPolicy(network, plain.normalizer, vision=vision)
+
+
+def test_what_cannot_be_exported_is_refused_and_nothing_is_written(tmp_path):
+    path = tmp_path / "policy.tsp"
+    with pytest.raises(
+        ValueError, match=r"^plan: expected one that does not look .* or a SAGPruner, got Looks$"
+    ):
+        make_policy(plan=Looks()).export(path)
+    with pytest.raises(ValueError, match=r"^export: expected a policy of states, got cameras \['image'\]$"):
+        with_camera().export(path)
+    with pytest.raises(ValueError, match=r"^weights: expected one of .*, got 'int8'$"):
+        make_policy().export(path, weights="int8")
+    with pytest.raises(ValueError, match=r"^export: it needs n_cond_layers = 0, the network has 1$"):
+        make_policy(n_cond_layers=1).export(path)
+    with pytest.raises(ValueError, match=r"^noise: expected one of \['torch', 'philox'\], got 'mt19937'$"):
+        make_policy().noise = "mt19937"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,53 @@
+"""The first call of every variant, before any is timed: is it right, what does it take to begin, and how much memory?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant
+from torchrl_sparse.runtime.clock import synchronised_clock
+
+__all__ = ["FirstCall", "first_calls"]
+
+_MOST = {"native-fp16": 1e-2, "native-bf16": 1e-1}
+_MOST_F32 = 1e-4  # of sums of 100 steps in another order
+
+
+@dataclass(frozen=True)
+class FirstCall:
+    """What the first call of a variant took.
+
+    Attributes:
+        seconds: with everything that is done once: tables, compilation, captured graphs.
+        peak_bytes: of the GPU's memory, with the weights; None on a CPU.
+    """
+
+    seconds: float
+    peak_bytes: int | None
+
+
+def first_calls(case: EngineCase, variants: Mapping[str, Variant]) -> dict[str, FirstCall]:
+    """Call every variant once.
+
+    Raises:
+        ValueError: naming the variant whose actions are not those of the reference.
+    """
+    return {name: _first_call(case, name, variant) for name, variant in variants.items()}
+
+
+def _first_call(case: EngineCase, name: str, variant: Variant) -> FirstCall:
+    expected, on_gpu = case.reference(variant.kind), case.device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats(case.device)
+    start = synchronised_clock(case.device)
+    actions = variant.call()
+    seconds = synchronised_clock(case.device) - start
+    error, most = (actions - expected).abs().max().item(), _MOST.get(name.split()[0], _MOST_F32)
+    if not error <= most:
+        raise ValueError(
+            f"{name}: expected the actions of the reference up to {most:g}, got a difference of {error:g}"
+        )
+    return FirstCall(seconds, torch.cuda.max_memory_allocated(case.device) if on_gpu else None)

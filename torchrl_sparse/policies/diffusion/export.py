@@ -1,0 +1,96 @@
+"""A policy as one file that a robot runs without Python or PyTorch, through the C interface of
+``torchrl_sparse/blocks/engine/native/tsp.h``: network, normaliser, sampler and planner.
+
+It answers as the policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_sparse.blocks.engine.native.engine import native_supports
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
+from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner
+from torchrl_sparse.blocks.engine.native.tsp import ExportedPlan, write_tsp
+from torchrl_sparse.blocks.mask import num_buffers
+from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.blocks.sag.planner import SAGPruner
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
+from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+
+__all__ = ["export_policy"]
+
+
+def export_policy(
+    path: Path,
+    encode: ObservationEncoder,
+    plan: Planner,
+    denoise: ActionDenoiser,
+    *,
+    weights: str,
+    facts: dict[str, Any],
+) -> None:
+    """Write the stages of a policy as one file; ``policy.export(path)`` calls it.
+
+    Args:
+        path: of the file, e.g. ``"lift.tsp"``.
+        encode, plan, denoise: the stages.
+        weights: see `torchrl_sparse.blocks.engine.NativeEngine`.
+        facts: about the policy, for the file's description.
+
+    Raises:
+        ValueError: naming what cannot be exported: cameras, a network that the native engine does not run, or a planner of
+            one's own that looks at the observation.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_sparse import DiffusionPolicy, Sampler
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> policy.sampler = Sampler("ddim", timesteps=[87, 20])
+        >>> policy.export(Path(tempfile.mkdtemp()) / "lift.tsp")
+    """
+    network, normalizer, sampler = denoise.network, denoise.normalizer, denoise.sampler
+    if (vision := encode.condition.vision) is not None:
+        raise ValueError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
+    supported, reason = native_supports(network)
+    if not supported:
+        raise ValueError(f"export: {reason}")
+    if network.horizon < network.n_obs_steps:
+        raise ValueError(
+            f"export: expected horizon >= n_obs_steps, got {network.horizon} and {network.n_obs_steps}"
+        )
+    with torch.no_grad():
+        exported = _exported_plan(plan, network)
+        packed = PackedNetwork(network, sampler, weight_type(weights))
+    parts = ("state_scale", "state_offset", "action_scale", "action_offset")
+    description = {
+        "format": "tsp/1",
+        **facts,
+        "sampler": sampler.config,
+        "planner": type(plan).__name__,
+        "weights": weights,
+    }
+    vectors = [getattr(normalizer, part) for part in parts]
+    write_tsp(path, packed, vectors, exported, json.dumps(description))
+
+
+def _exported_plan(plan: Planner, network: TransformerForDiffusion) -> ExportedPlan:
+    slots = num_buffers(plan.reuse, network.num_blocks)
+    if plan.is_static:
+        mask = plan.masks(torch.zeros(1, network.n_obs_steps, network.cond_dim))[0]
+        return ExportedPlan(slots, mask if mask.any() else None)
+    if not isinstance(plan, SAGPruner):
+        raise ValueError(
+            f"plan: expected one that does not look at the observation, or a SAGPruner, got {type(plan).__name__}"
+        )
+    if plan.network.fuse_obs.out_features > MAX_HIDDEN:
+        raise ValueError(
+            f"plan: expected at most {MAX_HIDDEN} hidden activations, got {plan.network.fuse_obs.out_features}"
+        )
+    rate = plan.rate if plan.network.rate_input else None
+    return ExportedPlan(slots, pruner=NativePruner(plan.network.mlp_weights()), rate=rate)

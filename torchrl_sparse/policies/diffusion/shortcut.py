@@ -1,0 +1,90 @@
+"""A whole query in one call of compiled code, where nothing between its state and its chunk is asked for.
+
+Stages that only move tensors cost as much as a denoising step: after a query, the caches have lost what Python and PyTorch
+run on, and each operation has to fetch it anew. So where the stages are those of the library, the state is all that the
+policy reads and the mask is known, the native engine takes the state and gives the chunk. The keys are the same, and so is
+every bit of them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine
+from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, mask_flops
+from torchrl_sparse.blocks.planner import Planner, StaticPlanner
+from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
+from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+
+__all__ = ["answer_directly"]
+
+
+def answer_directly(
+    tensordict: TensorDictBase, encode: ObservationEncoder, plan: Planner, denoise: ActionDenoiser
+) -> bool:
+    """Write what the three stages would, or return False and leave everything as it is where they have to run themselves."""
+    if not _known(encode, plan, denoise):
+        return False
+    engine = denoise.engine.get(denoise.network, denoise.sampler)
+    state = tensordict.get(keys.HISTORY_STATE, None)
+    if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
+        return False
+    batch = tensordict.batch_size
+    if state.shape != (*batch, *encode.state_shape):
+        return False
+    network, mask = denoise.network, plan.static_mask
+    seed = encode.seed(tensordict)
+    shape = (network.horizon, network.input_dim)
+    noise = NOISES[denoise.noise](seed.reshape(-1), denoise.sampler.num_inference_steps, shape)
+    rows = state.reshape(-1, *encode.state_shape)
+    answered = engine.answer(noise, rows, encode.condition.normalizer, mask, plan.reuse)
+    if answered is None:  # the encoder says what is wrong with the state
+        return False
+    cond, chunk = answered
+    tensordict.set(keys.COND, cond.view(state.shape))
+    tensordict.set(keys.SEED, seed)
+    tensordict.set(keys.PRUNE_MASK, mask.repeat(*batch, 1, 1) if batch else mask.clone())
+    tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
+    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
+    tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
+    return True
+
+
+@lru_cache(maxsize=64)
+def _flops(sizes: NetworkSizes, mask: Tensor) -> float:
+    """Count the FLOPs of a planner's mask, once: it is never written to, and as a key a tensor is itself alone."""
+    return mask_flops(sizes, mask).item()
+
+
+def _known(encode: ObservationEncoder, plan: Planner, denoise: ActionDenoiser) -> bool:
+    """Return whether the stages do what they do in the library, without anybody looking in between."""
+    kind, stages = type(plan), (encode, plan, denoise)
+    return (
+        kind.forward is Planner.forward
+        and getattr(kind, "masks", None) is StaticPlanner.masks
+        and type(encode) is ObservationEncoder
+        and type(denoise) is ActionDenoiser
+        and encode.condition.vision is None
+        and type(denoise.normalizer) is Normalizer
+        and encode.condition.normalizer is denoise.normalizer
+        and all(map(_is_plain, denoise.normalizer.buffers()))
+        and not denoise.network.training
+        and not any(_is_watched(stage) for stage in stages)
+    )
+
+
+def _is_watched(stage: TensorDictModuleBase) -> bool:
+    return bool(stage._forward_hooks or stage._forward_pre_hooks)
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Return whether compiled code can read ``tensor`` where it lies."""
+    strided = tensor.layout == torch.strided and tensor.is_contiguous()
+    return strided and tensor.dtype == torch.float32 and tensor.is_cpu and not tensor.requires_grad
