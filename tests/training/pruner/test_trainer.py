@@ -37,12 +37,12 @@ def test_sparsity_counts_blocks_or_what_they_cost():
 
 
 def begun_from_a_mask(policy, targets):
-    """SAG's training as the recipe's `init` begins it; from random gates, how far sixty updates get is a matter of rounding."""
+    """SAG's training as the recipe's `init` begins it; from random gates, how far so few updates get is a matter of rounding."""
     gates = sag_gates(policy)
     mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.65
     mask[0] = False
     fit_to_masks(gates, [mask], targets, updates=400)
-    return trainer_of(policy, targets, gates, max_updates=60, epochs=100, lr=1e-3, batch_size=16)
+    return trainer_of(policy, targets, gates, max_updates=120, epochs=100, lr=3e-3, batch_size=16)
 
 
 def begun_from_nothing(policy, targets):
