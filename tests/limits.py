@@ -3,7 +3,6 @@
 A small file must not exhaust a machine: whatever it says, it is read or refused within `SECONDS` and `MEGABYTES`.
 """
 
-import multiprocessing
 import resource
 import sys
 import time
@@ -13,11 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.forked import FORKED
+
 SECONDS, MEGABYTES = 5, 1000
 SMALL_FILE = 10_000_000
-
-_CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["tests.limits_baseline"])
 
 
 @dataclass(frozen=True)
@@ -33,8 +31,8 @@ def measure(read: Callable, path: Path) -> Cost:
     """Call ``read(path)`` in a process that is killed when it exceeds the limits."""
     if sys.platform != "linux":
         pytest.skip("limits are Linux's")
-    ours, theirs = _CONTEXT.Pipe()
-    process = _CONTEXT.Process(target=_call, args=(theirs, read, path))
+    ours, theirs = FORKED.Pipe()
+    process = FORKED.Process(target=_call, args=(theirs, read, path))
     process.start()
     theirs.close()
     try:

@@ -2,9 +2,15 @@
 
 import importlib.util
 import os
+import runpy
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+
+import torch
+
+from tests.forked import FORKED
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}
@@ -18,7 +24,33 @@ def load_recipe(name):
 
 
 def run(recipe, *options, expect=0):
+    """Run a recipe as a program, and return what it printed; in a process that has imported before what recipes import."""
+    with tempfile.TemporaryDirectory() as folder:
+        printed = [Path(folder, name) for name in ("stdout", "stderr")]
+        process = FORKED.Process(target=_play, args=(recipe, options, printed))
+        process.start()
+        process.join()
+        return _checked(process.exitcode, "".join(path.read_text() for path in printed), expect)
+
+
+def run_alone(recipe, *options, expect=0, environment=ENVIRONMENT):
+    """The same in an interpreter of its own."""
     command = [sys.executable, str(RECIPES / f"{recipe}.py"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
-    assert expect is None or done.returncode == expect, done.stderr[-3000:]
-    return done.stdout + done.stderr
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    return _checked(done.returncode, done.stdout + done.stderr, expect)
+
+
+def _play(recipe, options, printed):
+    for descriptor, path in enumerate(printed, start=1):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), descriptor)
+    os.environ.update(ENVIRONMENT)
+    torch.set_num_threads(1)
+    path = str(RECIPES / f"{recipe}.py")
+    sys.argv = [path, *options]
+    sys.path.insert(0, str(RECIPES))
+    runpy.run_path(path, run_name="__main__")
+
+
+def _checked(code, printed, expect):
+    assert expect is None or code == expect, printed[-3000:]
+    return printed

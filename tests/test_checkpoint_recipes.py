@@ -5,7 +5,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from tests.recipe_modules import ENVIRONMENT, run
+from tests.recipe_modules import ENVIRONMENT, run, run_alone
 from tests.storage.published.checkpoints import LowDimPolicy, write_checkpoint
 from torchrl_sparse import DiffusionPolicy
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
@@ -40,7 +40,7 @@ def robomimic_demos(path):
     return path
 
 
-def test_a_checkpoint_is_accelerated_offline_and_then_played(checkpoint, tmp_path, monkeypatch):
+def test_a_checkpoint_is_accelerated_offline_and_then_played(checkpoint, tmp_path):
     """The first without a simulator; the second goes on from what the first left."""
     demos, out = robomimic_demos(tmp_path / "demos.h5"), tmp_path / "fast"
     options = (
@@ -49,9 +49,10 @@ def test_a_checkpoint_is_accelerated_offline_and_then_played(checkpoint, tmp_pat
     )  # fmt: skip
     (tmp_path / "blocked").mkdir()
     (tmp_path / "blocked" / "robosuite.py").write_text("raise ImportError('no simulator here')")
-    with monkeypatch.context() as offline:
-        offline.setitem(ENVIRONMENT, "PYTHONPATH", f"{tmp_path}/blocked:{Path(__file__).parents[1]}")
-        assert "no episode was played" in run("accelerate_policy", *options, "episodes=0")
+    without = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}/blocked:{Path(__file__).parents[1]}"}
+    assert "no episode was played" in run_alone(
+        "accelerate_policy", *options, "episodes=0", environment=without
+    )
     assert not (out / "episodes").exists()
     found = load_acceleration(out / "acceleration.json")
     (searched,) = found.candidates.keys() - {"dense", "ddpm4", "bac7", "uniform2"}

@@ -37,7 +37,7 @@ def test_sparsity_counts_blocks_or_what_they_cost():
 
 
 def begun_from_a_mask(policy, targets):
-    """SAG's training as the recipe's `init` begins it; from random gates, how far so few updates get is a matter of rounding."""
+    """SAG's training as the recipe's `init` begins it; how far so few updates get from random gates is a matter of rounding."""
     gates = sag_gates(policy)
     mask = torch.rand(NUM_STEPS, NUM_BLOCKS, generator=torch.Generator().manual_seed(1)) < 0.65
     mask[0] = False

@@ -1,9 +1,15 @@
-"""What the processes of `tests.limits` have imported and used before anything is measured."""
+"""What processes that `tests.forked` makes have imported and used before they begin: all that is slow to import."""
 
 from pathlib import Path
 
+import matplotlib.pyplot  # noqa: F401
+import robosuite  # noqa: F401
+import torchrl.collectors  # noqa: F401
+
+import torchrl_sparse.cli.recipe
 import torchrl_sparse.data.robomimic
-import torchrl_sparse.evaluation.rollouts.episodes  # noqa: F401
+import torchrl_sparse.envs.robosuite
+import torchrl_sparse.evaluation.benchmarks.diffusion  # noqa: F401
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
