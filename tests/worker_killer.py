@@ -11,6 +11,7 @@ SIGNALS = {
     "process": (signal.SIGKILL, signal.SIGTERM, signal.SIGINT),
     "ray": (signal.SIGKILL, signal.SIGTERM),  # which takes an interrupt for a task that is cancelled
 }
+PATIENCE = 20  # s
 
 
 class Killer(threading.Thread):
@@ -29,10 +30,19 @@ class Killer(threading.Thread):
             _wait_for_workers(doomed)
             time.sleep(delay)
             alive = _wait_for_workers(doomed)
-            with suppress(ProcessLookupError):
-                os.kill(min(alive), self.signals[number % len(self.signals)])
+            _end(min(alive), self.signals[number % len(self.signals)])
             doomed |= alive
         self.done.touch()
+
+
+def _end(pid, number):
+    """Python drops an interrupt that falls into a finaliser or a callback of the garbage collector."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)
+        deadline = time.monotonic() + PATIENCE
+        while _is_worker(pid) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        os.kill(pid, signal.SIGKILL)
 
 
 def _wait_for_workers(doomed):

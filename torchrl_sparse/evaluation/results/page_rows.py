@@ -12,6 +12,7 @@ from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
+from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.results.text import percent_text
 from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
 from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
@@ -59,8 +60,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
         raise ValueError(f"expected a file {names}, got {path.name}")
     if pairs:
         return _pairs(path, pairs)
-    if which == "ways":
-        return _ways(path)
+    if which in _OF_EPISODES:
+        return _OF_EPISODES[which](path)
     tables = _READERS[kind](path)
     name = which or next(iter(tables))
     if name not in tables:
@@ -134,6 +135,14 @@ def _ways(path: Path) -> Table:
     return _table(results.task, way_rows(ways))
 
 
+def _scores(path: Path) -> Table:
+    results = load_results(path)
+    scores = told_scores(_episodes(path, results, results.methods))
+    if not scores:
+        raise ValueError(f"rows: expected episodes of {results.task} with scores, got none")
+    return _table(results.task, score_rows(scores, results.dense.paired_vs_dense.margin))
+
+
 def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
     """Read the episodes of methods that are of these results."""
     seeds = range(results.first_seed, results.first_seed + results.dense.success.n)
@@ -151,6 +160,7 @@ def _aggregate(path: Path) -> dict[str, Table]:
     return {"methods": _table(", ".join(results.tasks), aggregate_rows(results))}
 
 
+_OF_EPISODES = {"ways": _ways, "scores": _scores}
 _READERS = {
     "results": _results,
     "aggregate": _aggregate,
