@@ -1,16 +1,13 @@
 """The benchmark of the engines at toy size: what it runs, what it writes, what it draws."""
 
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 
 import imageio.v3 as iio
 import pytest
 import torch
 
-from tests.recipe_modules import RECIPES, load_recipe
+from tests.recipe_modules import RECIPES, load_recipe, run
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
@@ -23,7 +20,6 @@ from torchrl_sparse.evaluation.results.engine_report import (
     shape_results,
 )
 
-RECIPE = RECIPES / "benchmark_engine.py"
 ASSETS = RECIPES.parent / "assets"
 
 
@@ -112,13 +108,8 @@ def test_an_unknown_shape_is_refused():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_the_recipe_says_so_in_one_line(tmp_path):
-    done = subprocess.run(
-        [sys.executable, str(RECIPE), "quick=true", "device=cuda", f"out={tmp_path / 'out'}"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 2
-    assert done.stderr.strip().endswith("device: expected one that this machine and PyTorch have, got 'cuda'")
+    refused = run("benchmark_engine", "quick=true", "device=cuda", f"out={tmp_path / 'out'}", expect=2)
+    assert refused.strip().endswith("device: expected one that this machine and PyTorch have, got 'cuda'")
     assert not (tmp_path / "out").exists()
 
 
@@ -138,16 +129,10 @@ def test_recipe_writes_results_and_charts(tmp_path):
         "cases=[{shape: low_dim, batch: 1}, {shape: kitchen, batch: 2}]",
         f"out={tmp_path}",
     )
-    done = subprocess.run(
-        [sys.executable, str(RECIPE), *options],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    printed = run("benchmark_engine", *options)
     results = load_engine_results(tmp_path / "engine.json")
     assert list(results.shapes) == ["low_dim_b1", "kitchen_b2"]
     assert "eager-ifs random91" in results.shapes["low_dim_b1"].rows
     for name in results.shapes:
         assert iio.imread(tmp_path / f"engine_{name}.png").std() > 5
-        assert f"{name}: batch" in done.stdout
+        assert f"{name}: batch" in printed
