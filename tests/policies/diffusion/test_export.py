@@ -38,6 +38,7 @@ FLAGS = [
 ]  # as CMakeLists.txt has them
 # With `make sanitize`, as the Makefile has them: bits are the same only of the same optimisations.
 SANITIZE = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+SANITIZE_CPP = [*SANITIZE, *FLAGS[1:]]
 SANITIZED = "SANITIZED_NATIVE" in os.environ
 
 
@@ -64,7 +65,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def example(folder):
-    flags = ([*SANITIZE, "-ffp-contract=fast"], SANITIZE) if SANITIZED else (FLAGS,)
+    flags = (SANITIZE_CPP, SANITIZE) if SANITIZED else (FLAGS,)
     return build(folder, SOURCES / "example.c", *flags)
 
 
@@ -209,7 +210,7 @@ def test_no_damaged_file_does_harm(example, folder, tmp_path):
     path = tmp_path / "policy.tsp"
     policy.export(path)
     if SANITIZED:
-        program = build(tmp_path, FUZZ, [*SANITIZE, *FLAGS[1:]], SANITIZE)
+        program = build(tmp_path, FUZZ, SANITIZE_CPP, SANITIZE)
     else:
         program = tmp_path / "fuzz"
         run(["cc", f"-I{SOURCES}", FUZZ, folder / "tsp.o", "-lm", "-o", program], check=True)

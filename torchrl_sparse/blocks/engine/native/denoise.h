@@ -27,12 +27,15 @@
 
 extern "C" {
 
-enum Type : int32_t { F32, F16, BF16 };
+enum Type : int32_t { F32, F16, BF16, I8 };
 
-// A packed matrix [part][columns / 32][inputs of the part][32]. Of BF16, two inputs count as one: they lie side by side.
+// A packed matrix [part][columns / 32][inputs of the part][32]. Of BF16, two inputs count as one, and of I8 four: they lie
+// side by side.
 struct Matrix {
     const void* weight;
-    const float* bias;  // [columns], or one row of it for each row of the result
+    const float* bias;    // [columns], or one row of it for each row of the result
+    const float* scale;   // of I8 [columns]: what a weight of 1 stands for
+    const int32_t* sums;  // of I8 [columns]: of the weights
     int32_t rows, columns, bias_stride;
     Type type;
 };
@@ -77,6 +80,7 @@ constexpr int MAX_HIDDEN = 256;   // of a pruner
 constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
 using half = uint16_t;
 struct Pair { uint16_t first, second; };  // of BF16
+struct Quad { int8_t weights[4]; };       // of I8; the activations that belong to it are unsigned
 
 constexpr int padded(int n) { return (n + PANEL - 1) / PANEL * PANEL; }
 // Rows are one cache line longer than needed: powers of two would put all rows of a column in one set of the cache.
@@ -89,6 +93,7 @@ struct Buffers {
     const int width, ld, head, inner, ldh, lanes;
     float *x, *y, *kv, *rounded, *eps, *sample, *constant, *scores;  // own
     float* cleans;  // own [2][horizon]: the clean predictions of the step before and of the one before it
+    float* grid;    // own [horizon][2]: the step and the zero of rows that are rounded to I8
     float *qkv, *mixed, *hidden, *latest, *token;  // shared
     float *key, *value, *key_bias;  // shared [layers][obs_steps][heads]: what cross-attention reads of the observations
     size_t size;
@@ -105,6 +110,7 @@ struct Buffers {
         eps = take(own, m.horizon * stride(m.action_dim));
         sample = take(own, m.horizon * stride(m.action_dim));
         cleans = take(own, 2 * m.horizon * stride(m.action_dim));
+        grid = take(own, 2 * m.horizon);
         constant = take(own, m.horizon * width);
         scores = take(own, (size_t)(m.horizon > memory ? m.horizon : memory) * lanes);
         qkv = take(shared, m.horizon * stride(3 * padded(inner)));
@@ -138,8 +144,8 @@ struct Buffers {
 #include "denoise.h"
 #define LEVEL avx512_bf16
 #define VECTOR 16
-#define TARGET "avx512bf16,avx512f,avx2,fma,f16c"
-#define DOT_BF16
+#define TARGET "avx512bf16,avx512vnni,avx512f,avx2,fma,f16c"
+#define DOTS
 #include "denoise.h"
 #endif
 
@@ -163,7 +169,7 @@ int32_t levels() {
 #if defined(__x86_64__)
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return 1;
     if (!__builtin_cpu_supports("avx512f")) return 2;
-    return __builtin_cpu_supports("avx512bf16") ? 4 : 3;
+    return __builtin_cpu_supports("avx512bf16") && __builtin_cpu_supports("avx512vnni") ? 4 : 3;
 #else
     return 1;
 #endif
@@ -188,8 +194,11 @@ namespace LEVEL {
 typedef float V __attribute__((vector_size(4 * VECTOR)));
 typedef int32_t I __attribute__((vector_size(4 * VECTOR)));
 typedef half H __attribute__((vector_size(2 * VECTOR)));
+typedef uint8_t B __attribute__((vector_size(VECTOR)));
 typedef float Unaligned __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
 typedef half UnalignedHalf __attribute__((vector_size(2 * VECTOR), aligned(2), may_alias));
+typedef uint8_t UnalignedBytes __attribute__((vector_size(VECTOR), aligned(1), may_alias));
+typedef int32_t UnalignedInts __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
 
 constexpr int REGISTERS = VECTOR == 16 ? 32 : 16;
 // Rows of a tile. 16 are the longest published horizon; 6 rows x 2 vectors of sums, 2 of weights and 1 of activations fill
@@ -198,6 +207,7 @@ constexpr int MAX_ROWS = VECTOR == 16 ? 16 : 6;
 
 INLINE V load(const float* p) { return *(const Unaligned*)p; }
 INLINE V load(const Pair* p) { return *(const Unaligned*)p; }
+INLINE V load(const Quad* p) { return *(const Unaligned*)p; }
 INLINE void store(float* p, V v) { *(Unaligned*)p = v; }
 INLINE V splat(float f) { return f - V{}; }  // not V{} + f, which is not f if f is -0 and so costs an addition
 
@@ -214,11 +224,11 @@ INLINE V load(const half* p) {
 #endif
 }
 
-// sums + weights * activations: of one input, or of a pair of them.
+// sums + weights * activations: of one input, of a pair of them, or of four, in integers.
 INLINE V accumulate(V sums, V weights, V x, const float*) { return sums + weights * x; }
 INLINE V accumulate(V sums, V weights, V x, const half*) { return sums + weights * x; }
 INLINE V accumulate(V sums, V weights, V x, const Pair*) {
-#if defined(DOT_BF16)
+#if defined(DOTS)
     return _mm512_dpbf16_ps(sums, (__m512bh)weights, (__m512bh)x);
 #else
     const int second = ~0xffff;  // BF16 is the upper half of F32
@@ -226,6 +236,18 @@ INLINE V accumulate(V sums, V weights, V x, const Pair*) {
     return sums + (V)((I)weights & second) * (V)((I)x & second);
 #endif
 }
+INLINE I accumulate(I sums, V weights, V x, const Quad*) {
+#if defined(DOTS)
+    return (I)_mm512_dpbusd_epi32((__m512i)sums, (__m512i)x, (__m512i)weights);
+#else
+#pragma GCC unroll 4
+    for (int shift = 0; shift < 32; shift += 8) sums += ((I)weights << (24 - shift) >> 24) * ((I)x >> shift & 0xff);
+    return sums;
+#endif
+}
+
+template <class T> struct Sums { typedef V type; };
+template <> struct Sums<Quad> { typedef I type; };
 
 INLINE float sum(V v) {
 #if VECTOR == 16
@@ -288,10 +310,11 @@ void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const flo
     for (int strip = 0; strip < PANEL; strip += N * VECTOR) {
         const float* x = input;
         const T* w = panel + strip;
-        V sums[MR][N], weights[N];
+        typename Sums<T>::type sums[MR][N];
+        V weights[N];
 #pragma GCC unroll 16
         for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) sums[m][n] = load(start + m * ld_start + strip + n * VECTOR);
+            for (int n = 0; n < N; n++) sums[m][n] = (typename Sums<T>::type)load(start + m * ld_start + strip + n * VECTOR);
         for (int k = 0; k < rows; k++, w += PANEL, x++) {
             for (int n = 0; n < N; n++) {
                 __builtin_prefetch(w + AHEAD * PANEL + n * VECTOR, 0, 2);
@@ -305,7 +328,7 @@ void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const flo
         }
 #pragma GCC unroll 16
         for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, sums[m][n]);
+            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, (V)sums[m][n]);
     }
 }
 
@@ -370,6 +393,7 @@ struct Query {
     void product(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) const {
         if (a.type == F32) return multiply<float>(x, ldx, n, a, columns, y, ldy);
         if (a.type == F16) return multiply<half>(x, ldx, n, a, columns, y, ldy);
+        if (a.type == I8) return integer_product(x, ldx, n, a, columns, y, ldy);
         const int ld_rounded = b.ldh / 2;
         for (int t = 0; t < n; t++) round(x + t * ldx, 2 * a.rows, b.rounded + t * ld_rounded);
         multiply<Pair>(b.rounded, ld_rounded, n, a, columns, y, ldy);
@@ -385,6 +409,51 @@ struct Query {
             const I bits = (I)load(x + j);
             *(UnalignedHalf*)((half*)pairs + j) = __builtin_convertvector((bits + 0x7fff + (bits >> 16 & 1)) >> 16, H);
         }
+    }
+
+    // x = step * (q - zero) in each row, with q in a byte, so that x * weight = step * scale * (q * w - zero * sum of w): the
+    // sums are exact, whatever their order. Those of up to 2^15 inputs fit into i32.
+    void integer_product(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) const {
+        const int ld_rounded = b.ldh / 4;
+        for (int t = 0; t < n; t++) {
+            quantise(x + t * ldx, 4 * a.rows, (uint8_t*)(b.rounded + t * ld_rounded), b.grid + 2 * t);
+            for (int j = columns.first; j < columns.last; j += VECTOR)
+                *(UnalignedInts*)(y + t * ldy + j) = *(const UnalignedInts*)(a.sums + j) * -(int32_t)b.grid[2 * t + 1];
+        }
+        Matrix from = a;
+        from.bias = y;
+        from.bias_stride = ldy;
+        multiply<Quad>(b.rounded, ld_rounded, n, from, columns, y, ldy);
+        for (int t = 0; t < n; t++)
+            for (int j = columns.first; j < columns.last; j += VECTOR) {
+                const V total = __builtin_convertvector(*(const UnalignedInts*)(y + t * ldy + j), V);
+                store(y + t * ldy + j, total * (load(a.scale + j) * b.grid[2 * t]) + load(a.bias + j));
+            }
+    }
+
+    // A row of f32 to 256 levels, of which one is 0, from its least to its largest number. `x` is padded to whole vectors.
+    static void quantise(const float* x, int n, uint8_t* bytes, float* grid) {
+        V least{}, most{};
+        for (int j = 0; j < n; j += VECTOR) {
+            const V v = load(x + j);
+            least = v < least ? v : least;
+            most = v > most ? v : most;
+        }
+        float low = 0, high = 0;
+        for (int i = 0; i < VECTOR; i++) {
+            low = least[i] < low ? least[i] : low;
+            high = most[i] > high ? most[i] : high;
+        }
+        const float step = (high - low) / 255, inverse = step > 0 ? 1 / step : 0;
+        const float zero = (float)(int32_t)(.5f - low * inverse);
+        for (int j = 0; j < n; j += VECTOR) {
+            V level = load(x + j) * inverse + (zero + .5f);
+            level = level > 0.f ? level : V{};  // and if it is no number
+            level = level < 255.f ? level : splat(255.f);
+            *(UnalignedBytes*)(bytes + j) = __builtin_convertvector(__builtin_convertvector(level, I), B);
+        }
+        grid[0] = step;
+        grid[1] = zero;
     }
 
     // y = (x - mean) / std of rows; gain and shift are in the weights that follow.
@@ -663,5 +732,5 @@ void prune(const Pruner& p, const Member& who, const float* observation, float* 
 #undef LEVEL
 #undef VECTOR
 #undef TARGET
-#undef DOT_BF16
+#undef DOTS
 #endif
