@@ -209,7 +209,8 @@ def test_a_saved_planner_brings_its_sampler(policy, make, tmp_path):
 @pytest.mark.parametrize("weights", ["bf16", "int8"])
 def test_rounded_weights_are_written_behind_the_name(make, weights):
     exact, rounded = make("dense"), make(f"dense:{weights}")
-    assert rounded.network is exact.network and exact.engine == "auto"
+    assert rounded.network is exact.network
+    assert exact.engine == "auto"
     seeded = QUERY.clone().update(
         {"episode": {"seed": torch.ones(1, 1).long(), "step": torch.ones(1, 1).long()}}
     )

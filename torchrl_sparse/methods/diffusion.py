@@ -53,7 +53,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class MethodName:
-    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``, each with ``:WEIGHTS`` behind NAME or without.
+    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``, NAME also as ``NAME:WEIGHTS``.
 
     Attributes:
         name: see the module.

@@ -34,7 +34,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
+__all__ = ["MAX_THREADS", "NativeEngine", "NativeWatch", "native_supports"]
 
 MAX_THREADS = 64  # of a team, see team.h
 
@@ -64,7 +64,7 @@ def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
     return True, ""
 
 
-class _NativeWatch(WeightWatch):
+class NativeWatch(WeightWatch):
     """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
@@ -148,7 +148,7 @@ class NativeEngine:
             sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
         )
         self._stock: list[Tensor] = []
-        self._watch = _NativeWatch(network)
+        self._watch = NativeWatch(network)
         self._packed = (None, None)
         self._current()
 
