@@ -12,15 +12,20 @@
 //   sums in the same order whatever the number of threads.
 // * Nothing is allocated: all memory of a query is its `scratch`, so that any number of queries may run at a time.
 // * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.
-// * The kernels are written once, with the vector types of GCC and Clang, and compiled for four instruction sets by
+// * The kernels are written once, with the vector types of GCC and Clang, and compiled for up to four instruction sets by
 //   including this file in itself. The caller chooses one of LEVELS at run time.
 
 #ifndef VECTOR  // ---------------------------------------------------------------------- what is compiled only once
 
 #include <cstddef>
 #include <cstdint>
-#if defined(__x86_64__)
+#if defined(PORTABLE_ONLY)  // for tests
+#elif defined(__x86_64__)
+#define X86
 #include <immintrin.h>
+#elif defined(__aarch64__)
+#define ARM
+#include <arm_neon.h>
 #endif
 
 #include "member.h"
@@ -133,7 +138,12 @@ struct Buffers {
 #define LEVEL portable
 #define VECTOR 4
 #include "denoise.h"
-#if defined(__x86_64__)
+#if defined(ARM)  // always has NEON: the portable vectors are its own, and there are twice as many registers
+#define LEVEL neon
+#define VECTOR 4
+#define NEON
+#include "denoise.h"
+#elif defined(X86)
 #define LEVEL avx2
 #define VECTOR 8
 #define TARGET "avx2,fma,f16c"
@@ -157,7 +167,9 @@ struct Level {
 };
 const Level LEVELS[] = {
     {portable::denoise, portable::run_blocks, portable::prune},
-#if defined(__x86_64__)
+#if defined(ARM)
+    {neon::denoise, neon::run_blocks, neon::prune},
+#elif defined(X86)
     {avx2::denoise, avx2::run_blocks, avx2::prune},
     {avx512::denoise, avx512::run_blocks, avx512::prune},
     {avx512_bf16::denoise, avx512_bf16::run_blocks, avx512_bf16::prune},
@@ -166,7 +178,9 @@ const Level LEVELS[] = {
 
 // Instruction sets that this CPU can run: the first 1 to 4 of LEVELS.
 int32_t levels() {
-#if defined(__x86_64__)
+#if defined(ARM)
+    return 2;
+#elif defined(X86)
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return 1;
     if (!__builtin_cpu_supports("avx512f")) return 2;
     return __builtin_cpu_supports("avx512bf16") && __builtin_cpu_supports("avx512vnni") ? 4 : 3;
@@ -200,10 +214,14 @@ typedef half UnalignedHalf __attribute__((vector_size(2 * VECTOR), aligned(2), m
 typedef uint8_t UnalignedBytes __attribute__((vector_size(VECTOR), aligned(1), may_alias));
 typedef int32_t UnalignedInts __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
 
+#if defined(NEON)
+constexpr int REGISTERS = 32;
+#else
 constexpr int REGISTERS = VECTOR == 16 ? 32 : 16;
+#endif
 // Rows of a tile. 16 are the longest published horizon; 6 rows x 2 vectors of sums, 2 of weights and 1 of activations fill
 // 15 of 16 registers.
-constexpr int MAX_ROWS = VECTOR == 16 ? 16 : 6;
+constexpr int MAX_ROWS = REGISTERS == 32 ? 16 : 6;
 
 INLINE V load(const float* p) { return *(const Unaligned*)p; }
 INLINE V load(const Pair* p) { return *(const Unaligned*)p; }
@@ -216,6 +234,8 @@ INLINE V load(const half* p) {
     return _mm512_cvtph_ps(_mm256_loadu_si256((const __m256i*)p));
 #elif VECTOR == 8
     return _mm256_cvtph_ps(_mm_loadu_si128((const __m128i*)p));
+#elif defined(NEON)
+    return (V)vcvt_f32_f16(vreinterpret_f16_u16(vld1_u16(p)));
 #else
     const I bits = __builtin_convertvector(*(const UnalignedHalf*)p, I);
     // The exponents of f16 and f32 differ by 112; multiplying is right for subnormal numbers as well.
@@ -694,7 +714,7 @@ void run_blocks(const Model& m, const Member& who, int kind, float* own, float* 
 // One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
 void prune(const Pruner& p, const Member& who, const float* observation, float* logits, uint8_t* mask) {
     // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
-    constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
+    constexpr int GROUP = REGISTERS == 32 ? 12 : MAX_ROWS;
     constexpr int ld = stride(MAX_HIDDEN);
     alignas(64) float added[ld], x[GROUP * ld], y[GROUP * ld];
     const int width = p.middle.columns;
@@ -733,4 +753,5 @@ void prune(const Pruner& p, const Member& who, const float* observation, float* 
 #undef VECTOR
 #undef TARGET
 #undef DOTS
+#undef NEON
 #endif
