@@ -10,6 +10,7 @@ from tests.fixtures.diffusion import SIZES
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
+from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.blocks.planner import Dense, StaticPlanner
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork, SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
@@ -132,6 +133,8 @@ def test_samplers_are_taken_from_the_name(make, name, timesteps):
         "Dense",
         "bac@0.5-",
         "dense@1",
+        "dense:fp4",
+        "dense@0.5:bf16",
         "uniform@0.5@0.5",
         "uniform0",
         "uniform7_",
@@ -199,6 +202,24 @@ def test_a_saved_planner_brings_its_sampler(policy, make, tmp_path):
     method = make("mine")
     assert method.sampler.timesteps.tolist() == [90, 50, 10]
     assert torch.equal(method(QUERY.clone())[keys.PRUNE_MASK][0], mask)
+
+
+@pytest.mark.usefixtures("pruner")
+@pytest.mark.skipif(not native_available()[0], reason=native_available()[1])
+@pytest.mark.parametrize("weights", ["bf16", "int8"])
+def test_rounded_weights_are_written_behind_the_name(make, weights):
+    exact, rounded = make("dense"), make(f"dense:{weights}")
+    assert rounded.network is exact.network
+    assert exact.engine == "auto"
+    seeded = QUERY.clone().update(
+        {"episode": {"seed": torch.ones(1, 1).long(), "step": torch.ones(1, 1).long()}}
+    )
+    error = (rounded(seeded.clone())[keys.CHUNK] - exact(seeded.clone())[keys.CHUNK]).abs().max()
+    assert 1e-5 < error < 0.1
+    assert method_identity(f"dense:{weights}", rounded)["engine"] == f"native_{weights}"
+    assert make(f"dense_noise:{weights}").noise_stream == make("dense_noise").noise_stream
+    assert make(f"sag:{weights}@0.3").plan.rate == 0.3
+    assert make_controller(f"sag:{weights}@0.7-0.4").budgets == (0.7, 0.4)
 
 
 @pytest.mark.usefixtures("pruner")

@@ -1,7 +1,8 @@
 """The methods of a diffusion policy by name: planner and sampler, controller, and colour in figures.
 
 A method is written ``NAME``, ``NAME@RATE`` (every query is asked for that prune rate) or ``NAME@COARSE-FINE`` (a
-controller asks for the first rate in coarse motion and for the second in fine motion). NAME is a key of
+controller asks for the first rate in coarse motion and for the second in fine motion). ``NAME:bf16`` and ``NAME:int8``, of
+any of them (``sag:int8@0.9``), run it in the native engine with rounded weights and activations. NAME is a key of
 :data:`METHODS`, or matches the pattern of one, or names a planner that is saved in the folder at hand, as ``NAME.json`` or
 ``NAME/``; saved planners bring the sampler that they were made for.
 
@@ -52,28 +53,34 @@ __all__ = [
 
 @dataclass(frozen=True)
 class MethodName:
-    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``.
+    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``, NAME also as ``NAME:WEIGHTS``.
 
     Attributes:
         name: see the module.
         rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
+        weights: ``"bf16"``, ``"int8"``, or None, which rounds nothing.
     """
 
     name: str
     rates: tuple[float, ...] = ()
+    weights: str | None = None
 
     @classmethod
     def parse(cls, text: str) -> MethodName:
         """Raise ValueError unless ``text`` is written as above.
 
         >>> MethodName.parse("sag_rates@0.95-0.7")
-        MethodName(name='sag_rates', rates=(0.95, 0.7))
+        MethodName(name='sag_rates', rates=(0.95, 0.7), weights=None)
+        >>> MethodName.parse("dense:int8").weights
+        'int8'
         """
-        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?::(bf16|int8))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
         if match is None:
-            raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
-        name, *rates = match.groups()
-        return cls(name, tuple(float(rate) for rate in rates if rate is not None))
+            raise ValueError(
+                f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME:bf16 or NAME:int8, got {text!r}"
+            )
+        name, weights, *rates = match.groups()
+        return cls(name, tuple(float(rate) for rate in rates if rate is not None), weights)
 
 
 @dataclass(frozen=True)
@@ -215,6 +222,8 @@ def make_method(
         10
         >>> make_method("sag", policy, **options).plan.is_static
         False
+        >>> make_method("dense:int8", policy, **options).engine
+        'native_int8'
     """
     method, written = _find(text, planners), MethodName.parse(text)
     inputs = MethodInputs(written.name, policy.plan.spec, policy.sampler, num_updates, planners, calibration)
@@ -222,7 +231,11 @@ def make_method(
     if written.rates:
         _ask_for(planner, written)
     made = policy.with_plan(planner, sampler)
-    return made.with_noise(method.noise) if method.noise else made
+    if method.noise:
+        made = made.with_noise(method.noise)
+    if written.weights:
+        made.engine = f"native_{written.weights}"
+    return made
 
 
 def make_controller(text: str) -> TensorDictModuleBase | None:

@@ -30,7 +30,7 @@ def test_auto_takes_torch_where_native_does_not_apply_and_says_why(network, ddpm
 
 
 def test_unknown_engines_are_refused(network, ddpm):
-    message = r"engine: expected one of \['auto', 'native', 'torch', 'reference'\], got 'turbo'"
+    message = r"engine: expected one of \['auto', 'native', .*\], got 'turbo'"
     with pytest.raises(ValueError, match=message):
         make_engine("turbo", network, ddpm)
     with pytest.raises(ValueError, match=message):

@@ -36,16 +36,18 @@ FLAGS = [
     "-fno-exceptions",
     "-fno-rtti",
 ]  # as CMakeLists.txt has them
-# With `make sanitize`: compiling that takes longer than all other tests here.
+# With `make sanitize`, as the Makefile has them: bits are the same only of the same optimisations.
 SANITIZE = ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+SANITIZE_CPP = [*SANITIZE, *FLAGS[1:]]
 SANITIZED = "SANITIZED_NATIVE" in os.environ
 
 
-def build(folder, program, cpp_flags, c_flags=()):
+def build(folder, program, cpp_flags, c_flags=(), prefix=""):
     """Compile the library and a C program that is linked with it, by the C compiler: nothing of C++ is needed."""
+    cpp, c = (f"{prefix}g++", f"{prefix}gcc") if prefix else ("c++", "cc")
     for command in (
-        ["c++", "-std=c++17", *cpp_flags, "-c", SOURCES / "tsp.cpp", "-o", folder / "tsp.o"],
-        ["cc", *c_flags, f"-I{SOURCES}", program, folder / "tsp.o", "-lm", "-o", folder / program.stem],
+        [cpp, "-std=c++17", *cpp_flags, "-c", SOURCES / "tsp.cpp", "-o", folder / "tsp.o"],
+        [c, *c_flags, f"-I{SOURCES}", program, folder / "tsp.o", "-lm", "-o", folder / program.stem],
     ):
         run(command, check=True)
     return folder / program.stem
@@ -64,7 +66,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def example(folder):
-    return build(folder, SOURCES / "example.c", FLAGS)
+    flags = (SANITIZE_CPP, SANITIZE) if SANITIZED else (FLAGS,)
+    return build(folder, SOURCES / "example.c", *flags)
 
 
 def make_policy(sampler=None, plan=None, **sizes):
@@ -80,18 +83,18 @@ def make_policy(sampler=None, plan=None, **sizes):
     return policy
 
 
-def run_example(example, path, history, seeds):
+def run_example(example, path, history, seeds, runner=()):
     lines = [
         f"{seed} " + " ".join(value.hex() for value in row.double().flatten().tolist())
         for seed, row in zip(seeds, history, strict=True)
     ]
-    done = run([example, path], input="\n".join(lines), capture_output=True, text=True)
+    done = run([*runner, example, path], input="\n".join(lines), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return torch.tensor([[float.fromhex(word) for word in line.split()] for line in done.stdout.splitlines()])
 
 
-def check_equal(example, policy, path, **options):
-    """Export, and compare the answers to some queries bit by bit."""
+def answers(example, policy, path, runner=(), **options):
+    """Export, and return the file's chunks of some queries and the policy's own."""
     policy.export(path, **options)
     network, seeds = policy.network, [0, 1, 2**40 + 3, 2**63 - 1]
     history = torch.randn(
@@ -103,11 +106,40 @@ def check_equal(example, policy, path, **options):
         data["diffusion", "seed"] = torch.tensor(seeds)[:, None]
         for stage in ("plan", "denoise"):
             policy.module[stage](data)
-    expected = data["vla_action", "chunk"]
+    expected = data["vla_action", "chunk"].flatten(1)
     assert expected.isfinite().all()
-    got = run_example(example, path, history, seeds)
-    assert torch.equal(got, expected.flatten(1))
+    return run_example(example, path, history, seeds, runner), expected
+
+
+def check_equal(example, policy, path, **options):
+    """Export, and compare the answers to some queries bit by bit."""
+    got, expected = answers(example, policy, path, **options)
+    assert torch.equal(got, expected)
     assert not torch.equal(got[0], got[1])
+
+
+@pytest.mark.skipif(SANITIZED, reason="compiles for other machines")
+@pytest.mark.parametrize(
+    ("prefix", "runner", "flags"),
+    [
+        ("", [], ["-DPORTABLE_ONLY"]),
+        ("aarch64-linux-gnu-", ["qemu-aarch64"], ["-DPORTABLE_ONLY"]),
+        ("aarch64-linux-gnu-", ["qemu-aarch64"], []),
+    ],
+    ids=["portable", "ARM portable", "ARM NEON"],
+)
+def test_other_machines_answer_alike(example, tmp_path, prefix, runner, flags):
+    """As far as the order of sums allows, whatever the type of the weights."""
+    if prefix and not (shutil.which(f"{prefix}g++") and shutil.which(runner[0])):
+        pytest.skip(f"no {prefix}g++ (Debian's g++-aarch64-linux-gnu) or no {runner[0]} (qemu-user)")
+    other = build(tmp_path, SOURCES / "example.c", ["-O1", *FLAGS[1:], *flags], ["-static"], prefix)
+    # Sixteen actions and more than one part of inputs fill every kind of tile.
+    policy = make_policy(Sampler("unipc", 4), plan=Half("block"), horizon=16, n_emb=96)
+    for weights, most in (("float32", 1e-4), ("float16", 1e-4), ("bfloat16", 0.1)):
+        path = tmp_path / f"{weights}.tsp"
+        here, _ = answers(example, policy, path, weights=weights)
+        there, _ = answers(other, policy, path, runner, weights=weights)
+        assert (there - here).abs().max() < most, weights
 
 
 class Half(StaticPlanner):
@@ -208,7 +240,7 @@ def test_no_damaged_file_does_harm(example, folder, tmp_path):
     path = tmp_path / "policy.tsp"
     policy.export(path)
     if SANITIZED:
-        program = build(tmp_path, FUZZ, [*SANITIZE, *FLAGS[1:]], SANITIZE)
+        program = build(tmp_path, FUZZ, SANITIZE_CPP, SANITIZE)
     else:
         program = tmp_path / "fuzz"
         run(["cc", f"-I{SOURCES}", FUZZ, folder / "tsp.o", "-lm", "-o", program], check=True)

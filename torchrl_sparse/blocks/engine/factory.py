@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from torchrl_sparse.blocks.engine.base import Engine
@@ -40,11 +41,13 @@ class EngineEntry(NamedTuple):
     applies: Applies = _always
 
 
-# By name; "auto" takes the first that applies.
+# By name; "auto" takes the first that applies, so that those that round come last.
 ENGINES: dict[str, EngineEntry] = {
     "native": EngineEntry(NativeEngine, native_supports),
     "torch": EngineEntry(TorchEngine),
     "reference": EngineEntry(ReferenceEngine),
+    "native_bf16": EngineEntry(partial(NativeEngine, weights="bfloat16"), native_supports),
+    "native_int8": EngineEntry(partial(NativeEngine, weights="int8"), native_supports),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from math import nan
@@ -12,6 +13,7 @@ import numpy as np
 
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.latency.measure import Machine
+from torchrl_sparse.evaluation.latency.profile import serial_share
 from torchrl_sparse.evaluation.results.engine_report import EngineShape
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.text import threads_text
@@ -20,7 +22,7 @@ from torchrl_sparse.evaluation.results.vla_report import Part, VLALatency, VLAMe
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_engine_times", "plot_vla_times"]
+__all__ = ["plot_engine_times", "plot_thread_scaling", "plot_vla_times"]
 
 _RUNNERS = {"eager": "#999999", "reference": "#333333", "torch": "#E69F00", "native": "#0072B2"}
 _PARTS = {
@@ -126,3 +128,30 @@ def _draw_speedups(axes: Axes, methods: Mapping[str, VLAMethod]) -> None:
     axes.grid(False, axis="y")
     axes.set_xlabel("speed-up over dense")
     axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9)
+
+
+def plot_thread_scaling(
+    threads_s: Mapping[str, Mapping[str, float]], machine: Machine, path: str | os.PathLike
+) -> Path:
+    """Draw how many times as fast queries are on more threads, and Amdahl's law fitted to each, up to 16.
+
+    Args:
+        threads_s: name of a query -> number of threads, as text, ``"1"`` among them -> seconds.
+        machine: what it was measured on.
+        path: of the PNG.
+    """
+    figure, axes = make_figure(7, 4.5)
+    counts = np.arange(1, 17)
+    axes.plot(counts, counts, ":", color=_REST, label="as many times as threads")
+    for name, color in zip(threads_s, itertools.cycle((_MEASURED, _LIMIT, _ARITHMETIC)), strict=False):
+        seconds = {int(count): value for count, value in threads_s[name].items()}
+        share = serial_share(seconds)
+        axes.plot(list(seconds), [seconds[1] / value for value in seconds.values()], "o", color=color)
+        axes.plot(
+            counts, 1 / (share + (1 - share) / counts), color=color, label=f"{name}, {share:.0%} serial"
+        )
+    axes.set_xlabel("threads")
+    axes.set_ylabel("times as fast as on one thread")
+    axes.set_title(f"One query; {machine.cpu}", loc="left")
+    axes.legend(frameon=False)
+    return save_figure(figure, path)

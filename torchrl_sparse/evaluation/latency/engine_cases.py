@@ -32,8 +32,13 @@ QUICK = {"n_layer": 2, "n_emb": 32}
 _PRUNE_RATE = 0.91
 _SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
 _NUM_UPDATES = 10
-_HALF_RUNNERS = {"native-fp16": "float16", "native-bf16": "bfloat16"}
-_HALF_KINDS = ("dense", "random91", "bac10")
+# By runner, its weights and their bytes.
+_ROUNDED_RUNNERS = {
+    "native-fp16": ("float16", 2),
+    "native-bf16": ("bfloat16", 2),
+    "native-int8": ("int8", 1),
+}
+_ROUNDED_KINDS = ("dense", "random91", "bac10", "ddim2")
 _DRAWN_SEED = 1
 
 
@@ -145,17 +150,19 @@ class EngineCase:
         runners = {"torch": TorchEngine}
         if native_supports(self.network)[0]:
             runners["native"] = NativeEngine
-            runners |= {name: partial(NativeEngine, weights=dtype) for name, dtype in _HALF_RUNNERS.items()}
+            runners |= {
+                name: partial(NativeEngine, weights=dtype) for name, (dtype, _) in _ROUNDED_RUNNERS.items()
+            }
         for runner, make in runners.items():
             engines = {}
             for kind, query in self.queries.items():
-                if runner in _HALF_RUNNERS and kind not in _HALF_KINDS:
+                if runner in _ROUNDED_RUNNERS and kind not in _ROUNDED_KINDS:
                     continue
                 if query.sampler not in engines:
                     engines[query.sampler] = make(self.network, query.sampler)
                 call = self._call(engines[query.sampler], query)
-                weight_bytes = 2 if runner in _HALF_RUNNERS else 4
-                in_f32 = _HALF_RUNNERS.get(runner) != "bfloat16"
+                dtype, weight_bytes = _ROUNDED_RUNNERS.get(runner, ("float32", 4))
+                in_f32 = dtype in ("float32", "float16")
                 variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
         return variants
 
@@ -202,8 +209,8 @@ class EngineCase:
             queries[f"ddim{count}"] = QueryKind(self._ddim(count))
             mask = self._random_mask(count, _SHORT_PRUNE_RATE, generator)
             queries[f"ddim{count}-random50"] = QueryKind(self._ddim(count), mask)
-        # One step, and what a query takes besides its steps.
-        queries["ddim1"] = QueryKind(self._ddim(1))
+        for count in (3, 2, 1):
+            queries[f"ddim{count}"] = QueryKind(self._ddim(count))
         return queries
 
     def _ddim(self, num_steps: int) -> Sampler:

@@ -19,7 +19,7 @@ import torch
 
 from torchrl_sparse.runtime.threads import num_threads
 
-__all__ = ["Latency", "Machine", "describe_machine", "measure_latency", "summarize_latency"]
+__all__ = ["Latency", "Machine", "describe_machine", "measure_latency", "summarize_latency", "usable_cores"]
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def describe_machine(device: torch.device | str = "cpu", threads: int | None = N
     """
     device = torch.device(device)
     name = f"{device.type} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
-    cores = _usable_cores()
+    cores = usable_cores()
     return Machine(
         cpu=f"{_cpu_model()}, {cores} {'core' if cores == 1 else 'cores'} usable",
         threads=torch.get_num_threads() if threads is None else int(threads),
@@ -160,7 +160,8 @@ def _synchronize(device: torch.device) -> None:
         torch.mps.synchronize()
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
+    """Return how many cores this process may run on."""
     # A container often sees all the host's cores but may run on a few of them only.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

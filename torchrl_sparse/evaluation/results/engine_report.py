@@ -51,7 +51,7 @@ class EngineRow:
         max_err: largest difference of a normalised action to the reference's, on the same noise and mask.
         limit_s: what reading the weights of all computed blocks takes, once per evaluation, at the shape's bandwidth.
         f32_limit_s: what multiplying with these weights takes, for every row that computes them, at the shape's rate of
-            products; None for bf16.
+            products; None for bf16 and int8.
         first_s: of the first call, with everything that is done once; None in older files.
         peak_bytes: of a GPU's memory; None on a CPU.
     """

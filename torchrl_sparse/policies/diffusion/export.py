@@ -60,6 +60,8 @@ def export_policy(
     supported, reason = native_supports(network)
     if not supported:
         raise ValueError(f"export: {reason}")
+    if weights == "int8":
+        raise ValueError("weights: expected one of ['float32', 'float16', 'bfloat16'] in a file, got 'int8'")
     if network.horizon < network.n_obs_steps:
         raise ValueError(
             f"export: expected horizon >= n_obs_steps, got {network.horizon} and {network.n_obs_steps}"

@@ -151,7 +151,7 @@ def test_bfloat16_rounds_and_nothing_else(shape, instruction_set):
     assert (actions - portable.denoise(noise, cond, mask)).abs().max() < 2e-2
 
 
-@pytest.mark.parametrize("weights", ["float32", "float16", "bfloat16"])
+@pytest.mark.parametrize("weights", ["float32", "float16", "bfloat16", "int8"])
 def test_a_row_of_a_batch_is_bit_identical_to_the_row_alone_and_threads_change_nothing(weights):
     network, sampler = make_network(), Sampler("ddpm", 10)
     noise, cond, mask = make_query(network, sampler, batch=5)
@@ -239,8 +239,8 @@ def test_what_it_cannot_run_is_refused_with_the_reason():
     ):
         with pytest.raises(ValueError, match=reason):
             NativeEngine(network, sampler)
-    with pytest.raises(ValueError, match=r"weights: expected one of .*'bfloat16'\], got 'int8'"):
-        NativeEngine(make_network(), sampler, weights="int8")
+    with pytest.raises(ValueError, match=r"weights: expected one of .*'int8'\], got 'int4'"):
+        NativeEngine(make_network(), sampler, weights="int4")
     with pytest.raises(ValueError, match="instruction_set: expected one of"):
         NativeEngine(make_network(), sampler, instruction_set="mmx")
     with pytest.raises(ValueError, match="threads: expected a whole number from 1 to 64, got 0"):

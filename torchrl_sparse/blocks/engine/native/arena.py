@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["PANEL", "Arena", "Matrix", "pack_panels"]
+__all__ = ["PANEL", "Arena", "Matrix", "pack_panels", "quantise"]
 
 PANEL, PART = 32, 256
-_TYPES = (torch.float32, torch.float16, torch.bfloat16)  # as denoise.h numbers them
+_TYPES = (torch.float32, torch.float16, torch.bfloat16, torch.int8)  # as denoise.h numbers them
+_TOGETHER = {torch.bfloat16: 2, torch.int8: 4}  # inputs that lie side by side
 _CACHE_LINE = 64
 
 
@@ -26,7 +27,7 @@ class Matrix(ctypes.Structure):
     """``struct Matrix`` of denoise.h; :meth:`Arena.matrix` makes one."""
 
     _fields_ = [
-        *((name, c_void_p) for name in ("weight", "bias")),
+        *((name, c_void_p) for name in ("weight", "bias", "scale", "sums")),
         *((name, c_int32) for name in ("rows", "columns", "bias_stride", "type")),
     ]
 
@@ -36,8 +37,9 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
     Args:
         weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
-        dtype: torch.float32, torch.float16 or torch.bfloat16. Of bfloat16, each two rows become one of i32, the first
-            in the lower half: CPUs multiply them in pairs.
+        dtype: torch.float32, torch.float16, torch.bfloat16 or, for whole numbers from -127 to 127, torch.int8. Of
+            bfloat16 each two rows become one of i32, the first in the lower half, and of int8 each four: CPUs multiply
+            them together.
 
     Returns:
         flat, part after part of up to 256 rows, in each [ceil(columns / 32), rows of the part, 32]; zero where there
@@ -55,11 +57,27 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         raise ValueError(
             f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
         )
-    if dtype == torch.bfloat16:
-        rounded = functional.pad(rounded, (0, weight.shape[1] % 2)).contiguous().view(torch.int32)
+    if dtype in _TOGETHER:
+        missing = -weight.shape[1] % _TOGETHER[dtype]
+        rounded = functional.pad(rounded, (0, missing)).contiguous().view(torch.int32)
     columns, rows = rounded.shape
     panels = functional.pad(rounded, (0, 0, 0, -columns % PANEL)).view(-1, PANEL, rows).transpose(1, 2)
     return torch.cat([part.flatten() for part in panels.split(PART, dim=1)])
+
+
+def quantise(weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Round each column of a matrix to 8 bits by itself: ``weight`` [columns, rows] is about ``scale[:, None] * integers``.
+
+    Returns:
+        integers, -127 to 127, in the type of ``weight``, and scale [columns].
+
+    Examples:
+        >>> quantise(torch.tensor([[0.5, -1.0], [0.0, 0.0]]))
+        (tensor([[  64., -127.],
+                [   0.,    0.]]), tensor([0.0079, 0.0000]))
+    """
+    scale = weight.abs().amax(dim=1) / 127
+    return (weight / scale[:, None]).nan_to_num(0).round(), scale
 
 
 class Arena:
@@ -90,13 +108,20 @@ class Arena:
         """Pack a layer's ``weight`` [columns, rows] and ``bias`` [columns], or [n, columns] for n rows of a product."""
         columns, rows = weight.shape
         bias = functional.pad(bias, (0, -columns % PANEL))
+        integers = {}
+        if dtype == torch.int8:
+            weight, scale = quantise(weight)
+            sums = weight.sum(dim=1).to(torch.int32)
+            scale, sums = (functional.pad(part, (0, -columns % PANEL)) for part in (scale, sums))
+            integers = {"scale": self.floats(scale), "sums": self.keep(sums)}
         return Matrix(
             weight=self.keep(pack_panels(weight, dtype)),
             bias=self.floats(bias),
-            rows=-(-rows // 2) if dtype == torch.bfloat16 else rows,
+            rows=-(-rows // _TOGETHER.get(dtype, 1)),
             columns=bias.shape[-1],
             bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
             type=_TYPES.index(dtype),
+            **integers,
         )
 
 

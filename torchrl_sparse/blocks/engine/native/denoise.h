@@ -12,27 +12,35 @@
 //   sums in the same order whatever the number of threads.
 // * Nothing is allocated: all memory of a query is its `scratch`, so that any number of queries may run at a time.
 // * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.
-// * The kernels are written once, with the vector types of GCC and Clang, and compiled for four instruction sets by
+// * The kernels are written once, with the vector types of GCC and Clang, and compiled for up to four instruction sets by
 //   including this file in itself. The caller chooses one of LEVELS at run time.
 
 #ifndef VECTOR  // ---------------------------------------------------------------------- what is compiled only once
 
 #include <cstddef>
 #include <cstdint>
-#if defined(__x86_64__)
+#if defined(PORTABLE_ONLY)  // for tests
+#elif defined(__x86_64__)
+#define X86
 #include <immintrin.h>
+#elif defined(__aarch64__)
+#define ARM
+#include <arm_neon.h>
 #endif
 
 #include "member.h"
 
 extern "C" {
 
-enum Type : int32_t { F32, F16, BF16 };
+enum Type : int32_t { F32, F16, BF16, I8 };
 
-// A packed matrix [part][columns / 32][inputs of the part][32]. Of BF16, two inputs count as one: they lie side by side.
+// A packed matrix [part][columns / 32][inputs of the part][32]. Of BF16, two inputs count as one, and of I8 four: they lie
+// side by side.
 struct Matrix {
     const void* weight;
-    const float* bias;  // [columns], or one row of it for each row of the result
+    const float* bias;    // [columns], or one row of it for each row of the result
+    const float* scale;   // of I8 [columns]: what a weight of 1 stands for
+    const int32_t* sums;  // of I8 [columns]: of the weights
     int32_t rows, columns, bias_stride;
     Type type;
 };
@@ -77,6 +85,7 @@ constexpr int MAX_HIDDEN = 256;   // of a pruner
 constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
 using half = uint16_t;
 struct Pair { uint16_t first, second; };  // of BF16
+struct Quad { int8_t weights[4]; };       // of I8; the activations that belong to it are unsigned
 
 constexpr int padded(int n) { return (n + PANEL - 1) / PANEL * PANEL; }
 // Rows are one cache line longer than needed: powers of two would put all rows of a column in one set of the cache.
@@ -89,6 +98,7 @@ struct Buffers {
     const int width, ld, head, inner, ldh, lanes;
     float *x, *y, *kv, *rounded, *eps, *sample, *constant, *scores;  // own
     float* cleans;  // own [2][horizon]: the clean predictions of the step before and of the one before it
+    float* grid;    // own [horizon][2]: the step and the zero of rows that are rounded to I8
     float *qkv, *mixed, *hidden, *latest, *token;  // shared
     float *key, *value, *key_bias;  // shared [layers][obs_steps][heads]: what cross-attention reads of the observations
     size_t size;
@@ -105,6 +115,7 @@ struct Buffers {
         eps = take(own, m.horizon * stride(m.action_dim));
         sample = take(own, m.horizon * stride(m.action_dim));
         cleans = take(own, 2 * m.horizon * stride(m.action_dim));
+        grid = take(own, 2 * m.horizon);
         constant = take(own, m.horizon * width);
         scores = take(own, (size_t)(m.horizon > memory ? m.horizon : memory) * lanes);
         qkv = take(shared, m.horizon * stride(3 * padded(inner)));
@@ -127,7 +138,12 @@ struct Buffers {
 #define LEVEL portable
 #define VECTOR 4
 #include "denoise.h"
-#if defined(__x86_64__)
+#if defined(ARM)  // always has NEON: the portable vectors are its own, and there are twice as many registers
+#define LEVEL neon
+#define VECTOR 4
+#define NEON
+#include "denoise.h"
+#elif defined(X86)
 #define LEVEL avx2
 #define VECTOR 8
 #define TARGET "avx2,fma,f16c"
@@ -138,8 +154,8 @@ struct Buffers {
 #include "denoise.h"
 #define LEVEL avx512_bf16
 #define VECTOR 16
-#define TARGET "avx512bf16,avx512f,avx2,fma,f16c"
-#define DOT_BF16
+#define TARGET "avx512bf16,avx512vnni,avx512f,avx2,fma,f16c"
+#define DOTS
 #include "denoise.h"
 #endif
 
@@ -151,7 +167,9 @@ struct Level {
 };
 const Level LEVELS[] = {
     {portable::denoise, portable::run_blocks, portable::prune},
-#if defined(__x86_64__)
+#if defined(ARM)
+    {neon::denoise, neon::run_blocks, neon::prune},
+#elif defined(X86)
     {avx2::denoise, avx2::run_blocks, avx2::prune},
     {avx512::denoise, avx512::run_blocks, avx512::prune},
     {avx512_bf16::denoise, avx512_bf16::run_blocks, avx512_bf16::prune},
@@ -160,10 +178,12 @@ const Level LEVELS[] = {
 
 // Instruction sets that this CPU can run: the first 1 to 4 of LEVELS.
 int32_t levels() {
-#if defined(__x86_64__)
+#if defined(ARM)
+    return 2;
+#elif defined(X86)
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return 1;
     if (!__builtin_cpu_supports("avx512f")) return 2;
-    return __builtin_cpu_supports("avx512bf16") ? 4 : 3;
+    return __builtin_cpu_supports("avx512bf16") && __builtin_cpu_supports("avx512vnni") ? 4 : 3;
 #else
     return 1;
 #endif
@@ -188,16 +208,24 @@ namespace LEVEL {
 typedef float V __attribute__((vector_size(4 * VECTOR)));
 typedef int32_t I __attribute__((vector_size(4 * VECTOR)));
 typedef half H __attribute__((vector_size(2 * VECTOR)));
+typedef uint8_t B __attribute__((vector_size(VECTOR)));
 typedef float Unaligned __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
 typedef half UnalignedHalf __attribute__((vector_size(2 * VECTOR), aligned(2), may_alias));
+typedef uint8_t UnalignedBytes __attribute__((vector_size(VECTOR), aligned(1), may_alias));
+typedef int32_t UnalignedInts __attribute__((vector_size(4 * VECTOR), aligned(4), may_alias));
 
+#if defined(NEON)
+constexpr int REGISTERS = 32;
+#else
 constexpr int REGISTERS = VECTOR == 16 ? 32 : 16;
+#endif
 // Rows of a tile. 16 are the longest published horizon; 6 rows x 2 vectors of sums, 2 of weights and 1 of activations fill
 // 15 of 16 registers.
-constexpr int MAX_ROWS = VECTOR == 16 ? 16 : 6;
+constexpr int MAX_ROWS = REGISTERS == 32 ? 16 : 6;
 
 INLINE V load(const float* p) { return *(const Unaligned*)p; }
 INLINE V load(const Pair* p) { return *(const Unaligned*)p; }
+INLINE V load(const Quad* p) { return *(const Unaligned*)p; }
 INLINE void store(float* p, V v) { *(Unaligned*)p = v; }
 INLINE V splat(float f) { return f - V{}; }  // not V{} + f, which is not f if f is -0 and so costs an addition
 
@@ -206,6 +234,8 @@ INLINE V load(const half* p) {
     return _mm512_cvtph_ps(_mm256_loadu_si256((const __m256i*)p));
 #elif VECTOR == 8
     return _mm256_cvtph_ps(_mm_loadu_si128((const __m128i*)p));
+#elif defined(NEON)
+    return (V)vcvt_f32_f16(vreinterpret_f16_u16(vld1_u16(p)));
 #else
     const I bits = __builtin_convertvector(*(const UnalignedHalf*)p, I);
     // The exponents of f16 and f32 differ by 112; multiplying is right for subnormal numbers as well.
@@ -214,11 +244,11 @@ INLINE V load(const half* p) {
 #endif
 }
 
-// sums + weights * activations: of one input, or of a pair of them.
+// sums + weights * activations: of one input, of a pair of them, or of four, in integers.
 INLINE V accumulate(V sums, V weights, V x, const float*) { return sums + weights * x; }
 INLINE V accumulate(V sums, V weights, V x, const half*) { return sums + weights * x; }
 INLINE V accumulate(V sums, V weights, V x, const Pair*) {
-#if defined(DOT_BF16)
+#if defined(DOTS)
     return _mm512_dpbf16_ps(sums, (__m512bh)weights, (__m512bh)x);
 #else
     const int second = ~0xffff;  // BF16 is the upper half of F32
@@ -226,6 +256,18 @@ INLINE V accumulate(V sums, V weights, V x, const Pair*) {
     return sums + (V)((I)weights & second) * (V)((I)x & second);
 #endif
 }
+INLINE I accumulate(I sums, V weights, V x, const Quad*) {
+#if defined(DOTS)
+    return (I)_mm512_dpbusd_epi32((__m512i)sums, (__m512i)x, (__m512i)weights);
+#else
+#pragma GCC unroll 4
+    for (int shift = 0; shift < 32; shift += 8) sums += ((I)weights << (24 - shift) >> 24) * ((I)x >> shift & 0xff);
+    return sums;
+#endif
+}
+
+template <class T> struct Sums { typedef V type; };
+template <> struct Sums<Quad> { typedef I type; };
 
 INLINE float sum(V v) {
 #if VECTOR == 16
@@ -288,10 +330,11 @@ void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const flo
     for (int strip = 0; strip < PANEL; strip += N * VECTOR) {
         const float* x = input;
         const T* w = panel + strip;
-        V sums[MR][N], weights[N];
+        typename Sums<T>::type sums[MR][N];
+        V weights[N];
 #pragma GCC unroll 16
         for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) sums[m][n] = load(start + m * ld_start + strip + n * VECTOR);
+            for (int n = 0; n < N; n++) sums[m][n] = (typename Sums<T>::type)load(start + m * ld_start + strip + n * VECTOR);
         for (int k = 0; k < rows; k++, w += PANEL, x++) {
             for (int n = 0; n < N; n++) {
                 __builtin_prefetch(w + AHEAD * PANEL + n * VECTOR, 0, 2);
@@ -305,7 +348,7 @@ void tile(const float* input, ptrdiff_t ldx, const T* panel, int rows, const flo
         }
 #pragma GCC unroll 16
         for (int m = 0; m < MR; m++)
-            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, sums[m][n]);
+            for (int n = 0; n < N; n++) store(y + m * ldy + strip + n * VECTOR, (V)sums[m][n]);
     }
 }
 
@@ -370,6 +413,7 @@ struct Query {
     void product(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) const {
         if (a.type == F32) return multiply<float>(x, ldx, n, a, columns, y, ldy);
         if (a.type == F16) return multiply<half>(x, ldx, n, a, columns, y, ldy);
+        if (a.type == I8) return integer_product(x, ldx, n, a, columns, y, ldy);
         const int ld_rounded = b.ldh / 2;
         for (int t = 0; t < n; t++) round(x + t * ldx, 2 * a.rows, b.rounded + t * ld_rounded);
         multiply<Pair>(b.rounded, ld_rounded, n, a, columns, y, ldy);
@@ -385,6 +429,51 @@ struct Query {
             const I bits = (I)load(x + j);
             *(UnalignedHalf*)((half*)pairs + j) = __builtin_convertvector((bits + 0x7fff + (bits >> 16 & 1)) >> 16, H);
         }
+    }
+
+    // x = step * (q - zero) in each row, with q in a byte, so that x * weight = step * scale * (q * w - zero * sum of w): the
+    // sums are exact, whatever their order. Those of up to 2^15 inputs fit into i32.
+    void integer_product(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) const {
+        const int ld_rounded = b.ldh / 4;
+        for (int t = 0; t < n; t++) {
+            quantise(x + t * ldx, 4 * a.rows, (uint8_t*)(b.rounded + t * ld_rounded), b.grid + 2 * t);
+            for (int j = columns.first; j < columns.last; j += VECTOR)
+                *(UnalignedInts*)(y + t * ldy + j) = *(const UnalignedInts*)(a.sums + j) * -(int32_t)b.grid[2 * t + 1];
+        }
+        Matrix from = a;
+        from.bias = y;
+        from.bias_stride = ldy;
+        multiply<Quad>(b.rounded, ld_rounded, n, from, columns, y, ldy);
+        for (int t = 0; t < n; t++)
+            for (int j = columns.first; j < columns.last; j += VECTOR) {
+                const V total = __builtin_convertvector(*(const UnalignedInts*)(y + t * ldy + j), V);
+                store(y + t * ldy + j, total * (load(a.scale + j) * b.grid[2 * t]) + load(a.bias + j));
+            }
+    }
+
+    // A row of f32 to 256 levels, of which one is 0, from its least to its largest number. `x` is padded to whole vectors.
+    static void quantise(const float* x, int n, uint8_t* bytes, float* grid) {
+        V least{}, most{};
+        for (int j = 0; j < n; j += VECTOR) {
+            const V v = load(x + j);
+            least = v < least ? v : least;
+            most = v > most ? v : most;
+        }
+        float low = 0, high = 0;
+        for (int i = 0; i < VECTOR; i++) {
+            low = least[i] < low ? least[i] : low;
+            high = most[i] > high ? most[i] : high;
+        }
+        const float step = (high - low) / 255, inverse = step > 0 ? 1 / step : 0;
+        const float zero = (float)(int32_t)(.5f - low * inverse);
+        for (int j = 0; j < n; j += VECTOR) {
+            V level = load(x + j) * inverse + (zero + .5f);
+            level = level > 0.f ? level : V{};  // and if it is no number
+            level = level < 255.f ? level : splat(255.f);
+            *(UnalignedBytes*)(bytes + j) = __builtin_convertvector(__builtin_convertvector(level, I), B);
+        }
+        grid[0] = step;
+        grid[1] = zero;
     }
 
     // y = (x - mean) / std of rows; gain and shift are in the weights that follow.
@@ -625,7 +714,7 @@ void run_blocks(const Model& m, const Member& who, int kind, float* own, float* 
 // One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.
 void prune(const Pruner& p, const Member& who, const float* observation, float* logits, uint8_t* mask) {
     // With so many rows, a tile holds two vectors of each in registers: half the loads of one with MAX_ROWS.
-    constexpr int GROUP = VECTOR == 16 ? 12 : MAX_ROWS;
+    constexpr int GROUP = REGISTERS == 32 ? 12 : MAX_ROWS;
     constexpr int ld = stride(MAX_HIDDEN);
     alignas(64) float added[ld], x[GROUP * ld], y[GROUP * ld];
     const int width = p.middle.columns;
@@ -663,5 +752,6 @@ void prune(const Pruner& p, const Member& who, const float* observation, float* 
 #undef LEVEL
 #undef VECTOR
 #undef TARGET
-#undef DOT_BF16
+#undef DOTS
+#undef NEON
 #endif

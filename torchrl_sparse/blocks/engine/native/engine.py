@@ -34,7 +34,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
+__all__ = ["MAX_THREADS", "NativeEngine", "NativeWatch", "native_supports"]
 
 MAX_THREADS = 64  # of a team, see team.h
 
@@ -64,7 +64,7 @@ def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
     return True, ""
 
 
-class _NativeWatch(WeightWatch):
+class NativeWatch(WeightWatch):
     """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
@@ -98,7 +98,10 @@ class NativeEngine:
         network: the denoiser, in eval mode; see :func:`native_supports`.
         sampler: the sampler.
         weights: ``"float32"``; ``"float16"`` for half the memory; ``"bfloat16"`` for half the memory and, on a CPU
-            with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well.
+            with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well; ``"int8"`` for a
+            quarter of the memory and, with AVX512-VNNI, four times the multiply-adds: weights of the trunk are rounded to
+            8 bits by output, activations by token between the least and the largest of it, so that no data are needed
+            to calibrate them; embedding, head, norms, softmax, cross-attention and the residual stream stay float32.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
         threads: with the caller's; None takes ``torch.get_num_threads()`` at each call, of which a single query uses
             no more than one for each 32 of the embedding's size, and none at 1.
@@ -145,7 +148,7 @@ class NativeEngine:
             sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
         )
         self._stock: list[Tensor] = []
-        self._watch = _NativeWatch(network)
+        self._watch = NativeWatch(network)
         self._packed = (None, None)
         self._current()
 

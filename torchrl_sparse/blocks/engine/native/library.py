@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.machinery
+import platform
 import warnings
 from ctypes import c_int32, c_int64, c_void_p
 from functools import lru_cache
@@ -17,7 +18,8 @@ from torchrl_sparse.blocks.engine.native.packing import Model
 
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
 
-INSTRUCTION_SETS = ("portable", "avx2", "avx512", "avx512_bf16")
+_OF_MACHINE = {"aarch64": ("neon",), "arm64": ("neon",)}
+INSTRUCTION_SETS = ("portable", *_OF_MACHINE.get(platform.machine(), ("avx2", "avx512", "avx512_bf16")))
 # Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),

@@ -37,7 +37,7 @@ from torchrl_sparse.storage.tensors import check_shapes
 
 __all__ = ["Model", "PackedNetwork", "weight_type"]
 
-_WEIGHTS = ("float32", "float16", "bfloat16")
+_WEIGHTS = ("float32", "float16", "bfloat16", "int8")
 
 _HEAD = 16  # heads are padded to whole vectors
 
@@ -70,7 +70,8 @@ class PackedNetwork:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
         sampler: the denoising steps.
         weights: type of the trunk's matrices and of the condition encoder's but the first, one of those of
-            :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`.
+            :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`; of int8, the encoder's and what folds its
+            tokens, which are read once a query, stay f32.
 
     Attributes:
         model: the structure that denoise.h reads.
@@ -80,7 +81,7 @@ class PackedNetwork:
     """
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler, weights: torch.dtype) -> None:
-        self._weights = weights
+        self._weights, self._once = weights, torch.float32 if weights == torch.int8 else weights
         self._arena = Arena()
         self._arrays: list[ctypes.Array] = []  # structures only point to theirs
         # What is read beyond its end would not be noticed.
@@ -127,7 +128,7 @@ class PackedNetwork:
             ),
             head=self._arena.matrix(*after_norm(network.ln_f, Affine(head.weight, head.bias))),
             encode_up=self._arena.matrix(*fold_observation_stem(network)),
-            encode_down=self._matrix(network.encoder[2].weight, network.encoder[2].bias),
+            encode_down=self._arena.matrix(network.encoder[2].weight, network.encoder[2].bias, self._once),
             coefficients=self._arena.floats(sampler.coefficients.table()),
             valid=self._columns(torch.ones(network.n_emb)),
             **tables,
@@ -146,11 +147,13 @@ class PackedNetwork:
     def _pack_memory(self, layer: FoldedLayer) -> dict[str, object]:
         """Pack what folds memory tokens into cross-attention."""
         query, out = layer.query.weight, layer.cross_out.weight.movedim(0, 2)
-        kv = self._matrix(*map(_parts, layer.key_value))
+        kv = self._arena.matrix(*map(_parts, layer.key_value), self._once)
         heads = [_padded(head, _HEAD, dim=0).T for side in (query, out) for head in side]
         return {
             "kv": kv,
-            "fold": self._array(Matrix, [self._matrix(head, torch.zeros(len(head))) for head in heads]),
+            "fold": self._array(
+                Matrix, [self._arena.matrix(head, torch.zeros(len(head)), self._once) for head in heads]
+            ),
             "query_bias": self._arena.floats(_padded(layer.query.bias, _HEAD, dim=1)),
             "cross_bias": self._columns(layer.cross_out.bias),
         }

@@ -1,0 +1,66 @@
+"""Profile one query in the native engine: its parts, its threads, and its tail.
+
+    python recipes/profile_query.py policy=assets/lift sampler=ddim_87_20
+    python recipes/profile_query.py queries=100000 hz=50 busy=1 out=outputs/query_busy     # 33 minutes
+
+Writes OUT/query.json, three tables and OUT/query_threads.png. Times are medians, everything interleaved in one process; in
+the tail, every query counts.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.evaluation.figures.latency import plot_thread_scaling
+from torchrl_sparse.evaluation.latency.measure import describe_machine, usable_cores
+from torchrl_sparse.evaluation.latency.profile import (
+    busy_cores,
+    paced_seconds,
+    query_parts,
+    tail,
+    thread_seconds,
+)
+from torchrl_sparse.evaluation.results.query_report import QueryProfile, format_query_profile
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.runtime.progress import progress
+from torchrl_sparse.runtime.threads import num_threads
+from torchrl_sparse.storage.json import write_json
+
+
+@recipe("profile_query")
+def main(config: DictConfig) -> None:
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    dense, chosen = policy.sampler, Sampler.from_name(config.sampler)
+    policy.sampler = chosen
+    # Threads that wait for each other on one core show the scheduler, not the engine.
+    counts = sorted({1, *(count for count in config.thread_counts if count <= usable_cores())})
+    with num_threads(config.threads):
+        parts = query_parts(policy, config.repeats, config.warmup)
+        with busy_cores(config.busy), progress("tail", "query", config.queries) as show:
+            late = paced_seconds(policy, config.queries, config.hz, show)
+    threads = thread_seconds(
+        policy.network, {"dense": dense, config.sampler: chosen}, counts, config.repeats, config.warmup
+    )
+    found = QueryProfile(
+        format="query/1",
+        machine=describe_machine(threads=config.threads),
+        sampler=config.sampler,
+        parts_s=parts,
+        threads_s={name: {str(count): at[count] for count in at} for name, at in threads.items()},
+        tail_s=tail(late),
+        queries=config.queries,
+        busy=config.busy,
+        hz=config.hz,
+    )
+    out = Path(config.out)
+    write_json(out / "query.json", found)
+    plot_thread_scaling(found.threads_s, found.machine, out / "query_threads.png")
+    print(f"\n{format_query_profile(found)}\n\nfiles are in {out}")
+
+
+if __name__ == "__main__":
+    main()

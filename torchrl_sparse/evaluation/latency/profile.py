@@ -1,0 +1,186 @@
+"""One query under the glass: what its time goes to, what more threads make of it, and how late the latest of many come."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine, NativeWatch
+from torchrl_sparse.evaluation.latency.measure import measure_latency
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+__all__ = [
+    "busy_cores",
+    "paced_seconds",
+    "query_parts",
+    "serial_share",
+    "state_query",
+    "tail",
+    "thread_seconds",
+]
+
+_PERCENTILES = (50, 99, 99.9, 100)
+
+
+def state_query(policy: DiffusionPolicy) -> TensorDict:
+    """Return one observation [1] of a policy of states, with the seed of its noise.
+
+    Raises:
+        ValueError: if the policy has cameras.
+    """
+    if policy.vision is not None:
+        raise ValueError(f"policy: expected one of states, got cameras {list(policy.vision.cameras)}")
+    state = torch.zeros(1, policy.n_obs_steps, len(policy.normalizer.state_scale))
+    episode = {"seed": torch.ones(1, 1, dtype=torch.long), "step": torch.ones(1, 1, dtype=torch.long)}
+    return TensorDict({"history": {"state": state}, "episode": episode}, [1])
+
+
+@torch.no_grad()
+def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[str, float]:
+    """Measure the median seconds of a query in the native engine, and of what happens in it, interleaved.
+
+    Args:
+        policy: of states, on the CPU, with a planner that does not look at the observation.
+        repeats: timed rounds.
+        warmup: untimed rounds before them.
+
+    Returns:
+        ``"query"``, the whole of it, and its parts, which add up to it: ``"noise"``, drawn; ``"weights"``, asked whether
+        they are the same; ``"blocks"``, those that the mask leaves; ``"compiled rest"``: units, the encoder, head and
+        sampler; ``"tensors"``: keys of the TensorDict, Python, and the clock.
+
+    Raises:
+        ValueError: if another engine runs the policy, or the planner looks at the observation.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift", engine="native")
+        >>> policy.sampler = Sampler("ddim", timesteps=[87, 20])
+        >>> parts = query_parts(policy, repeats=3)
+        >>> query = parts.pop("query")
+        >>> abs(query - sum(parts.values())) < 1e-9
+        True
+    """
+    query = state_query(policy)
+    engine = policy.module["denoise"].engine.get(policy.network, policy.sampler)
+    if not isinstance(engine, NativeEngine):
+        raise ValueError(f"engine: expected native, got {engine.name}")
+    if not policy.plan.is_static:
+        raise ValueError(
+            f"plan: expected one that does not look at the observation, got {type(policy.plan).__name__}"
+        )
+    noise, state, seed = policy.sample_noise(torch.tensor([1])), query["history", "state"], torch.tensor([1])
+    mask, watch = policy.plan.static_mask, NativeWatch(policy.network)
+    latency = measure_latency(
+        {
+            "query": lambda: policy(query.copy()),
+            "noise": partial(policy.sample_noise, seed),
+            "weights": watch.state,
+            "answer": lambda: engine.answer(noise, state, policy.normalizer, mask, policy.plan.reuse),
+        },
+        repeats,
+        warmup,
+    )
+    seconds = {name: found.p50 for name, found in latency.items()}
+    each = torch.tensor(list(engine.block_seconds().values()), dtype=torch.float64)
+    blocks = float(((~mask).view(-1, 3) * each).sum())
+    return {
+        "query": seconds["query"],
+        "noise": seconds["noise"],
+        "weights": seconds["weights"],
+        "blocks": blocks,
+        "compiled rest": seconds["answer"] - seconds["weights"] - blocks,
+        "tensors": seconds["query"] - seconds["noise"] - seconds["answer"],
+    }
+
+
+def thread_seconds(
+    network: TransformerForDiffusion,
+    samplers: Mapping[str, Sampler],
+    threads: Sequence[int],
+    repeats: int,
+    warmup: int = 2,
+) -> dict[str, dict[int, float]]:
+    """Measure the median seconds of an unpruned query of each sampler on each number of threads, all interleaved.
+
+    Returns:
+        name of the sampler -> threads -> seconds.
+    """
+    generator = torch.Generator().manual_seed(0)
+    cond = torch.randn(1, network.n_obs_steps, network.cond_dim, generator=generator)
+    calls: dict[str, Callable[[], Any]] = {}
+    for name, sampler in samplers.items():
+        shape = (1, sampler.num_inference_steps, network.horizon, network.input_dim)
+        noise = torch.randn(shape, generator=generator)
+        for count in threads:
+            engine = NativeEngine(network, sampler, threads=count)
+            calls[f"{name} {count}"] = partial(engine.denoise, noise, cond)
+    latency = measure_latency(calls, repeats, warmup)
+    return {name: {count: latency[f"{name} {count}"].p50 for count in threads} for name in samplers}
+
+
+def serial_share(seconds: dict[int, float]) -> float:
+    """Fit Amdahl's law, ``t(n) = t(1) (s + (1 - s) / n)``, to times on n threads, 1 among them; return s, by least squares.
+
+    >>> round(serial_share({1: 1.0, 2: 0.6, 4: 0.4}), 3)
+    0.2
+    """
+    others = [count for count in seconds if count > 1]
+    gained = np.array([1 - 1 / count for count in others])
+    missing = np.array([seconds[count] / seconds[1] - 1 / count for count in others])
+    return float(missing @ gained / (gained @ gained)) if others else 0.0
+
+
+@torch.no_grad()
+def paced_seconds(
+    policy: DiffusionPolicy,
+    queries: int,
+    hz: float | None,
+    on_query: Callable[[int, int], None] | None = None,
+) -> list[float]:
+    """Time each of many queries, which begin ``hz`` times a second as a control loop's do; None: one after the other."""
+    query, samples = state_query(policy), []
+    policy(query.copy())
+    begin = time.perf_counter()
+    for number in range(queries):
+        if hz is not None:
+            time.sleep(max(0.0, begin + number / hz - time.perf_counter()))
+        data = query.copy()
+        start = time.perf_counter()
+        policy(data)
+        samples.append(time.perf_counter() - start)
+        if on_query is not None:
+            on_query(number + 1, queries)
+    return samples
+
+
+def tail(samples: Sequence[float]) -> dict[str, float]:
+    """Return ``"p50"``, ``"p99"``, ``"p99.9"`` and ``"max"`` of seconds.
+
+    >>> tail([1.0, 1.0, 3.0])["p50"]
+    1.0
+    """
+    values = np.percentile(samples, _PERCENTILES).tolist()
+    return dict(zip(("p50", "p99", "p99.9", "max"), values, strict=True))
+
+
+@contextmanager
+def busy_cores(count: int) -> Iterator[None]:
+    """Keep ``count`` processes computing meanwhile, as other programs of a robot do."""
+    busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
