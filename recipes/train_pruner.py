@@ -30,7 +30,7 @@ from torchrl_sparse.training.diffusion.targets import add_queries, load_targets,
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner
-from torchrl_sparse.training.pruner.fit import fit_to_masks
+from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
@@ -41,9 +41,18 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     trainer = make_trainer(config)
+    if config.spread and (config.init or config.method != "sag"):
+        raise ValueError(f"spread: expected null with an init or without method=sag, got {config.spread}")
     if config.init and not (out / CHECKPOINT).exists():
         fit_to_schedules(trainer, initial_schedules(config))
-    made = {"init": initial_schedules(config), "targets": settings["targets"], "rollouts": config.rollouts}
+    if config.spread and not (out / CHECKPOINT).exists():
+        spread_logits(trainer.gates, trainer.train_set, config.spread)
+    made = {
+        "init": initial_schedules(config),
+        "spread": config.spread,
+        "targets": settings["targets"],
+        "rollouts": config.rollouts,
+    }
     train(trainer, settings, export=partial(export_planner, trainer, out, made))
     if config.logger == "csv" and trainer.step >= config.log_every:
         plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
