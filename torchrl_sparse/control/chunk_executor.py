@@ -9,6 +9,8 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 
+_HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED)  # to policies that read them; no environment writes them
+
 
 class ChunkExecutor(TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
@@ -16,7 +18,8 @@ class ChunkExecutor(TensorDictModuleBase):
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
     when the controller asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to
     the policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are
-    zero on served steps.
+    zero on served steps. A policy that reads ``("control", "last_chunk")`` and ``("control", "elapsed")`` is handed the chunk
+    of the query before and the steps since, 0 where an episode begins.
 
     All state is in keys, so it follows the environment through any collector.
 
@@ -57,7 +60,7 @@ class ChunkExecutor(TensorDictModuleBase):
             [
                 keys.IS_INIT,
                 *(self.controller.in_keys if self.controller is not None else ()),
-                *self.policy.in_keys,
+                *(key for key in self.policy.in_keys if key not in _HANDED_OVER),
             ]
         )
 
@@ -95,8 +98,7 @@ class ChunkExecutor(TensorDictModuleBase):
         """Run the policy on the due samples alone and write what it returns into their rows."""
         batch = tensordict.batch_size
         index = due.reshape(-1).nonzero().squeeze(-1)
-        request = tensordict.select(*self.policy.in_keys, strict=False).reshape(-1)[index]
-        answer = self.policy(request)
+        answer = self.policy(self._request(tensordict).reshape(-1)[index])
         length = answer.get(keys.CHUNK).shape[-2]
         if length < self.n_action_steps:
             raise ValueError(
@@ -107,6 +109,15 @@ class ChunkExecutor(TensorDictModuleBase):
             shape = value.shape[1:]
             whole = keys.recall(tensordict, key, shape, 0, value.dtype).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
+
+    def _request(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return all that the policy reads, with the last chunk if it asks for that."""
+        request = tensordict.select(*self.policy.in_keys, strict=False)
+        if keys.LAST_CHUNK in self.policy.in_keys:
+            elapsed = keys.recall(tensordict, keys.AGE, (1,), -1) + 1
+            request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
+            request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
+        return request
 
     def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
         """Return the action [*B, A] of this step."""

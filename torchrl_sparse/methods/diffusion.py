@@ -10,6 +10,7 @@ controller asks for the first rate in coarse motion and for the second in fine m
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
+``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ==================== ===========================================================================================
 
 A method of one's own is one line, executed before its name is used::
@@ -38,6 +39,7 @@ from torchrl_sparse.keys import PRUNE_RATE
 from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart
 
 __all__ = [
     "METHODS",
@@ -116,6 +118,7 @@ class Method:
             written, or None.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
         noise: stream of the noise that it draws; 0 is what all methods share, so that they can be paired.
+        start: returns what queries begin from; None is noise.
     """
 
     make: Callable[[MethodInputs], tuple[Planner, Sampler]]
@@ -123,6 +126,7 @@ class Method:
     controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
     color: str | None = None
     noise: int = 0
+    start: Callable[[MethodInputs], ColdStart | None] = lambda inputs: None
 
 
 def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -131,7 +135,13 @@ def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 def _sampler(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Take the sampler of the name."""
-    return Dense(), Sampler.from_name(inputs.name, num_train_timesteps=inputs.sampler.num_train_timesteps)
+    chain = inputs.name.partition("_warm")[0]
+    return Dense(), Sampler.from_name(chain, num_train_timesteps=inputs.sampler.num_train_timesteps)
+
+
+def _warm(inputs: MethodInputs) -> WarmStart:
+    """Take the steps of the name."""
+    return WarmStart(int(inputs.name.rpartition("_warm")[2]))
 
 
 def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -171,6 +181,7 @@ METHODS: dict[str, Method] = {
     "dense_noise": Method(_dense, color="#9A9AA0", noise=1),
     "ddim10": Method(_sampler, color="#E69F00"),
     "<sampler><steps>, <sampler>_<t>_<t>...": Method(_sampler, pattern=CHAIN_PATTERN),
+    "<sampler>..._warm<steps>": Method(_sampler, pattern=rf"{CHAIN_PATTERN}_warm[1-9]\d*", start=_warm),
     "uniform": Method(_uniform, color="#56B4E9"),
     "uniform<interval>[_<sampler>]": Method(
         _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"
@@ -221,7 +232,7 @@ def make_method(
     planner, sampler = method.make(inputs)
     if written.rates:
         _ask_for(planner, written)
-    made = policy.with_plan(planner, sampler)
+    made = policy.with_plan(planner, sampler, method.start(inputs))
     return made.with_noise(method.noise) if method.noise else made
 
 
@@ -239,6 +250,7 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         policy: as :func:`make_method` returned it.
     """
     other_noise = {"noise": policy.noise_stream} if policy.noise_stream else {}
+    start = {"start": policy.start.name} if policy.start.name else {}
     return {
         "method": text,
         "policy": policy.fingerprint,
@@ -246,6 +258,7 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         "sampler": policy.sampler.config,
         "planner": policy.plan.fingerprint,
         **other_noise,
+        **start,
     }
 
 

@@ -6,7 +6,6 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,11 @@ from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.fingerprint import networks_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -42,8 +43,8 @@ class DiffusionPolicy(TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
-    Weights may change at any time, by training, ``load_state_dict`` or a move: the next query sees it. Only after writing
-    to a part of a tensor through ``.data``, which PyTorch does not record, call `refresh`.
+    Weights may change at any time: the next query sees it. Only after writing to a part of a tensor through ``.data``,
+    which PyTorch does not record, call `refresh`.
 
     Args:
         network: the denoiser.
@@ -60,6 +61,7 @@ class DiffusionPolicy(TensorDictSequential):
         plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
             which then reads as the `Dense` planner.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
+        start: what queries begin from: noise, or the last chunk after ``policy.start = WarmStart(1)``; None is noise.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
@@ -84,6 +86,7 @@ class DiffusionPolicy(TensorDictSequential):
         sampler = Sampler() if sampler is None else sampler
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
+            start=ColdStart(),
             plan=Dense(),
             denoise=ActionDenoiser(network, normalizer, sampler, engine),
         )
@@ -112,47 +115,53 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["plan"]
 
     @property
+    def start(self) -> ColdStart:
+        return self.module["start"]
+
+    @property
     def sampler(self) -> Sampler:
         return self.module["denoise"].sampler
 
     def __setattr__(self, name: str, value: Any) -> None:
         # nn.Module registers any module that is assigned, so properties with setters never see it.
         if name == "plan":
-            self._install(value, self.sampler)
+            self._install(value, self.sampler, self.start)
         elif name == "sampler":
-            self._install(self.plan, value)
+            self._install(self.plan, value, self.start)
+        elif name == "start":
+            self._install(self.plan, self.sampler, value)
         else:
             super().__setattr__(name, value)
 
-    def _install(self, plan: Planner | None, sampler: Sampler) -> None:
-        """Change planner and sampler together, or, if the planner cannot serve that sampler, neither."""
-        plan = Dense() if plan is None else plan
+    def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
+        """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
+        plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
+        start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
-        self.module["plan"] = plan
+        self.module["denoise"].warm = bool(start.out_keys)
+        self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
 
-    def with_plan(self, plan: Planner | None, sampler: Sampler | None = None) -> DiffusionPolicy:
-        """Return a policy of the same networks under another planner and, unless it is None, another sampler.
+    def with_plan(
+        self, plan: Planner | None, sampler: Sampler | None = None, start: ColdStart | None = None
+    ) -> DiffusionPolicy:
+        """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
 
         Raises:
-            ValueError: if the planner was made for another policy or sampler.
+            ValueError: if the planner was made for another policy or sampler, or the start cannot serve it.
         """
         sampler = self.sampler if sampler is None else sampler
         shared = {"vision": self.vision, "engine": self.engine}
         policy = DiffusionPolicy(self.network, self.normalizer, sampler=sampler, plan=plan, **shared)
-        policy.source = self.source
+        policy.start, policy.source = start, self.source
         policy.module["encode"].noise_stream = self.noise_stream
         return policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
-        """Return a policy of the same networks, planner and sampler that draws other noise: what chance alone does.
-
-        Args:
-            stream: 0 is the noise of every other policy.
-        """
-        policy = self.with_plan(self.plan)
+        """Return the same policy with other noise, what chance alone does; ``stream`` 0 is that of every other policy."""
+        policy = self.with_plan(self.plan, start=self.start)
         policy.module["encode"].noise_stream = stream
         return policy
 
@@ -184,14 +193,8 @@ class DiffusionPolicy(TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        digest = hashlib.sha256()
-        for part in (self.network, self.vision):
-            if part is not None:
-                digest.update(repr(sorted(part.config.items())).encode())
-                for name, value in sorted(part.state_dict().items()):
-                    digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
-        return digest.hexdigest()[:16]
+        """A name of these weights; planners are made for one policy."""
+        return networks_fingerprint(self.network, *filter(None, [self.vision]))
 
     @property
     def engine(self) -> EngineName:
@@ -206,8 +209,7 @@ class DiffusionPolicy(TensorDictSequential):
         """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights"``; where
         ``"auto"`` had to do without the native one, also why.
 
-        Raises:
-            ValueError: if the chosen engine cannot run this network here.
+        ValueError if the chosen engine cannot run this network here.
         """
         return self.module["denoise"].engine.describe(self.network, self.sampler)
 
@@ -217,12 +219,8 @@ class DiffusionPolicy(TensorDictSequential):
         return engine_block_costs(slot.get(self.network, self.sampler))
 
     def refresh(self) -> None:
-        """Read all weights anew in the next query.
-
-        Needed after writes through ``parameter.data`` alone, unless they change whole parameters. Engines see optimiser
-        steps, ``load_state_dict``, moves, and parameters or modules that were exchanged.
-        """
-        self.module["denoise"].engine.refresh()
+        """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
+        self.module["denoise"].refresh()
         # A learned planner forgets what it keeps whenever its mode is set.
         self.plan.train(self.plan.training)
 
@@ -254,15 +252,18 @@ class DiffusionPolicy(TensorDictSequential):
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
         Raises:
-            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`; nothing is written.
+            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or there is a start,
+                which no file says; nothing is written.
         """
+        if self.start.name:
+            raise ValueError(f"start: expected None in a policy that is saved, got {self.start.name}")
         plan = save_beside(self.plan, Path(path))
         stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
         write_pretrained(Path(path), stored, half=half)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler and planner, to run in ``engine``. Nothing in the files is executed.
+        """Read what `save_pretrained` wrote, with sampler and planner. Nothing in the files is executed.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -277,8 +278,7 @@ class DiffusionPolicy(TensorDictSequential):
     def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
         """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
 
-        The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
-        what the policy was trained for. Nothing in the file is executed.
+        Averaged weights are used where there are any; ``source`` says what it was trained for. Nothing is executed.
 
         Raises:
             FileNotFoundError: if there is no file.
