@@ -82,6 +82,8 @@ OPTIONS: dict[str, Any] = {
     "draws": Annotated[int, Field(ge=3)],
     "sampler": Section | None,
     "calibrate_bac.sampler": Word | None,
+    "looking.sampler": Word | None,
+    "pruner": Word | None,
     "specprune": Section,
     "options": Section,
     "preset": Word,

@@ -32,7 +32,7 @@ def record_queries(
     episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
     env.close()
     wanted = [*actor.policy.in_keys, *actor.policy.out_keys, keys.LAST_CHUNK, keys.ELAPSED]
-    return torch.cat([_queries(steps).select(*wanted) for steps in episodes])
+    return torch.cat([_queries(steps).select(*wanted, strict=False) for steps in episodes])
 
 
 def _queries(steps: TensorDictBase) -> TensorDictBase:

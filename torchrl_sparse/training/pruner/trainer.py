@@ -37,7 +37,7 @@ from torchrl_sparse.training.pruner.loss import (
 )
 from torchrl_sparse.training.trainer import Trainer, checksum
 
-__all__ = ["PrunerTrainer"]
+__all__ = ["PrunerTrainer", "mean_mask"]
 
 
 class PrunerTrainer(Trainer):
@@ -136,10 +136,7 @@ class PrunerTrainer(Trainer):
         """Return the mean of the masks of all training observations, bool [K, 3L]: the cells that the gates prune most often,
         as many as they prune on average. L2C's result, and SAG's ablation that does not read the observation."""
         parts = self.train_set[keys.COND].split(ANSWER_BATCH)
-        share = sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set)
-        mask = torch.zeros(share.numel(), dtype=torch.bool)
-        mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
-        return mask.view_as(share)
+        return mean_mask(sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set))
 
     def header(self) -> dict[str, dict[str, Any]]:
         size = len(self.train_set) + len(self.held_out)
@@ -211,3 +208,17 @@ class PrunerTrainer(Trainer):
         return noise_errors(
             policy.network, policy.sampler, clean, noise, batch[keys.COND], gate[:, step], step
         )
+
+
+def mean_mask(share: Tensor) -> Tensor:
+    """Return the mask that is nearest to many, bool [K, 3L]: the cells that are pruned most often, as many as are on average.
+
+    Args:
+        share: of the masks that prune each cell, f32 [K, 3L].
+
+    >>> mean_mask(torch.tensor([[0.0, 0.0], [0.9, 0.4]])).tolist()
+    [[False, False], [True, False]]
+    """
+    mask = torch.zeros(share.numel(), dtype=torch.bool)
+    mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
+    return mask.view_as(share)
