@@ -15,7 +15,7 @@ from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.loss import mutual_information, sparsity_loss
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
-SMALL = PrunerConfig(rate=0.6, batch_size=4, lr=1e-2, max_updates=6, checkpointed=False)
+SMALL = PrunerConfig(reuse="type", rate=0.6, batch_size=4, lr=1e-2, max_updates=6, checkpointed=False)
 
 
 def trainer_of(policy, targets, gates=None, **changes):

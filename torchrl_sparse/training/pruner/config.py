@@ -15,7 +15,7 @@ Cost = Literal["blocks", "flops", "seconds"]
 
 @dataclass(frozen=True)
 class PrunerConfig:
-    """Options of a training; defaults as published.
+    """Options of a training; defaults as published, but for ``reuse``.
 
     Attributes:
         objective: what the gates are to change little: ``"actions"``, the final actions of the pruned chain (SAG; static
@@ -42,7 +42,8 @@ class PrunerConfig:
         sparsity: ``"global"``, or ``"block"``: every block has to reach the rate by itself (the paper's ablation).
         cost: what the rate counts: ``"blocks"`` (published), or each weighed by the ``"flops"`` or the measured
             ``"seconds"`` of its type.
-        reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
+        reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`: ``"block"``, as in all policies here, or the
+            paper's one-for-all, ``"type"``.
         gradient: ``"chain"`` differentiates the whole chain of denoising steps; ``"step"`` cuts it between them
             (:func:`~torchrl_sparse.blocks.sag.relaxed.step_errors` says what is lost).
         detached: whether outputs are kept for reuse without their gradient, as the release of SAG's successor does
@@ -72,7 +73,7 @@ class PrunerConfig:
     variety: float = 0.0
     sparsity: Literal["global", "block"] = "global"
     cost: Cost = "blocks"
-    reuse: Reuse = "type"
+    reuse: Reuse = "block"
     gradient: Literal["chain", "step"] = "chain"
     detached: bool = False
     explore: float = 1.0
