@@ -28,6 +28,9 @@ constant                          shape, dtype           meaning
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``START``                         f32 [*B, H, A]         normalised actions that a query begins from, if not from noise
 ``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
+``RECALL``                        bool [*B, K, 3L]       pruned cells that reuse what the query before returned there
+``QUERY``                         i64 [*B, 1]            queries of the episode before this one, for planners that count them
+``FEATURES``                      f32 [*B, K, 3L, H, d]  what each block last computed in each step since the episode began
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
 ``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
                                                          the decoder, L (all of them) was never pruned
@@ -79,6 +82,9 @@ REUSE = ("diffusion", "reuse")
 PRUNE_RATE = ("diffusion", "prune_rate")
 START = ("diffusion", "start")
 NUM_STEPS = ("diffusion", "num_steps")
+RECALL = ("diffusion", "recall")
+QUERY = ("diffusion", "query")
+FEATURES = ("diffusion", "features")
 
 KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")

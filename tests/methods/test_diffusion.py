@@ -82,6 +82,13 @@ def test_a_warm_start_is_written_behind_its_sampler(make):
         make("ddim2_warm2")
 
 
+def test_recalling_is_written_as_uniform_caching_is(make):
+    made = make("recall3_ddpm10")
+    assert (made.plan.interval, made.num_inference_steps) == (3, 10)
+    assert make("recall2").num_inference_steps == 20
+    assert keys.FEATURES in made.out_keys
+
+
 def test_a_method_may_bring_its_own_controller(monkeypatch):
     controller = ActionAwareController(coarse=1, fine=2)
     mine = Method(lambda inputs: (Odd(), inputs.sampler), controller=lambda rates: controller)

@@ -113,9 +113,10 @@ class ChunkExecutor(TensorDictModuleBase):
     def _request(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return all that the policy reads, with the last chunk if it asks for that."""
         request = tensordict.select(*self.policy.in_keys, strict=False)
-        if keys.LAST_CHUNK in self.policy.in_keys:
+        if keys.ELAPSED in self.policy.in_keys:
             elapsed = keys.recall(tensordict, keys.AGE, (1,), -1) + 1
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
+        if keys.LAST_CHUNK in self.policy.in_keys:
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
         return request
 

@@ -10,6 +10,7 @@ controller asks for the first rate in coarse motion and for the second in fine m
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
+``recall2``          every second step of the queries after an episode's first, the other steps as in the query before
 ``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ==================== ===========================================================================================
 
@@ -31,11 +32,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
+from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.keys import PRUNE_RATE
+from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -50,32 +53,6 @@ __all__ = [
     "make_controller",
     "make_method",
 ]
-
-
-@dataclass(frozen=True)
-class MethodName:
-    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``.
-
-    Attributes:
-        name: see the module.
-        rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
-    """
-
-    name: str
-    rates: tuple[float, ...] = ()
-
-    @classmethod
-    def parse(cls, text: str) -> MethodName:
-        """Raise ValueError unless ``text`` is written as above.
-
-        >>> MethodName.parse("sag_rates@0.95-0.7")
-        MethodName(name='sag_rates', rates=(0.95, 0.7))
-        """
-        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
-        if match is None:
-            raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
-        name, *rates = match.groups()
-        return cls(name, tuple(float(rate) for rate in rates if rate is not None))
 
 
 @dataclass(frozen=True)
@@ -149,12 +126,22 @@ def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _uniform_and_last(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    interval, sampler = _interval_and_sampler(inputs, "uniform")
+    return Uniform(interval, last=True), sampler
+
+
+def _interval_and_sampler(inputs: MethodInputs, prefix: str) -> tuple[int, Sampler]:
     """Take interval and, where it is written, sampler of the name."""
-    interval, _, chain = inputs.name.removeprefix("uniform").partition("_")
+    interval, _, chain = inputs.name.removeprefix(prefix).partition("_")
     sampler = inputs.sampler
     if chain:
         sampler = Sampler.from_name(chain, num_train_timesteps=sampler.num_train_timesteps)
-    return Uniform(int(interval), last=True), sampler
+    return int(interval), sampler
+
+
+def _recall(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    interval, sampler = _interval_and_sampler(inputs, "recall")
+    return Recall(interval), sampler
 
 
 def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -186,6 +173,7 @@ METHODS: dict[str, Method] = {
     "uniform<interval>[_<sampler>]": Method(
         _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"
     ),
+    "recall<interval>[_<sampler>]": Method(_recall, pattern=rf"recall[2-9]\d*(_{CHAIN_PATTERN})?"),
     "bac": Method(_bac, color="#0072B2"),
     "bac_blockwise": Method(_bac, color="#D55E00"),
     "bac_unified": Method(_bac, color="#CC79A7"),

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
+from torchrl_sparse.blocks.engine.recall import Memory
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.noise import sample_noise
@@ -19,17 +20,14 @@ from torchrl_sparse.networks.normalize import Normalizer
 __all__ = ["ActionDenoiser"]
 
 
-_WARM = [keys.START, keys.NUM_STEPS]
-
-
 class ActionDenoiser(TensorDictModuleBase):
     """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost.
 
     Attributes:
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
+        recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`; only
+            the reference engine does that.
     """
-
-    out_keys = [keys.CHUNK, keys.FLOPS]
 
     def __init__(
         self,
@@ -41,31 +39,55 @@ class ActionDenoiser(TensorDictModuleBase):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
-        self.warm = False
+        self.warm = self.recalls = False
         self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
         self.engine = EngineSlot(engine)
 
     @property
     def in_keys(self):
-        return [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE, *(_WARM if self.warm else ())]
+        own = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
+        warm, recalls = [keys.START, keys.NUM_STEPS], [keys.RECALL, keys.FEATURES]
+        return [*own, *(warm if self.warm else ()), *(recalls if self.recalls else ())]
+
+    @property
+    def out_keys(self):
+        return [keys.CHUNK, keys.FLOPS, *([keys.FEATURES] if self.recalls else ())]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
-        rows = batch.numel()
-        cond, mask, rules, *begin = (
-            keys.read(tensordict, key).reshape(rows, *tensordict.get(key).shape[len(batch) :])
-            for key in self.in_keys
-            if key != keys.SEED
-        )
+        wanted = [
+            keys.COND,
+            keys.PRUNE_MASK,
+            keys.REUSE,
+            *((keys.START, keys.NUM_STEPS) if self.warm else ()),
+        ]
+        cond, mask, rules, *begin = (_flat(keys.read(tensordict, key), batch) for key in wanted)
         shape = (self.network.horizon, self.network.input_dim)
         noise = sample_noise(tensordict.get(keys.SEED).reshape(-1), self.sampler.num_inference_steps, shape)
         dtype = self.network.pos_emb.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
-        actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), *begin)
+        if self.recalls:
+            actions, flops = self._recall(tensordict, noise, cond, mask, rules.reshape(-1))
+        else:
+            actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
+
+    def _recall(
+        self, tensordict: TensorDictBase, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what `_denoise` does, and keep what this query computed for those after it."""
+        network, batch = self.network, tensordict.batch_size
+        shape = (*mask.shape[1:], network.horizon, network.n_emb)
+        before = _flat(keys.recall(tensordict, keys.FEATURES, shape, 0.0, cond.dtype), batch)
+        memory = Memory(mask, _flat(keys.read(tensordict, keys.RECALL), batch), before)
+        (code,) = set(rules.tolist()) or {0}
+        options = {"reuse": REUSE_RULES[code], "replace": memory}
+        actions = denoise(network, self.sampler, noise, cond, mask, **options)
+        tensordict.set(keys.FEATURES, memory.outputs.reshape(*batch, *shape))
+        return actions, mask_flops(NetworkSizes.of(network), mask)
 
     def _denoise(
         self,
@@ -141,3 +163,8 @@ class ActionDenoiser(TensorDictModuleBase):
             self._tails = {key: tail for key, tail in self._tails.items() if key[:2] == made_for[:2]}
             self._tails[made_for] = self.sampler.last_steps(number), EngineSlot(self.engine.name)
         return self._tails[made_for]
+
+
+def _flat(tensor: Tensor, batch: torch.Size) -> Tensor:
+    """Return [rows, ...] of [*batch, ...]."""
+    return tensor.reshape(batch.numel(), *tensor.shape[len(batch) :])

@@ -61,7 +61,7 @@ class DiffusionPolicy(TensorDictSequential):
         plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
             which then reads as the `Dense` planner.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
-        start: what queries begin from: noise, or the last chunk after ``policy.start = WarmStart(1)``; None is noise.
+        start: what queries begin from: noise, or the last chunk after ``policy.start = WarmStart(1)``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
@@ -136,10 +136,12 @@ class DiffusionPolicy(TensorDictSequential):
     def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
+        if (recalls := keys.RECALL in plan.out_keys) and start.name:
+            raise ValueError(f"start: expected None with a planner that recalls, got {start.name}")
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
-        self.module["denoise"].warm = bool(start.out_keys)
+        self.module["denoise"].warm, self.module["denoise"].recalls = bool(start.out_keys), recalls
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
@@ -215,8 +217,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
-        slot = self.module["denoise"].engine
-        return engine_block_costs(slot.get(self.network, self.sampler))
+        return engine_block_costs(self.module["denoise"].engine.get(self.network, self.sampler))
 
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""

@@ -1,0 +1,34 @@
+"""How methods are written."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+__all__ = ["MethodName"]
+
+
+@dataclass(frozen=True)
+class MethodName:
+    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``.
+
+    Attributes:
+        name: see `torchrl_sparse.methods.diffusion`.
+        rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
+    """
+
+    name: str
+    rates: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, text: str) -> MethodName:
+        """Raise ValueError unless ``text`` is written as above.
+
+        >>> MethodName.parse("sag_rates@0.95-0.7")
+        MethodName(name='sag_rates', rates=(0.95, 0.7))
+        """
+        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        if match is None:
+            raise ValueError(f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, got {text!r}")
+        name, *rates = match.groups()
+        return cls(name, tuple(float(rate) for rate in rates if rate is not None))
