@@ -46,6 +46,8 @@ constant                          shape, dtype           meaning
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
+``CANDIDATES``                    f32 [*B, S, n, A]      chunks of a query that was asked S times, of which one is played
+``CHOSEN``                        i64 [*B, 1]            which of them
 ``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the query before, for policies that read it
 ``ELAPSED``                       i64 [*B, 1]            steps since that query; 0 at the beginning of an episode
 ``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait
@@ -102,6 +104,8 @@ FINE = ("control", "fine")
 CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
+CANDIDATES = ("control", "candidates")
+CHOSEN = ("control", "chosen")
 LAST_CHUNK = ("control", "last_chunk")
 ELAPSED = ("control", "elapsed")
 DELAY = ("control", "delay")
