@@ -34,7 +34,7 @@ def recalled_steps(query: Tensor, num_steps: int, interval: int) -> Tensor:
 class Recall(Planner):
     """Writes which steps a query recalls, see the module.
 
-    Reads ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for it; queries that come without it are
+    Reads ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for it; queries that come without it, or without the query before, are
     the first of their episode. Writes ``("diffusion", "recall")`` and ``("diffusion", "query")`` beside the mask.
 
     Args:
@@ -45,7 +45,8 @@ class Recall(Planner):
         >>> from torchrl_sparse.blocks.planner import PlanSpec
         >>> planner = Recall(2)
         >>> planner.bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="a policy"))
-        >>> td = planner(TensorDict({COND: torch.zeros(1, 2, 5), ELAPSED: torch.tensor([[8]])}, [1]))
+        >>> query = {COND: torch.zeros(1, 2, 5), ELAPSED: torch.tensor([[8]]), QUERY: torch.tensor([[0]])}
+        >>> td = planner(TensorDict(query, [1]))
         >>> td[RECALL][0, :, 0].int().tolist()
         [0, 0, 1, 0]
     """
@@ -66,7 +67,7 @@ class Recall(Planner):
 
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
         """Return the number of every query in its episode, and write it."""
-        number = recall(tensordict, QUERY, (1,), 0) + 1
+        number = recall(tensordict, QUERY, (1,), -1) + 1  # none was counted: there is nothing to recall
         number = number.masked_fill(recall(tensordict, ELAPSED, (1,), 0) == 0, 0)
         tensordict.set(QUERY, number)
         return {"query": number.reshape(rows, 1)}

@@ -60,12 +60,19 @@ def test_flops_are_of_what_is_computed(policy):
     query = {
         keys.HISTORY_STATE: torch.zeros(2, 2, 5),
         keys.ELAPSED: torch.tensor([[0], [3]]),
+        keys.QUERY: torch.tensor([[4], [0]]),
         keys.EPISODE_SEED: torch.zeros(2, 1).long(),
         keys.EPISODE_STEP: torch.zeros(2, 1).long(),
     }
     answered = policy(TensorDict(query, [2]))
     assert answered[keys.PRUNE_MASK].float().mean(dim=(1, 2)).tolist() == [0, 5 / 8]
     assert answered[keys.FLOPS][1] < answered[keys.FLOPS][0] / 2
+
+
+def test_without_a_memory_a_query_is_dense(policy):
+    query = {keys.HISTORY_STATE: torch.zeros(2, 2, 5), keys.ELAPSED: torch.tensor([[3], [8]])}
+    policy.plan = Recall(2)
+    assert not policy(TensorDict(query, [2]))[keys.PRUNE_MASK].any()
 
 
 def test_nothing_recalled_is_the_rule_alone(policy):
