@@ -34,8 +34,9 @@ def recalled_steps(query: Tensor, num_steps: int, interval: int) -> Tensor:
 class Recall(Planner):
     """Writes which steps a query recalls, see the module.
 
-    Reads ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for it; queries that come without it, or without the query before, are
-    the first of their episode. Writes ``("diffusion", "recall")`` and ``("diffusion", "query")`` beside the mask.
+    Reads ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for it; queries that come without it,
+    or without a query before them, are the first of their episode. Writes ``("diffusion", "recall")`` and
+    ``("diffusion", "query")`` beside the mask.
 
     Args:
         interval: of the steps that are computed, >= 2.
