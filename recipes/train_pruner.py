@@ -15,27 +15,24 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
-from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
-from torchrl_sparse.envs.seeds import CLOSED_LOOP_SEED, tuning_seeds
+from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
-from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner, exported
-from torchrl_sparse.training.pruner.fit import fit_to_masks
+from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
+from torchrl_sparse.training.pruner.rollouts import closed_loop_queries
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
 
@@ -44,9 +41,14 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads or torch.get_num_threads())
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     trainer = make_trainer(config)
-    if config.init and not (out / CHECKPOINT).exists():
-        fit_to_schedules(trainer, initial_schedules(config))
-    made = {"init": initial_schedules(config), "targets": settings["targets"], "rollouts": config.rollouts}
+    if not (out / CHECKPOINT).exists():
+        begin(trainer, config)
+    made = {
+        "init": initial_schedules(config),
+        "spread": config.spread,
+        "targets": settings["targets"],
+        "rollouts": config.rollouts,
+    }
     train(trainer, settings, export=partial(export_planner, trainer, out, made))
     if config.logger == "csv" and trainer.step >= config.log_every:
         plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
@@ -87,29 +89,26 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
-        queries = closed_loop_queries(policy, config)
+        if config.targets.source != "teacher":
+            raise ValueError(
+                f"targets.source: expected 'teacher' with rollouts, got {config.targets.source!r}"
+            )
+        queries = closed_loop_queries(policy, config.task, config.rollouts, *initial_schedules(config)[:1])
         with progress("targets", "query") as show:
             targets = add_queries(policy, targets, queries, seed=config.targets.seed, on_progress=show)
     save_targets(path, targets, made_for)
     return targets
 
 
-def closed_loop_queries(policy: DiffusionPolicy, config: DictConfig) -> TensorDictBase:
-    """Record the queries of episodes under the first of the schedules in ``init``, or under the dense policy."""
-    if config.targets.source != "teacher":
-        raise ValueError(
-            f"rollouts: their targets can only be the teacher's; expected targets.source=teacher, "
-            f"got {config.targets.source}"
-        )
-    schedules = initial_schedules(config)
-    planner = SchedulePlanner.from_pretrained(schedules[0]) if schedules else None
-    n_action_steps = executed_steps(config.task, policy.source)
-    actor = ChunkExecutor(policy.with_plan(planner), n_action_steps=n_action_steps)
-    seeds = tuning_seeds(CLOSED_LOOP_SEED, config.rollouts)
-    return record_queries(actor, diffusion_env(config.task, policy), seeds)
-
-
-def fit_to_schedules(trainer: PrunerTrainer, paths: list[str]) -> None:
+def begin(trainer: PrunerTrainer, config: DictConfig) -> None:
+    """Fit the gates to the schedules of ``init``, or spread their logits; else leave them as they are."""
+    paths = initial_schedules(config)
+    if config.spread:
+        if paths or config.method != "sag":
+            raise ValueError(f"spread: expected null with an init or without method=sag, got {config.spread}")
+        spread_logits(trainer.gates, trainer.train_set, config.spread)
+    if not paths:
+        return
     masks = [CacheSchedule.from_pretrained(path).mask() for path in paths]
     with progress("fit to schedules", "step") as show:
         fit_to_masks(trainer.gates, masks, trainer.train_set, seed=trainer.config.seed, on_progress=show)

@@ -1,6 +1,7 @@
 """Recipes as modules, to test their parts in this process, and as programs."""
 
 import importlib.util
+import multiprocessing
 import os
 import runpy
 import subprocess
@@ -44,6 +45,7 @@ def _play(recipe, options, printed):
     for descriptor, path in enumerate(printed, start=1):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), descriptor)
     os.environ.update(ENVIRONMENT)
+    multiprocessing.set_start_method(None, force=True)  # not that of the server
     torch.set_num_threads(1)
     path = str(RECIPES / f"{recipe}.py")
     sys.argv = [path, *options]

@@ -207,6 +207,18 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
     )
     assert iio.imread(work / "sag" / "curves.png").std() > 5
+    looked = run(
+        "looking",
+        f"policy={policy}",
+        f"pruner={work}/sag/pruner",
+        "episodes=2",
+        "samples=2",
+        f"out={work}/looking",
+    )
+    assert "own_minus_mean: " in looked
+    assert "reuse of own: cosine similarity" in looked
+    for name in ("looking_Lift.png", "reuse_sources_Lift.png"):
+        assert iio.imread(work / "looking" / name).std() > 5
     output = run(
         "train_pruner",
         "method=l2c",

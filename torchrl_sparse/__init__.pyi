@@ -6,6 +6,7 @@ from .blocks import (
     Dense as Dense,
     Planner as Planner,
     PlanSpec as PlanSpec,
+    Recall as Recall,
     SAGPruner as SAGPruner,
     SchedulePlanner as SchedulePlanner,
     StaticPlanner as StaticPlanner,
@@ -18,6 +19,7 @@ from .blocks import (
 from .control import (
     ActionAwareController as ActionAwareController,
     ChunkExecutor as ChunkExecutor,
+    CoherentChunk as CoherentChunk,
     HoldPose as HoldPose,
     RealtimeExecutor as RealtimeExecutor,
 )
@@ -45,6 +47,7 @@ from .networks.vla import VLAConfig as VLAConfig
 from .policies import (
     DiffusionPolicy as DiffusionPolicy,
     VLAPolicy as VLAPolicy,
+    WarmStart as WarmStart,
 )
 from .tokens import (
     EfficientVLAPruner as EfficientVLAPruner,

@@ -26,6 +26,11 @@ constant                          shape, dtype           meaning
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
 ``REUSE``                         i64 [*B, 1]            the rule by which pruned blocks reuse, an index of ``REUSE_RULES``
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
+``START``                         f32 [*B, H, A]         normalised actions that a query begins from, if not from noise
+``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
+``RECALL``                        bool [*B, K, 3L]       pruned cells that reuse what the query before returned there
+``QUERY``                         i64 [*B, 1]            queries of the episode before this one, for planners that count them
+``FEATURES``                      f32 [*B, K, 3L, H, d]  what each block last computed in each step since the episode began
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
 ``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
                                                          the decoder, L (all of them) was never pruned
@@ -41,6 +46,10 @@ constant                          shape, dtype           meaning
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
 ``QUERIED``                       bool [*B, 1]           this step called the policy
+``CANDIDATES``                    f32 [*B, S, n, A]      chunks of a query that was asked S times, of which one is played
+``CHOSEN``                        i64 [*B, 1]            which of them
+``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the query before, for policies that read it
+``ELAPSED``                       i64 [*B, 1]            steps since that query; 0 at the beginning of an episode
 ``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait
 ``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
 ``HOLD``                          f32 [*B, A]            the action that keeps the arm where it is
@@ -73,6 +82,11 @@ SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
 REUSE = ("diffusion", "reuse")
 PRUNE_RATE = ("diffusion", "prune_rate")
+START = ("diffusion", "start")
+NUM_STEPS = ("diffusion", "num_steps")
+RECALL = ("diffusion", "recall")
+QUERY = ("diffusion", "query")
+FEATURES = ("diffusion", "features")
 
 KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")
@@ -90,6 +104,10 @@ FINE = ("control", "fine")
 CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
 QUERIED = ("control", "queried")
+CANDIDATES = ("control", "candidates")
+CHOSEN = ("control", "chosen")
+LAST_CHUNK = ("control", "last_chunk")
+ELAPSED = ("control", "elapsed")
 DELAY = ("control", "delay")
 MEANWHILE = ("control", "meanwhile")
 HOLD = ("control", "hold")

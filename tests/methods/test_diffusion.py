@@ -73,6 +73,23 @@ def test_one_line_adds_a_method_from_outside(policy, make, tmp_path, monkeypatch
         check_method("even", tmp_path)
 
 
+def test_a_warm_start_is_written_behind_its_sampler(make):
+    warm = make("ddpm_82_41_14_warm2")
+    assert (warm.sampler.name, warm.start.name) == ("ddpm_82_41_14", "warm2")
+    assert method_identity("ddpm_82_41_14_warm2", warm)["start"] == "warm2"
+    assert warm.with_noise(1).start is warm.start
+    assert "start" not in method_identity("ddpm_82_41_14", make("ddpm_82_41_14"))
+    with pytest.raises(ValueError, match="num_steps: expected fewer than the sampler's 2, got 2"):
+        make("ddim2_warm2")
+
+
+def test_recalling_is_written_as_uniform_caching_is(make):
+    made = make("recall3_ddpm10")
+    assert (made.plan.interval, made.num_inference_steps) == (3, 10)
+    assert make("recall2").num_inference_steps == 20
+    assert keys.FEATURES in made.out_keys
+
+
 def test_a_method_may_bring_its_own_controller(monkeypatch):
     controller = ActionAwareController(coarse=1, fine=2)
     mine = Method(lambda inputs: (Odd(), inputs.sampler), controller=lambda rates: controller)

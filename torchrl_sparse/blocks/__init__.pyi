@@ -17,6 +17,7 @@ from .planner import (
     PlanSpec as PlanSpec,
     StaticPlanner as StaticPlanner,
 )
+from .recall import Recall as Recall
 from .sag import (
     PrunerInfo as PrunerInfo,
     PrunerNetwork as PrunerNetwork,

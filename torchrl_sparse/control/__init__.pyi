@@ -11,3 +11,4 @@ from .realtime_executor import (
     HoldPose as HoldPose,
     RealtimeExecutor as RealtimeExecutor,
 )
+from .selectors import CoherentChunk as CoherentChunk

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.plain import PlainLoop
+from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
+
+_HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED)  # to policies that read them; no environment writes them
 
 
 class ChunkExecutor(TensorDictModuleBase):
@@ -20,7 +23,8 @@ class ChunkExecutor(TensorDictModuleBase):
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
     when the controller asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to
     the policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are
-    zero on served steps.
+    zero on served steps. A policy that reads ``("control", "last_chunk")`` and ``("control", "elapsed")`` is handed the chunk
+    of the query before and the steps since, 0 where an episode begins.
 
     All state is in keys, so it follows the environment through any collector. Without TorchRL around it, `reset` and `act` are
     a robot's loop; the state of that one episode is kept here.
@@ -29,6 +33,10 @@ class ChunkExecutor(TensorDictModuleBase):
         policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
         n_action_steps: actions of a chunk that are executed before the next query (Ta).
         controller: a TensorDictModule that may write ``("control", "replan")``; run at every step.
+        num_samples: chunks S that a query samples as one batch, of which one is played; the first has the noise of a query that
+            samples one. Needs ``("episode", "seed")``. FLOPs are those of all.
+        selector: writes ``("control", "chosen")`` given ``("control", "candidates")``, see
+            :mod:`torchrl_sparse.control.selectors`; with ``num_samples`` above 1, and only then.
 
     Raises:
         ValueError: if a chunk is shorter than ``n_action_steps``.
@@ -48,13 +56,20 @@ class ChunkExecutor(TensorDictModuleBase):
         policy: TensorDictModuleBase,
         n_action_steps: int = 8,
         controller: TensorDictModuleBase | None = None,
+        *,
+        num_samples: int = 1,
+        selector: TensorDictModuleBase | None = None,
     ):
         super().__init__()
+        if num_samples < 1 or (num_samples > 1) != (selector is not None):
+            raise ValueError(
+                f"num_samples: expected 1, or more with a selector, got {num_samples} and selector {selector}"
+            )
         if n_action_steps < 1:
             raise ValueError(f"n_action_steps: expected at least 1, got {n_action_steps}")
         self.policy = policy
         self.n_action_steps = n_action_steps
-        self.controller = controller
+        self.controller, self.num_samples, self.selector = controller, num_samples, selector
         self._plain: PlainLoop | None = None
 
     @property
@@ -63,13 +78,13 @@ class ChunkExecutor(TensorDictModuleBase):
             [
                 keys.IS_INIT,
                 *(self.controller.in_keys if self.controller is not None else ()),
-                *self.policy.in_keys,
+                *(key for key in self.policy.in_keys if key not in _HANDED_OVER),
             ]
         )
 
     @property
     def out_keys(self):
-        own = [keys.ACTION, keys.AGE, keys.QUERIED]
+        own = [keys.ACTION, keys.AGE, keys.QUERIED, *([keys.CHOSEN] if self.selector is not None else ())]
         return _unique(
             [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
         )
@@ -136,18 +151,44 @@ class ChunkExecutor(TensorDictModuleBase):
         """Run the policy on the due samples alone and write what it returns into their rows."""
         batch = tensordict.batch_size
         index = due.reshape(-1).nonzero().squeeze(-1)
-        request = tensordict.select(*self.policy.in_keys, strict=False).reshape(-1)[index]
-        answer = self.policy(request)
+        answer = self._ask(self._request(tensordict).reshape(-1)[index])
         length = answer.get(keys.CHUNK).shape[-2]
         if length < self.n_action_steps:
             raise ValueError(
                 f"{keys.CHUNK}: expected at least n_action_steps={self.n_action_steps} actions, got {length}"
             )
-        for key in self.policy.out_keys:
+        for key in (*self.policy.out_keys, *([keys.CHOSEN] if self.selector is not None else ())):
             value = answer.get(key)
             shape = value.shape[1:]
             whole = keys.recall(tensordict, key, shape, 0, value.dtype).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
+
+    def _request(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return all that the policy reads, with the last chunk if it asks for that."""
+        wanted = [*self.policy.in_keys, *(self.selector.in_keys if self.selector is not None else ())]
+        request = tensordict.select(*wanted, strict=False)
+        if keys.ELAPSED in wanted:
+            elapsed = keys.recall(tensordict, keys.AGE, (1,), -1) + 1
+            request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
+        if keys.LAST_CHUNK in wanted:
+            request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
+        return request
+
+    def _ask(self, request: TensorDictBase) -> TensorDictBase:
+        """Return the policy's answers to queries [n], each the chosen one of its samples."""
+        if self.selector is None:
+            return self.policy(request)
+        rows, samples = len(request), self.num_samples
+        asked = request.repeat_interleave(samples, dim=0)
+        stream = torch.arange(samples, device=asked.device).repeat(rows)[:, None]
+        asked.set(keys.EPISODE_SEED, keys.read(asked, keys.EPISODE_SEED).long() + stream * NOISE_STREAM)
+        answers = self.policy(asked).reshape(rows, samples)
+        request.set(keys.CANDIDATES, answers.get(keys.CHUNK))
+        chosen = self.selector(request).get(keys.CHOSEN)
+        answer = answers[torch.arange(rows), chosen.squeeze(-1)]
+        if keys.FLOPS in self.policy.out_keys:
+            answer.set(keys.FLOPS, answers.get(keys.FLOPS).sum(dim=1))
+        return answer.set(keys.CHOSEN, chosen)
 
     def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
         """Return the action [*B, A] of this step."""

@@ -20,6 +20,9 @@ def record_queries(
 ) -> TensorDictBase:
     """Record every query of one episode per seed: [number of queries], with what the policy read and what it answered.
 
+    The chunk of the query before and the steps since, 0 in the first, are there whether the policy reads them or not, so that
+    another can be asked that does.
+
     Args:
         actor: whose policy is asked.
         make_env: called as ``make_env(seeds=[...])``.
@@ -28,8 +31,16 @@ def record_queries(
     env = make_env(seeds=list(seeds))
     episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
     env.close()
-    wanted = [*actor.policy.in_keys, *actor.policy.out_keys]
-    return torch.cat([steps[steps[keys.QUERIED].squeeze(-1)].select(*wanted) for steps in episodes])
+    wanted = [*actor.policy.in_keys, *actor.policy.out_keys, keys.LAST_CHUNK, keys.ELAPSED]
+    return torch.cat([_queries(steps).select(*wanted, strict=False) for steps in episodes])
+
+
+def _queries(steps: TensorDictBase) -> TensorDictBase:
+    """Return the queries among the steps of an episode, [T], each with the last chunk before it."""
+    asked = steps[keys.QUERIED].squeeze(-1).nonzero().squeeze(-1)
+    queries, before = steps[asked], steps[asked - 1]  # the first one's, the last step of all, does not count
+    queries.set(keys.LAST_CHUNK, before[keys.CHUNK])
+    return queries.set(keys.ELAPSED, (before[keys.AGE] + 1) * (asked > 0)[:, None])
 
 
 @torch.no_grad()

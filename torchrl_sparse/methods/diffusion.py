@@ -11,6 +11,8 @@ any of them (``sag:int8@0.9``), run it in the native engine with rounded weights
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
+``recall2``          every second step of the queries after an episode's first, the other steps as in the query before
+``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ==================== ===========================================================================================
 
 A method of one's own is one line, executed before its name is used::
@@ -31,14 +33,17 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
+from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.keys import PRUNE_RATE
+from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart
 
 __all__ = [
     "METHODS",
@@ -49,38 +54,6 @@ __all__ = [
     "make_controller",
     "make_method",
 ]
-
-
-@dataclass(frozen=True)
-class MethodName:
-    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``, NAME also as ``NAME:WEIGHTS``.
-
-    Attributes:
-        name: see the module.
-        rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
-        weights: ``"bf16"``, ``"int8"``, or None, which rounds nothing.
-    """
-
-    name: str
-    rates: tuple[float, ...] = ()
-    weights: str | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> MethodName:
-        """Raise ValueError unless ``text`` is written as above.
-
-        >>> MethodName.parse("sag_rates@0.95-0.7")
-        MethodName(name='sag_rates', rates=(0.95, 0.7), weights=None)
-        >>> MethodName.parse("dense:int8").weights
-        'int8'
-        """
-        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?::(bf16|int8))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
-        if match is None:
-            raise ValueError(
-                f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME:bf16 or NAME:int8, got {text!r}"
-            )
-        name, weights, *rates = match.groups()
-        return cls(name, tuple(float(rate) for rate in rates if rate is not None), weights)
 
 
 @dataclass(frozen=True)
@@ -123,6 +96,7 @@ class Method:
             written, or None.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
         noise: stream of the noise that it draws; 0 is what all methods share, so that they can be paired.
+        start: returns what queries begin from; None is noise.
     """
 
     make: Callable[[MethodInputs], tuple[Planner, Sampler]]
@@ -130,6 +104,7 @@ class Method:
     controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
     color: str | None = None
     noise: int = 0
+    start: Callable[[MethodInputs], ColdStart | None] = lambda inputs: None
 
 
 def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -138,7 +113,13 @@ def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 def _sampler(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Take the sampler of the name."""
-    return Dense(), Sampler.from_name(inputs.name, num_train_timesteps=inputs.sampler.num_train_timesteps)
+    chain = inputs.name.partition("_warm")[0]
+    return Dense(), Sampler.from_name(chain, num_train_timesteps=inputs.sampler.num_train_timesteps)
+
+
+def _warm(inputs: MethodInputs) -> WarmStart:
+    """Take the steps of the name."""
+    return WarmStart(int(inputs.name.rpartition("_warm")[2]))
 
 
 def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -146,12 +127,22 @@ def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _uniform_and_last(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    interval, sampler = _interval_and_sampler(inputs, "uniform")
+    return Uniform(interval, last=True), sampler
+
+
+def _interval_and_sampler(inputs: MethodInputs, prefix: str) -> tuple[int, Sampler]:
     """Take interval and, where it is written, sampler of the name."""
-    interval, _, chain = inputs.name.removeprefix("uniform").partition("_")
+    interval, _, chain = inputs.name.removeprefix(prefix).partition("_")
     sampler = inputs.sampler
     if chain:
         sampler = Sampler.from_name(chain, num_train_timesteps=sampler.num_train_timesteps)
-    return Uniform(int(interval), last=True), sampler
+    return int(interval), sampler
+
+
+def _recall(inputs: MethodInputs) -> tuple[Planner, Sampler]:
+    interval, sampler = _interval_and_sampler(inputs, "recall")
+    return Recall(interval), sampler
 
 
 def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -178,10 +169,12 @@ METHODS: dict[str, Method] = {
     "dense_noise": Method(_dense, color="#9A9AA0", noise=1),
     "ddim10": Method(_sampler, color="#E69F00"),
     "<sampler><steps>, <sampler>_<t>_<t>...": Method(_sampler, pattern=CHAIN_PATTERN),
+    "<sampler>..._warm<steps>": Method(_sampler, pattern=rf"{CHAIN_PATTERN}_warm[1-9]\d*", start=_warm),
     "uniform": Method(_uniform, color="#56B4E9"),
     "uniform<interval>[_<sampler>]": Method(
         _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"
     ),
+    "recall<interval>[_<sampler>]": Method(_recall, pattern=rf"recall[2-9]\d*(_{CHAIN_PATTERN})?"),
     "bac": Method(_bac, color="#0072B2"),
     "bac_blockwise": Method(_bac, color="#D55E00"),
     "bac_unified": Method(_bac, color="#CC79A7"),
@@ -230,7 +223,7 @@ def make_method(
     planner, sampler = method.make(inputs)
     if written.rates:
         _ask_for(planner, written)
-    made = policy.with_plan(planner, sampler)
+    made = policy.with_plan(planner, sampler, method.start(inputs))
     if method.noise:
         made = made.with_noise(method.noise)
     if written.weights:
@@ -252,6 +245,7 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         policy: as :func:`make_method` returned it.
     """
     other_noise = {"noise": policy.noise_stream} if policy.noise_stream else {}
+    start = {"start": policy.start.name} if policy.start.name else {}
     return {
         "method": text,
         "policy": policy.fingerprint,
@@ -259,6 +253,7 @@ def method_identity(text: str, policy: DiffusionPolicy) -> dict[str, Any]:
         "sampler": policy.sampler.config,
         "planner": policy.plan.fingerprint,
         **other_noise,
+        **start,
     }
 
 

@@ -1,2 +1,5 @@
-from .diffusion import DiffusionPolicy as DiffusionPolicy
+from .diffusion import (
+    DiffusionPolicy as DiffusionPolicy,
+    WarmStart as WarmStart,
+)
 from .vla import VLAPolicy as VLAPolicy

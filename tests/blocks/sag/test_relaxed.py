@@ -54,7 +54,33 @@ def test_the_gradient_is_that_of_the_mixture(network, sampler, double_query, reu
         assert gate.grad[cell].item() == pytest.approx(slope, rel=1e-4, abs=1e-6)
 
 
-def mixed_chain(network, sampler, noise, cond, gate, reuse):
+@pytest.mark.parametrize("reuse", ["block", "type"])
+def test_a_detached_gate_learns_from_its_own_place_alone(network, sampler, double_query, reuse):
+    """Against finite differences of a chain in which what is kept for reuse stays as it was."""
+    noise, cond = double_query
+    mask = random_mask(5, rate=0.6)
+    gate = gate_of(mask)
+    options = {"reuse": reuse, "detached": True}
+    actions = denoise_relaxed(network, sampler, noise, cond, gate, **options)
+    assert torch.equal(actions, denoise_relaxed(network, sampler, noise, cond, gate, reuse=reuse))
+    actions.square().sum().backward()
+    kept = []
+    mixed_chain(network, sampler, noise, cond, mask.double(), reuse, kept)
+    step = 1e-6
+    for cell in [(0, 1, 0), (1, 3, 2), (2, 5, 4), (3, 9, 5), (4, 2, 1)]:
+        values = []
+        for sign in (1, -1):
+            moved = mask.double()
+            moved[cell] += sign * step
+            values.append(
+                mixed_chain(network, sampler, noise, cond, moved, reuse, kept=list(kept), replay=True)
+            )
+        slope = ((values[0].square().sum() - values[1].square().sum()) / (2 * step)).item()
+        assert gate.grad[cell].item() == pytest.approx(slope, rel=1e-4, abs=1e-6)
+
+
+def mixed_chain(network, sampler, noise, cond, gate, reuse, kept=None, replay=False):
+    """`kept` takes what each block keeps for reuse, or gives it, with `replay`."""
     slots = {"block": NUM_BLOCKS, "type": 3}[reuse]
     latest, sample, cleans = [None] * slots, noise[:, 0], ()
     for k, timestep in enumerate(sampler.timesteps.tolist()):
@@ -62,8 +88,11 @@ def mixed_chain(network, sampler, noise, cond, gate, reuse):
         for block in range(NUM_BLOCKS):
             fresh, slot = network.block(block, x, memory), block % slots
             pruned = gate[:, k, block, None, None]
-            latest[slot] = fresh if k == 0 else pruned * latest[slot] + (1 - pruned) * fresh
-            x = x + latest[slot]
+            output = fresh if k == 0 else pruned * latest[slot] + (1 - pruned) * fresh
+            x = x + output
+            if kept is not None and not replay:
+                kept.append(output)
+            latest[slot] = kept.pop(0) if replay else output
         noise_k = noise[:, k + 1] if k + 1 < NUM_STEPS else None
         eps, before = network.head_out(x), sample
         sample = sampler.step(eps, k, before, noise_k, cleans)

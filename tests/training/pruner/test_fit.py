@@ -8,7 +8,7 @@ from tests.training.pruner.conftest import NUM_BLOCKS, sag_gates
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.sag.planner import rate_threshold
-from torchrl_sparse.training.pruner.fit import fit_to_masks
+from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 
 
 @pytest.mark.parametrize("rate_input", [False, True])
@@ -43,3 +43,19 @@ def test_gates_are_fitted_to_a_mask_for_each_of_several_rates(policy, targets):
         fit_to_masks(sag_gates(policy), masks, targets)
     with pytest.raises(ValueError, match="masks: expected at least one, got 0"):
         fit_to_masks(gates, [], targets)
+
+
+@pytest.mark.parametrize("rate_input", [False, True])
+def test_gates_begin_with_masks_that_differ_between_observations(policy, targets, rate_input):
+    gates = sag_gates(policy, rate_input=rate_input)
+    targets[keys.COND][..., 0] = 3.0  # what is constant tells nothing
+    targets[keys.COND][..., 1:] *= 1e-2  # as states are that one number scales
+    spread_logits(gates, targets, 0.8)
+    rate = torch.full((len(targets), 1), 0.5) if rate_input else None
+    logits = gates.prune_logits(targets[keys.COND], rate)[:, 1:]
+    assert logits.std(dim=0).mean().item() == pytest.approx(0.8, rel=0.05)
+    assert logits.mean().item() == pytest.approx(0, abs=1e-3)
+    masks = logits > 0
+    assert 0.3 < masks.float().mean() < 0.7
+    changing = masks.float().mean(dim=0)
+    assert ((changing > 0.1) & (changing < 0.9)).float().mean() > 0.5

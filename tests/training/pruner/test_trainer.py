@@ -11,11 +11,11 @@ from tests.training.pruner.conftest import NUM_BLOCKS, sag_gates
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates, noise_errors
 from torchrl_sparse.training.pruner.config import PrunerConfig
-from torchrl_sparse.training.pruner.fit import fit_to_masks
-from torchrl_sparse.training.pruner.loss import sparsity_loss
+from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
+from torchrl_sparse.training.pruner.loss import mutual_information, sparsity_loss
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
-SMALL = PrunerConfig(rate=0.6, batch_size=4, lr=1e-2, max_updates=6, checkpointed=False)
+SMALL = PrunerConfig(reuse="type", rate=0.6, batch_size=4, lr=1e-2, max_updates=6, checkpointed=False)
 
 
 def trainer_of(policy, targets, gates=None, **changes):
@@ -34,6 +34,27 @@ def test_sparsity_counts_blocks_or_what_they_cost():
     assert sparsity_loss(gate, rate, weight).item() == pytest.approx((0.6 - 0.25 + 0.25) / 2)
     by_block = sparsity_loss(gate, rate, weight, per_block=True)
     assert by_block.item() == pytest.approx((0.25 + 0.25 + 0.5 + 3 * 0.25) / 6)
+
+
+def test_information_is_what_masks_tell_of_their_observations():
+    alike = torch.tensor([[5.0, -5.0, 0.0]]).expand(4, 2, 3)
+    assert mutual_information(alike).item() == pytest.approx(0, abs=1e-6)
+    opposed = torch.full((4, 2, 3), 50.0)
+    opposed[:2] = -50.0
+    assert mutual_information(opposed).item() == pytest.approx(1, abs=1e-3)
+    logits = opposed.clone().requires_grad_()
+    mutual_information(logits).backward()
+    assert logits.grad.isfinite().all()
+
+
+def test_a_reward_for_variety_makes_masks_follow_the_observation(policy, targets):
+    information = []
+    for variety in (0.0, 1.0):
+        gates = sag_gates(policy)
+        spread_logits(gates, targets, 0.5)
+        trainer = trainer_of(policy, targets, gates, variety=variety, max_updates=25, epochs=100, lr=1e-3)
+        information.append([trainer.train_step()["information"] for _ in range(trainer.total)][-1])
+    assert information[1] > 1.2 * information[0] > 0
 
 
 def begun_from_a_mask(policy, targets):
@@ -110,6 +131,7 @@ def test_the_objective_of_learning_to_cache_learns_where_a_step_after_a_dense_on
         {"cost": "flops"},
         {"rate_range": (0.5, 0.7)},
         {"cost": "seconds"},
+        {"estimator": "gumbel", "final_temperature": 0.2, "variety": 0.1, "detached": True},
     ],
 )
 def test_a_resumed_training_is_equal_to_the_last_bit(policy, targets, tmp_path, options):
@@ -169,6 +191,8 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
         ({"cost": "joules"}, "cost: expected one of .*got 'joules'"),
         ({"reuse": "layer"}, "reuse: expected one of .*got 'layer'"),
         ({"lr": 0.0}, "lr: expected a positive number, got 0.0"),
+        ({"final_temperature": 0.0}, "final_temperature: expected a positive number, got 0.0"),
+        ({"variety": -1.0}, "variety: expected a weight >= 0, got -1.0"),
     ],
 )
 def test_a_wrong_configuration_is_refused(options, message):

@@ -55,6 +55,7 @@ def denoise(
     *,
     reuse: Reuse = "block",
     record: Callable[[int, int, Tensor], None] | None = None,
+    replace: Callable[[int, int, Tensor], Tensor] | None = None,
 ) -> Tensor:
     """Denoise a batch of action chunks, skipping what ``mask`` prunes.
 
@@ -74,6 +75,7 @@ def denoise(
             arXiv:2506.13456), ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
             last-writer-wins) or ``"single"``.
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
+        replace: called likewise before that; returns what is added instead, and buffers keep what was there.
 
     Returns:
         normalised actions [B, H, A].
@@ -104,6 +106,8 @@ def denoise(
             slot = block % len(latest)
             output = _block_output(network, block, x, memory, computed.at(step, block), latest[slot])
             latest[slot] = output
+            if replace is not None:
+                output = replace(step, block, output)
             x = x + output
             if record is not None:
                 record(step, block, output)

@@ -113,7 +113,7 @@ class PrunerNetwork(nn.Module):
         In evaluation mode and without gradients, compiled code computes it for float32 on the CPU.
         """
         if (native := self._compiled(cond)) is not None:
-            return native.logits(self._features(cond, rate))
+            return native.logits(self.features(cond, rate))
         _, middle, _, last = self.mlp
         hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
         logits = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
@@ -148,12 +148,13 @@ class PrunerNetwork(nn.Module):
         small = self.fuse_obs.out_features <= MAX_HIDDEN
         return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
 
-    def _features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+    def features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
+        """Return what the first layer reads, f32 [B, n]."""
         return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
         """Return the first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
-        obs = self.fuse_obs(self.obs(self._features(cond, rate)))
+        obs = self.fuse_obs(self.obs(self.features(cond, rate)))
         return (obs[:, None] + self.cells()).flatten(0, 1)
 
     def cells(self) -> Tensor:

@@ -6,7 +6,9 @@ gradients are those of the mixture of SAG (arXiv:2601.12894), with the gate ``M`
     out_b = (1 - M) d_b + M tau      tau <- out_b      x <- x + out_b
 
 so that the gradient of a gate says how the final actions would change if its block were computed or reused, also
-through what later blocks then reuse. SAG and Learning-to-Cache are trained with it.
+through what later blocks then reuse. SAG and Learning-to-Cache are trained with it. The release of SAG's successor
+(TTS, arXiv:2605.13316) keeps what it reuses without its gradient, ``tau <- detach(out_b)``: a gate then learns from what
+reusing does at its own place alone, not from what computing it would do for the blocks that reuse it (``detached``).
 """
 
 from __future__ import annotations
@@ -69,6 +71,7 @@ def denoise_relaxed(
     reuse: Reuse = "type",
     explore: float = 1.0,
     checkpointed: bool = False,
+    detached: bool = False,
 ) -> Tensor:
     """Return normalised actions [B, H, A], differentiable with respect to the gates.
 
@@ -80,11 +83,12 @@ def denoise_relaxed(
             of those that are drawn is divided by it, so that its expectation stays that of evaluating all.
         checkpointed: recompute each denoising step in the backward pass instead of keeping its activations:
             the memory of one step instead of K, for about a third more time.
+        detached: keep outputs for reuse without their gradient, see the module.
 
     Raises:
         ValueError: as ``denoise`` does.
     """
-    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
+    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed, "detached": detached}
     *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, **options)
     return actions
 
@@ -99,6 +103,7 @@ def step_errors(
     reuse: Reuse = "type",
     explore: float = 1.0,
     checkpointed: bool = False,
+    detached: bool = False,
 ) -> Tensor:
     """Return the error of each denoising step alone, with gradients cut between the steps.
 
@@ -110,7 +115,7 @@ def step_errors(
     Returns:
         f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
     """
-    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed}
+    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed, "detached": detached}
     chain = _chain(network, sampler, noise, cond, gate, **options, cut=True)
     errors = []
     for k, (before, cleans, after) in enumerate(chain):
@@ -133,6 +138,7 @@ def _chain(
     reuse: Reuse,
     explore: float,
     checkpointed: bool,
+    detached: bool,
     cut: bool = False,
 ) -> Iterator[tuple[Tensor, tuple[Tensor, ...], Tensor]]:
     """Yield the sample before each denoising step, the clean predictions that the step reads, and the sample after it."""
@@ -149,7 +155,7 @@ def _chain(
         if cut:
             sample = sample.detach()
             cleans, buffers = (tuple(tensor.detach() for tensor in kept) for kept in (cleans, buffers))
-        run = _Step(network, sampler, k, cond, _transition_noise(noise, k), computed, slots)
+        run = _Step(network, sampler, k, cond, _transition_noise(noise, k), computed, slots, detached)
         arguments = (sample, gate[:, k], cleans, buffers)
         after, new_cleans, buffers = (
             checkpoint(run, *arguments, use_reentrant=False) if checkpointed else run(*arguments)
@@ -170,10 +176,11 @@ class _Step:
         noise: Tensor | None,
         computed: ComputedRows,
         slots: int,
+        detached: bool,
     ) -> None:
         self._network, self._sampler, self._k = network, sampler, k
         self._cond, self._noise = cond, noise
-        self._computed, self._slots = computed, slots
+        self._computed, self._slots, self._detached = computed, slots, detached
 
     def __call__(
         self, sample: Tensor, gate: Tensor, cleans: tuple[Tensor, ...], buffers: tuple[Tensor, ...]
@@ -184,7 +191,8 @@ class _Step:
         x = network.embed(sample)
         for block in range(network.num_blocks):
             slot = block % self._slots
-            latest[slot] = output = self._output(block, x, memory, gate[:, block, None, None], latest[slot])
+            output = self._output(block, x, memory, gate[:, block, None, None], latest[slot])
+            latest[slot] = output.detach() if self._detached else output
             x = x + output
         eps = network.head_out(x)
         after = self._sampler.step(eps, self._k, sample, self._noise, cleans)

@@ -60,6 +60,7 @@ def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> 
 def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
     device = next(policy.network.parameters()).device
     encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
+    encoded = policy.module["start"](encoded)
     start = synchronised_clock(device)
     planned = policy.module["plan"](encoded)
     seconds = synchronised_clock(device) - start

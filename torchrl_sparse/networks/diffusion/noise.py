@@ -7,6 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+NOISE_STREAM = 2**32
+"""Between the seeds of two noises that an episode could have had; no seed of an episode is as large."""
+
 _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 

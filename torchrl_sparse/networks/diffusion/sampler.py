@@ -163,6 +163,20 @@ class Sampler:
         options = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
+    def last_steps(self, number: int) -> Sampler:
+        """Return the sampler of the last steps alone, 1 to K; each has the coefficients that it has here.
+
+        Those of solvers that remember earlier steps begin anew: their first step is of first order.
+
+        >>> Sampler("ddpm", timesteps=[82, 41, 14]).last_steps(2).name
+        'ddpm_41_14'
+        """
+        check_size("number", number, self.num_inference_steps)
+        if number == self.num_inference_steps:
+            return self
+        timesteps = self.timesteps[-number:].tolist()
+        return Sampler(self.kind, None, self.num_train_timesteps, timesteps=timesteps, eta=self.eta)
+
     @property
     def name(self) -> str:
         """Its name without the number of steps: ``"ddpm"``, ``"ddpm_logsnr"``, ``"ddim_90_50_10"``."""

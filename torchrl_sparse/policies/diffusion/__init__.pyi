@@ -1,1 +1,2 @@
 from .policy import DiffusionPolicy as DiffusionPolicy
+from .warm_start import WarmStart as WarmStart

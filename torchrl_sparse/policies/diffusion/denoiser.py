@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
+from torchrl_sparse.blocks.engine.recall import Memory
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.noise import sample_noise
@@ -32,10 +33,13 @@ def check_noise(name: str) -> str:
 
 
 class ActionDenoiser(TensorDictModuleBase):
-    """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost."""
+    """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost.
 
-    in_keys = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
-    out_keys = [keys.CHUNK, keys.FLOPS]
+    Attributes:
+        warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
+        recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`; only
+            the reference engine does that.
+    """
 
     def __init__(
         self,
@@ -47,28 +51,95 @@ class ActionDenoiser(TensorDictModuleBase):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
+        self.warm = self.recalls = False
+        self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
         self.engine = EngineSlot(engine)
         self.noise = "torch"
 
+    @property
+    def in_keys(self):
+        own = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
+        warm, recalls = [keys.START, keys.NUM_STEPS], [keys.RECALL, keys.FEATURES]
+        return [*own, *(warm if self.warm else ()), *(recalls if self.recalls else ())]
+
+    @property
+    def out_keys(self):
+        return [keys.CHUNK, keys.FLOPS, *([keys.FEATURES] if self.recalls else ())]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
-        rows = batch.numel()
-        cond, mask = (
-            value.reshape(rows, *value.shape[len(batch) :])
-            for value in (tensordict.get(keys.COND), keys.read(tensordict, keys.PRUNE_MASK))
-        )
+        wanted = [
+            keys.COND,
+            keys.PRUNE_MASK,
+            keys.REUSE,
+            *((keys.START, keys.NUM_STEPS) if self.warm else ()),
+        ]
+        cond, mask, rules, *begin = (_flat(keys.read(tensordict, key), batch) for key in wanted)
         shape = (self.network.horizon, self.network.input_dim)
         seed = tensordict.get(keys.SEED).reshape(-1)
         noise = NOISES[self.noise](seed, self.sampler.num_inference_steps, shape)
         dtype = self.network.pos_emb.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
-        actions = self._follow_rules(noise, cond, mask, keys.read(tensordict, keys.REUSE).reshape(-1))
+        if self.recalls:
+            actions, flops = self._recall(tensordict, noise, cond, mask, rules.reshape(-1))
+        else:
+            actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
-        return tensordict.set(keys.FLOPS, mask_flops(NetworkSizes.of(self.network), mask).reshape(*batch, 1))
+        return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
 
-    def _follow_rules(self, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor) -> Tensor:
+    def _recall(
+        self, tensordict: TensorDictBase, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what `_denoise` does, and keep what this query computed for those after it."""
+        network, batch = self.network, tensordict.batch_size
+        shape = (*mask.shape[1:], network.horizon, network.n_emb)
+        before = _flat(keys.recall(tensordict, keys.FEATURES, shape, 0.0, cond.dtype), batch)
+        memory = Memory(mask, _flat(keys.read(tensordict, keys.RECALL), batch), before)
+        (code,) = set(rules.tolist()) or {0}
+        options = {"reuse": REUSE_RULES[code], "replace": memory}
+        actions = denoise(network, self.sampler, noise, cond, mask, **options)
+        tensordict.set(keys.FEATURES, memory.outputs.reshape(*batch, *shape))
+        return actions, mask_flops(NetworkSizes.of(network), mask)
+
+    def _denoise(
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor,
+        rules: Tensor,
+        start: Tensor | None = None,
+        num_steps: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return normalised actions [B, H, A] and FLOPs [B] of queries, each with as many steps as it takes."""
+        whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
+        numbers = [whole] if num_steps is None else sorted(set(num_steps.flatten().tolist()))
+        if numbers in ([], [whole]):
+            return self._follow_rules(noise, cond, mask, rules), mask_flops(sizes, mask)
+        if not 1 <= numbers[0] <= numbers[-1] <= whole:
+            raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
+        actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
+        for number in numbers:
+            rows = num_steps.flatten() == number
+            part = self._last_steps(number, noise[rows], mask[rows], start[rows].to(noise))
+            actions[rows] = self._follow_rules(part[0], cond[rows], part[1], rules[rows], number)
+            flops[rows] = mask_flops(sizes, part[1]).to(flops)
+        return actions, flops
+
+    def _last_steps(self, number: int, noise: Tensor, mask: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+        """Return noise and mask of the last steps, from a guess noised to the first of them, which has nothing to reuse."""
+        if number == self.sampler.num_inference_steps:
+            return noise, mask
+        noise, mask = noise[:, :number].clone(), mask[:, -number:].clone()
+        timestep = self.sampler.timesteps[-number].expand(len(noise)).to(noise.device)
+        noise[:, 0] = self.sampler.add_noise(start, noise[:, 0], timestep)
+        mask[:, 0] = False
+        return noise, mask
+
+    def _follow_rules(
+        self, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor, number: int | None = None
+    ) -> Tensor:
         """Denoise normalised actions, each row under the reuse rule of its own."""
         codes = sorted(set(rules.tolist()))
         if codes and not 0 <= codes[0] <= codes[-1] < len(REUSE_RULES):
@@ -76,15 +147,38 @@ class ActionDenoiser(TensorDictModuleBase):
                 f"{keys.REUSE}: expected an index of {list(REUSE_RULES)} for each row, got {codes}"
             )
         if len(codes) == 1:
-            return self.run(noise, cond, mask, REUSE_RULES[codes[0]])
+            return self.run(noise, cond, mask, REUSE_RULES[codes[0]], number)
         actions = torch.empty_like(noise[:, 0])
         for code in codes:
             rows = rules == code
-            actions[rows] = self.run(noise[rows], cond[rows], mask[rows], REUSE_RULES[code])
+            actions[rows] = self.run(noise[rows], cond[rows], mask[rows], REUSE_RULES[code], number)
         return actions
 
-    def run(self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse) -> Tensor:
-        """Denoise normalised actions [B, H, A], all that the network predicts."""
+    def run(
+        self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse, number: int | None = None
+    ) -> Tensor:
+        """Denoise normalised actions [B, H, A], all that the network predicts, in all steps or the last ``number``."""
+        sampler, slot = self.sampler, self.engine
+        if number not in (None, sampler.num_inference_steps):
+            sampler, slot = self._tail(number)
         if self.network.training or cond.requires_grad:
-            return denoise(self.network, self.sampler, noise, cond, mask, reuse=reuse)
-        return self.engine.get(self.network, self.sampler).denoise(noise, cond, mask, reuse)
+            return denoise(self.network, sampler, noise, cond, mask, reuse=reuse)
+        return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse)
+
+    def refresh(self) -> None:
+        """Read all weights anew in the next query."""
+        self.engine.refresh()
+        self._tails.clear()
+
+    def _tail(self, number: int) -> tuple[Sampler, EngineSlot]:
+        """Return the sampler of the last steps, and the engine that runs it."""
+        made_for = self.sampler, self.engine, number
+        if made_for not in self._tails:
+            self._tails = {key: tail for key, tail in self._tails.items() if key[:2] == made_for[:2]}
+            self._tails[made_for] = self.sampler.last_steps(number), EngineSlot(self.engine.name)
+        return self._tails[made_for]
+
+
+def _flat(tensor: Tensor, batch: torch.Size) -> Tensor:
+    """Return [rows, ...] of [*batch, ...]."""
+    return tensor.reshape(batch.numel(), *tensor.shape[len(batch) :])

@@ -22,6 +22,7 @@ from torchrl_sparse.blocks.sag.planner import SAGPruner
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 
 __all__ = ["export_policy"]
 
@@ -29,6 +30,7 @@ __all__ = ["export_policy"]
 def export_policy(
     path: Path,
     encode: ObservationEncoder,
+    start: ColdStart,
     plan: Planner,
     denoise: ActionDenoiser,
     *,
@@ -39,13 +41,13 @@ def export_policy(
 
     Args:
         path: of the file, e.g. ``"lift.tsp"``.
-        encode, plan, denoise: the stages.
+        encode, start, plan, denoise: the stages.
         weights: see `torchrl_sparse.blocks.engine.NativeEngine`.
         facts: about the policy, for the file's description.
 
     Raises:
-        ValueError: naming what cannot be exported: cameras, a network that the native engine does not run, or a planner of
-            one's own that looks at the observation.
+        ValueError: naming what cannot be exported: cameras, a warm start, a network that the native engine does not run, or a
+            planner of one's own that looks at the observation.
 
     Examples:
         >>> import tempfile
@@ -57,6 +59,8 @@ def export_policy(
     network, normalizer, sampler = denoise.network, denoise.normalizer, denoise.sampler
     if (vision := encode.condition.vision) is not None:
         raise ValueError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
+    if start.name:
+        raise ValueError(f"start: expected queries that begin from noise, got {start.name}")
     supported, reason = native_supports(network)
     if not supported:
         raise ValueError(f"export: {reason}")

@@ -24,13 +24,14 @@ from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.fingerprint import networks_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
-from torchrl_sparse.policies.diffusion.fingerprint import weights_fingerprint
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -44,8 +45,8 @@ class DiffusionPolicy(TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
-    Weights may change at any time, by training, ``load_state_dict`` or a move: the next query sees it. Only after writing
-    to a part of a tensor through ``.data``, which PyTorch does not record, call `refresh`.
+    Weights may change at any time: the next query sees it. Only after writing to a part of a tensor through ``.data``,
+    which PyTorch does not record, call `refresh`.
 
     Args:
         network: the denoiser.
@@ -62,6 +63,7 @@ class DiffusionPolicy(TensorDictSequential):
         plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
             which then reads as the `Dense` planner.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
+        start: what queries begin from: noise, or the last chunk after ``policy.start = WarmStart(1)``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
@@ -86,6 +88,7 @@ class DiffusionPolicy(TensorDictSequential):
         sampler = Sampler() if sampler is None else sampler
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
+            start=ColdStart(),
             plan=Dense(),
             denoise=ActionDenoiser(network, normalizer, sampler, engine),
         )
@@ -112,48 +115,57 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["plan"]
 
     @property
+    def start(self) -> ColdStart:
+        return self.module["start"]
+
+    @property
     def sampler(self) -> Sampler:
         return self.module["denoise"].sampler
 
     def __setattr__(self, name: str, value: Any) -> None:
         # nn.Module registers any module that is assigned, so properties with setters never see it.
         if name == "plan":
-            self._install(value, self.sampler)
+            self._install(value, self.sampler, self.start)
         elif name == "sampler":
-            self._install(self.plan, value)
+            self._install(self.plan, value, self.start)
+        elif name == "start":
+            self._install(self.plan, self.sampler, value)
         elif name == "noise":
             self.module["denoise"].noise = check_noise(value)
         else:
             super().__setattr__(name, value)
 
-    def _install(self, plan: Planner | None, sampler: Sampler) -> None:
-        """Change planner and sampler together, or, if the planner cannot serve that sampler, neither."""
-        plan = Dense() if plan is None else plan
+    def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
+        """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
+        plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
+        if (recalls := keys.RECALL in plan.out_keys) and start.name:
+            raise ValueError(f"start: expected None with a planner that recalls, got {start.name}")
+        start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
-        self.module["plan"] = plan
+        self.module["denoise"].warm, self.module["denoise"].recalls = bool(start.out_keys), recalls
+        self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
 
-    def with_plan(self, plan: Planner | None, sampler: Sampler | None = None) -> DiffusionPolicy:
-        """Return a policy of the same networks under another planner and, unless it is None, another sampler.
+    def with_plan(
+        self, plan: Planner | None, sampler: Sampler | None = None, start: ColdStart | None = None
+    ) -> DiffusionPolicy:
+        """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
 
         Raises:
-            ValueError: if the planner was made for another policy or sampler.
+            ValueError: if the planner was made for another policy or sampler, or the start cannot serve it.
         """
         shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
-        policy.source = self.source
+        policy.start, policy.source = start, self.source
         policy.module["encode"].noise_stream = self.noise_stream
         policy.noise = self.noise
         return policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
-        """Return a policy of the same networks, planner and sampler that draws other noise: what chance alone does.
-
-        Stream 0 is the noise of every other policy.
-        """
-        policy = self.with_plan(self.plan)
+        """Return the same policy with other noise, what chance alone does; ``stream`` 0 is that of every other policy."""
+        policy = self.with_plan(self.plan, start=self.start)
         policy.module["encode"].noise_stream = stream
         return policy
 
@@ -166,8 +178,6 @@ class DiffusionPolicy(TensorDictSequential):
     def noise(self) -> str:
         """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
-
-    # -- numbers about it ----------------------------------------------------------------------------------------------
 
     @property
     def num_inference_steps(self) -> int:
@@ -191,7 +201,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def fingerprint(self) -> str:
         """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        return weights_fingerprint(self.network, self.vision)
+        return networks_fingerprint(self.network, *filter(None, [self.vision]))
 
     @property
     def engine(self) -> EngineName:
@@ -203,11 +213,8 @@ class DiffusionPolicy(TensorDictSequential):
         self.module["denoise"].engine = EngineSlot(name)
 
     def engine_info(self) -> str:
-        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``; where
-        ``"auto"`` had to do without the native one, also why.
-
-        Raises:
-            ValueError: if the chosen engine cannot run this network here.
+        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why
+        ``"auto"`` had to do without the native one. ValueError if the chosen engine cannot run this network here.
         """
         return self.module["denoise"].engine.describe(self.network, self.sampler)
 
@@ -218,16 +225,11 @@ class DiffusionPolicy(TensorDictSequential):
         return engine_block_costs(self.module["denoise"].engine.get(self.network, self.sampler))
 
     def refresh(self) -> None:
-        """Read all weights anew in the next query.
-
-        Needed after writes through ``parameter.data`` alone, unless they change whole parameters. Engines see optimiser
-        steps, ``load_state_dict``, moves, and parameters or modules that were exchanged.
-        """
-        self.module["denoise"].engine.refresh()
-        # A learned planner forgets what it keeps whenever its mode is set.
-        self.plan.train(self.plan.training)
-
-    # -- running it ----------------------------------------------------------------------------------------------------
+        """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
+        self.module["denoise"].refresh()
+        self.plan.train(
+            self.plan.training
+        )  # a learned planner forgets what it keeps whenever its mode is set
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
@@ -250,14 +252,15 @@ class DiffusionPolicy(TensorDictSequential):
         seconds = synchronised_clock(device) - start
         return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
 
-    # -- files ---------------------------------------------------------------------------------------------------------
-
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
         Raises:
-            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`; nothing is written.
+            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or there is a start,
+                which no file says; nothing is written.
         """
+        if self.start.name:
+            raise ValueError(f"start: expected None in a policy that is saved, got {self.start.name}")
         plan = save_beside(self.plan, Path(path))
         stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
         write_pretrained(Path(path), stored, half=half)
@@ -284,8 +287,7 @@ class DiffusionPolicy(TensorDictSequential):
     def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
         """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
 
-        The averaged weights are used where there are any, the sampler is the checkpoint's own, and ``source`` says
-        what the policy was trained for. Nothing in the file is executed.
+        Averaged weights are used where there are any; ``source`` says what it was trained for. Nothing is executed.
 
         Raises:
             FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.

@@ -22,15 +22,20 @@ from torchrl_sparse.blocks.planner import Planner, StaticPlanner
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 
 __all__ = ["answer_directly"]
 
 
 def answer_directly(
-    tensordict: TensorDictBase, encode: ObservationEncoder, plan: Planner, denoise: ActionDenoiser
+    tensordict: TensorDictBase,
+    encode: ObservationEncoder,
+    start: ColdStart,
+    plan: Planner,
+    denoise: ActionDenoiser,
 ) -> bool:
-    """Write what the three stages would, or return False and leave everything as it is where they have to run themselves."""
-    if not _known(encode, plan, denoise):
+    """Write what the four stages would, or return False and leave everything as it is where they have to run themselves."""
+    if not _known(encode, start, plan, denoise):
         return False
     engine = denoise.engine.get(denoise.network, denoise.sampler)
     state = tensordict.get(keys.HISTORY_STATE, None)
@@ -63,13 +68,14 @@ def _flops(sizes: NetworkSizes, mask: Tensor) -> float:
     return mask_flops(sizes, mask).item()
 
 
-def _known(encode: ObservationEncoder, plan: Planner, denoise: ActionDenoiser) -> bool:
+def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise: ActionDenoiser) -> bool:
     """Return whether the stages do what they do in the library, without anybody looking in between."""
-    kind, stages = type(plan), (encode, plan, denoise)
+    kind, stages = type(plan), (encode, start, plan, denoise)
     return (
         kind.forward is Planner.forward
         and getattr(kind, "masks", None) is StaticPlanner.masks
         and type(encode) is ObservationEncoder
+        and type(start) is ColdStart
         and type(denoise) is ActionDenoiser
         and encode.condition.vision is None
         and type(denoise.normalizer) is Normalizer

@@ -15,7 +15,7 @@ Cost = Literal["blocks", "flops", "seconds"]
 
 @dataclass(frozen=True)
 class PrunerConfig:
-    """Options of a training; defaults as published.
+    """Options of a training; defaults as published, but for ``reuse``.
 
     Attributes:
         objective: what the gates are to change little: ``"actions"``, the final actions of the pruned chain (SAG; static
@@ -34,13 +34,20 @@ class PrunerConfig:
         beta: weight of the sparsity loss.
         norm: of the fidelity loss, ``"l1"`` or ``"l2"``.
         estimator: ``"ste"`` (straight-through) or ``"gumbel"`` (straight-through Gumbel-softmax).
-        temperature: of ``"gumbel"``.
+        temperature: of ``"gumbel"``, at the first update.
+        final_temperature: of ``"gumbel"`` at the last update; between, it falls or rises by the same factor in every
+            update. None leaves it as it is.
+        variety: weight of a reward for masks that follow the observation, see
+            :func:`~torchrl_sparse.training.pruner.loss.mutual_information`; 0 as published.
         sparsity: ``"global"``, or ``"block"``: every block has to reach the rate by itself (the paper's ablation).
         cost: what the rate counts: ``"blocks"`` (published), or each weighed by the ``"flops"`` or the measured
             ``"seconds"`` of its type.
-        reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
+        reuse: what pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`: ``"block"``, as in all policies here, or the
+            paper's one-for-all, ``"type"``.
         gradient: ``"chain"`` differentiates the whole chain of denoising steps; ``"step"`` cuts it between them
             (:func:`~torchrl_sparse.blocks.sag.relaxed.step_errors` says what is lost).
+        detached: whether outputs are kept for reuse without their gradient, as the release of SAG's successor does
+            (:mod:`torchrl_sparse.blocks.sag.relaxed`); SAG's equation has it run through them.
         explore: share of the pruned blocks that an update evaluates to learn what they are worth; the smaller,
             the cheaper an update and the noisier its gradient.
         checkpointed: recompute denoising steps in the backward pass, for the memory of one step.
@@ -62,10 +69,13 @@ class PrunerConfig:
     norm: Literal["l1", "l2"] = "l1"
     estimator: Literal["ste", "gumbel"] = "ste"
     temperature: float = 1.0
+    final_temperature: float | None = None
+    variety: float = 0.0
     sparsity: Literal["global", "block"] = "global"
     cost: Cost = "blocks"
-    reuse: Reuse = "type"
+    reuse: Reuse = "block"
     gradient: Literal["chain", "step"] = "chain"
+    detached: bool = False
     explore: float = 1.0
     checkpointed: bool = True
     max_grad_norm: float = 1.0
@@ -90,6 +100,17 @@ class PrunerConfig:
             object.__setattr__(self, "rate_range", tuple(self.rate_range))
             if self.cost != "blocks":
                 raise ValueError(f"cost: expected 'blocks' with a rate_range, got {self.cost!r}")
-        for name in ("epochs", "batch_size", "lr", "temperature"):
-            if not (value := getattr(self, name)) > 0:
+        for name in ("epochs", "batch_size", "lr", "temperature", "final_temperature"):
+            if (value := getattr(self, name)) is not None and not value > 0:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
+        if not self.variety >= 0:
+            raise ValueError(f"variety: expected a weight >= 0, got {self.variety}")
+
+    def temperature_at(self, progress: float) -> float:
+        """Return the temperature at a share of the training, 0 to 1.
+
+        >>> PrunerConfig(temperature=4.0, final_temperature=0.25).temperature_at(0.5)
+        1.0
+        """
+        final = self.temperature if self.final_temperature is None else self.final_temperature
+        return self.temperature * (final / self.temperature) ** progress

@@ -1,4 +1,4 @@
-"""Gates fitted to given masks, the start of a training."""
+"""Where gates begin their training: fitted to given masks, or different for every observation."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import prune_rate
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.training.pruner.gates import Gates
 
-__all__ = ["fit_to_masks"]
+__all__ = ["fit_to_masks", "spread_logits"]
 
 _BATCH = 4  # the coordinates' tokens, which no observation changes, cost the most
+_SMALLEST_DEVIATION = 1e-3  # of an observed number; what varies less is taken for constant
 
 
 def fit_to_masks(
@@ -68,3 +70,43 @@ def fit_to_masks(
         loss.backward()
         optimizer.step()
         on_progress(update + 1, total)
+
+
+@torch.no_grad()
+def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, samples: int = 256) -> None:
+    """Have untrained gates begin with masks that differ between observations, in place.
+
+    Initialised as usual, gates are next to blind. Published normalisers scale a whole state by one number, so that most of
+    what tells two observations apart is far smaller than 1, and every layer makes it smaller. Once the logits of the cells have
+    grown apart, as when gates are fitted to a mask, no observation changes a sign, and what changes nothing is never learned.
+    Here the first layers are scaled so that observation and coordinates have an equal say, with mean 0 and deviation 1 in
+    each unit of the first hidden layer, and the last so that logits have mean 0 and deviation ``spread``. All of them stay
+    the layers that they were.
+
+    Args:
+        gates: those that read the observation.
+        targets: see `make_targets`; only its observations are read.
+        spread: deviation of a cell's logit over observations, mean over the cells, > 0.
+        samples: observations to measure it with, the first.
+    """
+    cond = targets[keys.COND][:samples]
+    rate = torch.full((len(cond), 1), 0.5) if gates.rate_input else None
+    observed, weight = cond.flatten(1), gates.obs.weight
+    deviation = observed.std(dim=0)
+    varies = deviation > _SMALLEST_DEVIATION
+    weight[:, : len(varies)] *= torch.where(varies, 1 / deviation, 0.0)  # a rate may follow
+    _standardise(gates.fuse_obs, gates.fuse_obs(gates.obs(gates.features(cond, rate))))
+    _standardise(gates.fuse_z, gates.cells(), gates.fuse_obs.bias)
+    last = gates.mlp[-1]
+    last.weight *= spread / gates.prune_logits(cond, rate)[:, 1:].std(dim=0).mean()
+    last.bias[1] -= gates.prune_logits(cond, rate)[:, 1:].mean()
+    gates.train(gates.training)  # forget what followed from the weights
+
+
+def _standardise(layer: nn.Linear, outputs: Tensor, bias: Tensor | None = None) -> None:
+    """Scale and shift a layer so that each of its ``outputs`` [N, n] has mean 0 and deviation 1."""
+    bias, deviation, mean = layer.bias if bias is None else bias, outputs.std(dim=0), outputs.mean(dim=0)
+    if layer.bias is not None:
+        layer.bias /= deviation
+    layer.weight /= deviation[:, None]
+    bias -= mean / deviation

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,14 @@ from torchrl_sparse.blocks.mask import BLOCK_TYPES
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.pruner.config import Cost
 
-__all__ = ["block_weights", "rate_metrics", "sparsity_loss", "weighted_rate"]
+__all__ = [
+    "block_weights",
+    "mutual_information",
+    "rate_metrics",
+    "sparsity_loss",
+    "varying_share",
+    "weighted_rate",
+]
 
 
 def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool = False) -> Tensor:
@@ -28,6 +37,39 @@ def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool
     if per_block:
         return (gate.mean(dim=1) - rate).abs().mean()
     return (weighted_rate(gate, weight) - rate).abs().mean()
+
+
+def mutual_information(logits: Tensor) -> Tensor:
+    """Return how much a batch's gates tell of its observations, in bits of a cell, 0 to 1, a scalar.
+
+    ``H(mean_i p_i) - mean_i H(p_i)``, the mean over all cells after the first step, with ``p_i`` the probability that
+    observation i prunes the cell: 0 if every observation prunes alike, 1 if each cell is pruned for half of them, surely.
+    Gates that start from one mask stay there, since reward and gradient of looking are both 0; this has a gradient.
+
+    Args:
+        logits: f32 [B, K, 3L], positive where pruning is preferred.
+
+    >>> certain = torch.tensor([[[0.0], [20.0]], [[0.0], [-20.0]]])
+    >>> round(mutual_information(certain).item(), 3), mutual_information(certain[:1]).item()
+    (1.0, 0.0)
+    """
+    probability = logits[:, 1:].sigmoid().clamp(1e-6, 1 - 1e-6)  # an entropy's slope is infinite at its ends
+    return (_entropy(probability.mean(dim=0)) - _entropy(probability).mean(dim=0)).mean()
+
+
+def _entropy(probability: Tensor) -> Tensor:
+    """Return the entropy of coins, in bits."""
+    certain = torch.special.entr(probability) + torch.special.entr(1 - probability)
+    return certain / math.log(2)
+
+
+def varying_share(masks: Tensor) -> Tensor:
+    """Return the share of the cells, of all K x 3L, in which the masks bool [N, K, 3L] do not all agree.
+
+    >>> varying_share(torch.tensor([[[False, False], [True, True]], [[False, False], [True, False]]])).item()
+    0.25
+    """
+    return (masks != masks[:1]).any(dim=0).float().mean()
 
 
 def weighted_rate(gate: Tensor, weight: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ The frozen policy answers observations of a small calibration set under the pred
 
 a(M) being the normalised actions of the whole chain and a* the targets: those of the dense policy on the same noise, or of the
 demonstration. The mean can count blocks, as in the paper, or weigh them by what they cost. The first term can also be
-Learning-to-Cache's own (arXiv:2406.01733), of the noise predicted in one step (`PrunerConfig.objective`).
+Learning-to-Cache's own (arXiv:2406.01733), of the noise predicted in one step (`PrunerConfig.objective`). A reward for masks
+that follow the observation can be added (`PrunerConfig.variety`).
 """
 
 from __future__ import annotations
@@ -27,10 +28,16 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.gates import Gates
-from torchrl_sparse.training.pruner.loss import block_weights, rate_metrics, sparsity_loss
+from torchrl_sparse.training.pruner.loss import (
+    block_weights,
+    mutual_information,
+    rate_metrics,
+    sparsity_loss,
+    varying_share,
+)
 from torchrl_sparse.training.trainer import Trainer, checksum
 
-__all__ = ["PrunerTrainer"]
+__all__ = ["PrunerTrainer", "mean_mask"]
 
 
 class PrunerTrainer(Trainer):
@@ -86,20 +93,24 @@ class PrunerTrainer(Trainer):
         """Return the loss, its parts ``"fidelity"`` and ``"sparsity"``, and the prune rates of samples ``index``, i64 [B]."""
         config, batch = self.config, self.train_set[index]
         rate = self._draw_rates(len(batch))
-        gate = self._gate(batch[keys.COND], rate)
+        logits = self._logits(batch[keys.COND], rate)
+        gate = self._gate(logits)
         fidelity = self._fidelity(batch, gate)
         sparsity = sparsity_loss(gate, rate, self.weight, per_block=config.sparsity == "block")
+        information = mutual_information(logits)
+        loss = fidelity + config.beta * sparsity
         return {
-            "loss": fidelity + config.beta * sparsity,
+            "loss": loss - config.variety * information if config.variety else loss,
             "fidelity": fidelity,
             "sparsity": sparsity,
+            "information": information.detach(),
             **rate_metrics(gate.detach(), self.weight),
         }
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Return the error of the actions and the prune rates on held-out observations, with the masks as they will be
-        used, and the variance of the masks over observations."""
+        used, and how the masks vary over observations: their variance, and the share of the cells that ever differ."""
         cond = self.held_out[keys.COND]
         masks = self._masks(cond)
         noise = self.policy.sample_noise(self.held_out[keys.SEED].squeeze(-1))
@@ -112,7 +123,12 @@ class PrunerTrainer(Trainer):
         error = (torch.cat(actions) - self.held_out["target"]).abs().mean()
         gate = masks.float()
         variance = gate.var(dim=0, unbiased=False).mean()
-        metrics = {"error": error, "variance": variance, **rate_metrics(gate, self.weight)}
+        metrics = {
+            "error": error,
+            "variance": variance,
+            "varying": varying_share(masks),
+            **rate_metrics(gate, self.weight),
+        }
         return {name: value.item() for name, value in metrics.items()}
 
     @torch.no_grad()
@@ -120,10 +136,7 @@ class PrunerTrainer(Trainer):
         """Return the mean of the masks of all training observations, bool [K, 3L]: the cells that the gates prune most often,
         as many as they prune on average. L2C's result, and SAG's ablation that does not read the observation."""
         parts = self.train_set[keys.COND].split(ANSWER_BATCH)
-        share = sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set)
-        mask = torch.zeros(share.numel(), dtype=torch.bool)
-        mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
-        return mask.view_as(share)
+        return mean_mask(sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set))
 
     def header(self) -> dict[str, dict[str, Any]]:
         size = len(self.train_set) + len(self.held_out)
@@ -155,10 +168,9 @@ class PrunerTrainer(Trainer):
         logits = self.gates.prune_logits(cond, rate)
         return logits - rate_threshold(logits, rate)
 
-    def _gate(self, cond: Tensor, rate: Tensor) -> Tensor:
-        logits = self._logits(cond, rate)
+    def _gate(self, logits: Tensor) -> Tensor:
         if self.config.estimator == "gumbel":
-            gate = gumbel_gate(logits, self.config.temperature)
+            gate = gumbel_gate(logits, self.config.temperature_at(self.step / self.total))
         else:
             gate = straight_through_gate(logits)
         return gate * self._may_prune
@@ -180,6 +192,7 @@ class PrunerTrainer(Trainer):
                 "reuse": config.reuse,
                 "explore": config.explore,
                 "checkpointed": config.checkpointed,
+                "detached": config.detached,
             }
             if config.gradient == "step":
                 error = step_errors(*query, **options)
@@ -195,3 +208,17 @@ class PrunerTrainer(Trainer):
         return noise_errors(
             policy.network, policy.sampler, clean, noise, batch[keys.COND], gate[:, step], step
         )
+
+
+def mean_mask(share: Tensor) -> Tensor:
+    """Return the mask that is nearest to many, bool [K, 3L]: the cells that are pruned most often, as many as are on average.
+
+    Args:
+        share: of the masks that prune each cell, f32 [K, 3L].
+
+    >>> mean_mask(torch.tensor([[0.0, 0.0], [0.9, 0.4]])).tolist()
+    [[False, False], [True, False]]
+    """
+    mask = torch.zeros(share.numel(), dtype=torch.bool)
+    mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
+    return mask.view_as(share)

@@ -1,0 +1,72 @@
+"""Measure whether a pruner looks, and what its blocks could reuse: over rollouts that it was not trained on.
+
+    python recipes/looking.py task=lift policy=assets/lift pruner=assets/lift/sag
+
+Without a pruner only the similarities of what could be reused are measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from torchrl_sparse.blocks.sag.planner import SAGPruner
+from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.queries import record_queries
+from torchrl_sparse.envs.for_policy import diffusion_env
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.evaluation.figures.looking import plot_looking, plot_reuse_sources
+from torchrl_sparse.evaluation.statistics.looking import looking
+from torchrl_sparse.evaluation.statistics.reuse_sources import reuse_sources
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.storage.json import write_json
+from torchrl_sparse.training.diffusion.published import published_shape
+
+
+@recipe("looking")
+def main(config: DictConfig) -> None:
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    policy, task = make_policy(config), find_task(config.task).name
+    n_action_steps = published_shape(task).n_action_steps
+    seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
+    actor = ChunkExecutor(policy, n_action_steps)
+    queries = record_queries(actor, diffusion_env(task, policy), seeds)
+    out, results = Path(config.out), {"task": task, "policy": policy.fingerprint}
+    sources = reuse_sources(policy, queries[: config.samples])
+    results["sources"] = asdict(sources)
+    plot_reuse_sources(sources, out / f"reuse_sources_{task}.png", title=f"{task}, {policy.sampler.name}")
+    if config.pruner:
+        found = looking(policy, queries, n_action_steps=n_action_steps)
+        results |= {"pruner": policy.plan.fingerprint, "looking": asdict(found)}
+        plot_looking(found, out / f"looking_{task}.png", title=task)
+        said = f"{found.varying:.1%} of the cells differ, {found.varying_in_episode:.1%} within an episode"
+        print(f"{task}: rate {found.rate:.3f}, {said}")
+        print("errors: " + ", ".join(f"{name} {error:.4f}" for name, error in found.error.items()))
+        for name in ("own_minus_mean", "own_minus_others"):
+            mean, low, high = getattr(found, name)
+            print(f"{name}: {mean:+.4f} [{low:+.4f}, {high:+.4f}]")
+    write_json(out / f"looking_{task}.json", results)
+    for name in ("own", "type", "query"):
+        alike = torch.tensor(results["sources"][name])[:, 1:].mean().item()
+        print(f"reuse of {name}: cosine similarity {alike:.3f}")
+
+
+def make_policy(config: DictConfig) -> DiffusionPolicy:
+    """Return the policy with the pruner and its sampler, or with the sampler that is asked for."""
+    policy = DiffusionPolicy.from_pretrained(config.policy)
+    if config.pruner is None:
+        return policy if config.sampler is None else policy.with_plan(None, Sampler.from_name(config.sampler))
+    pruner = SAGPruner.from_pretrained(config.pruner)
+    made_for = pruner.made_for
+    return policy.with_plan(pruner, Sampler.from_name(made_for.sampler, made_for.num_inference_steps))
+
+
+if __name__ == "__main__":
+    main()

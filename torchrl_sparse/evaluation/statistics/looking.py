@@ -1,0 +1,131 @@
+"""Whether a pruner looks: how much its masks differ between observations, when they do, and whether that pays.
+
+A pruner that reads the observation (SAG, arXiv:2601.12894) can end up with one mask for all observations and lose nothing by
+its own loss. So its masks are compared with their own mean, which prunes as much and reads nothing, and with each other's: if
+the masks of other observations do as well as a query's own, what differs between them does not come from seeing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.planner import Dense
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH, dense_answers
+from torchrl_sparse.training.pruner.loss import varying_share
+from torchrl_sparse.training.pruner.trainer import mean_mask
+
+__all__ = ["Looking", "looking"]
+
+
+@dataclass(frozen=True)
+class Looking:
+    """What the masks of a pruner do over rollouts.
+
+    Attributes:
+        queries, episodes: that were looked at.
+        rate: mean prune rate.
+        varying: share of the cells, of all K x 3L, that differ between any two queries.
+        varying_in_episode: the same within an episode, mean over episodes with two queries or more.
+        differing: share of the cells in which a query's mask differs from the mean mask, mean over queries.
+        error: mean absolute difference to the dense policy's actions on the same noise, normalised, over the executed
+            actions: under the query's ``"own"`` mask, the ``"mean"`` mask, and ``"others"``, the mask of another query.
+        own_minus_mean, own_minus_others: differences of those errors with the 95 % interval of their mean over episodes;
+            below 0, looking pays.
+        phases: ``[P][K][3L]``, share of an episode phase's queries that prune each cell, minus that of all queries.
+    """
+
+    queries: int
+    episodes: int
+    rate: float
+    varying: float
+    varying_in_episode: float
+    differing: float
+    error: dict[str, float]
+    own_minus_mean: tuple[float, float, float]
+    own_minus_others: tuple[float, float, float]
+    phases: list[list[list[float]]]
+
+
+@torch.no_grad()
+def looking(
+    policy: DiffusionPolicy,
+    queries: TensorDictBase,
+    *,
+    n_action_steps: int = 8,
+    phases: int = 4,
+    seed: int = 0,
+) -> Looking:
+    """Ask recorded queries for their masks, and for their actions under these and others.
+
+    Args:
+        policy: with the pruner as its planner.
+        queries: [N], of `torchrl_sparse.control.queries.record_queries`; none that the pruner was trained on.
+        n_action_steps: actions of a chunk that are executed.
+        phases: equal parts of an episode's queries.
+        seed: of whose mask a query gets as another's.
+
+    Raises:
+        ValueError: if there are fewer than two episodes.
+    """
+    policy = policy.with_plan(policy.plan)
+    encoded = policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
+    masks, episodes = encoded[keys.PRUNE_MASK], encoded[keys.EPISODE_SEED].flatten()
+    starts = [rows.nonzero().flatten() for rows in (episodes == number for number in episodes.unique())]
+    if len(starts) < 2:
+        raise ValueError(f"queries: expected those of two episodes at least, got {len(starts)}")
+    mean = mean_mask(masks.float().mean(dim=0))
+    other = torch.randperm(len(masks), generator=torch.Generator().manual_seed(seed)).roll(1)
+    dense = dense_answers(policy.with_plan(Dense()), encoded)
+    candidates = {"own": masks, "mean": mean.expand_as(masks).contiguous(), "others": masks[other]}
+    first = policy.n_obs_steps - 1
+    errors = {
+        name: (_actions(policy, encoded, asked) - dense)[:, first : first + n_action_steps]
+        .abs()
+        .mean(dim=(1, 2))
+        for name, asked in candidates.items()
+    }
+    repeated = [rows for rows in starts if len(rows) > 1]
+    return Looking(
+        queries=len(masks),
+        episodes=len(starts),
+        rate=masks.float().mean().item(),
+        varying=varying_share(masks).item(),
+        varying_in_episode=float(np.mean([varying_share(masks[rows]).item() for rows in repeated])),
+        differing=(masks != mean).float().mean().item(),
+        error={name: error.mean().item() for name, error in errors.items()},
+        own_minus_mean=_paired(errors["own"] - errors["mean"], starts),
+        own_minus_others=_paired(errors["own"] - errors["others"], starts),
+        phases=_phases(masks, starts, phases).tolist(),
+    )
+
+
+def _actions(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) -> Tensor:
+    """Return normalised actions [N, H, A] of queries under ``masks``."""
+    noise = policy.sample_noise(encoded[keys.SEED].flatten())
+    parts = zip(*(part.split(ANSWER_BATCH) for part in (noise, encoded[keys.COND], masks)), strict=True)
+    return torch.cat([policy.denoise(*part, reuse=policy.plan.reuse) for part in parts])
+
+
+def _paired(difference: Tensor, starts: list[Tensor]) -> tuple[float, float, float]:
+    """Return the mean over episodes and its 95 % interval; an episode's queries are no independent samples."""
+    by_episode = torch.stack([difference[rows].mean() for rows in starts])
+    mean, half = by_episode.mean().item(), 1.96 * by_episode.std().item() / len(starts) ** 0.5
+    return mean, mean - half, mean + half
+
+
+def _phases(masks: Tensor, starts: list[Tensor], phases: int) -> Tensor:
+    """Return f32 [P, K, 3L]: how much more often than on average each cell is pruned in each phase, 0 without a query."""
+    phase = torch.empty(len(masks), dtype=torch.long)
+    for rows in starts:
+        phase[rows] = torch.arange(len(rows)) * phases // len(rows)
+    change = torch.zeros(phases, *masks.shape[1:])
+    for number in phase.unique().tolist():
+        change[number] = masks[phase == number].float().mean(dim=0) - masks.float().mean(dim=0)
+    return change
