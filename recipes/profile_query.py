@@ -1,7 +1,7 @@
 """Profile one query in the native engine: its parts, its threads, and its tail.
 
     python recipes/profile_query.py policy=assets/lift sampler=ddim_87_20
-    python recipes/profile_query.py queries=100000 hz=50 busy=1 out=outputs/query_busy     # 33 minutes
+    python recipes/profile_query.py queries=100000 hz=50 busy=1 library=build/tsp/libtsp.so     # an hour
 
 Writes OUT/query.json, three tables and OUT/query_threads.png. Times are medians, everything interleaved in one process; in
 the tail, every query counts.
@@ -9,7 +9,9 @@ the tail, every query counts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -18,7 +20,9 @@ from torchrl_sparse.evaluation.figures.latency import plot_thread_scaling
 from torchrl_sparse.evaluation.latency.measure import describe_machine, usable_cores
 from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
+    exported_call,
     paced_seconds,
+    policy_call,
     query_parts,
     tail,
     thread_seconds,
@@ -40,8 +44,9 @@ def main(config: DictConfig) -> None:
     counts = sorted({1, *(count for count in config.thread_counts if count <= usable_cores())})
     with num_threads(config.threads):
         parts = query_parts(policy, config.repeats, config.warmup)
-        with busy_cores(config.busy), progress("tail", "query", config.queries) as show:
-            late = paced_seconds(policy, config.queries, config.hz, show)
+        with busy_cores(config.busy):
+            late = tail(paced(policy_call(policy), config))
+            exported = exported_tail(policy, config) if config.library else None
     threads = thread_seconds(
         policy.network, {"dense": dense, config.sampler: chosen}, counts, config.repeats, config.warmup
     )
@@ -51,15 +56,26 @@ def main(config: DictConfig) -> None:
         sampler=config.sampler,
         parts_s=parts,
         threads_s={name: {str(count): at[count] for count in at} for name, at in threads.items()},
-        tail_s=tail(late),
+        tail_s=late,
         queries=config.queries,
         busy=config.busy,
         hz=config.hz,
+        exported_tail_s=exported,
     )
     out = Path(config.out)
     write_json(out / "query.json", found)
     plot_thread_scaling(found.threads_s, found.machine, out / "query_threads.png")
     print(f"\n{format_query_profile(found)}\n\nfiles are in {out}")
+
+
+def exported_tail(policy: DiffusionPolicy, config: DictConfig) -> dict[str, float]:
+    with exported_call(policy, Path(config.library)) as call:
+        return tail(paced(call, config))
+
+
+def paced(call: Callable[[], Any], config: DictConfig) -> list[float]:
+    with progress("tail", "query", config.queries) as show:
+        return paced_seconds(call, config.queries, config.hz, show)
 
 
 if __name__ == "__main__":

@@ -153,6 +153,7 @@ OPTIONS: dict[str, Any] = {
     "queries": Count,
     "hz": Positive | None,
     "busy": Whole,
+    "library": Word | None,
     "engine": Word,
     "device": Word,
     "dtype": Literal["float32", "float16", "bfloat16"],

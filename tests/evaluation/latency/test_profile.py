@@ -1,5 +1,8 @@
 """One query under the glass: its parts add up, its threads are compared, its tail is kept, and what cannot be is one line."""
 
+from pathlib import Path
+from time import perf_counter
+
 import pytest
 import torch
 
@@ -10,7 +13,9 @@ from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.evaluation.latency.measure import usable_cores
 from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
+    exported_call,
     paced_seconds,
+    policy_call,
     query_parts,
     serial_share,
     tail,
@@ -64,7 +69,9 @@ def test_the_serial_share_of_amdahls_law_is_found_again(share):
 
 def test_the_tail_keeps_the_latest_and_the_pace_is_kept(policy):
     with busy_cores(1):
-        samples = paced_seconds(policy, queries=4, hz=50)
+        start = perf_counter()
+        samples = paced_seconds(policy_call(policy), queries=4, hz=20)
+    assert perf_counter() - start > 3 / 20
     assert len(samples) == 4
     assert tail(samples)["max"] == max(samples)
     assert tail([*[1.0] * 1998, 2.0, 9.0])["p99.9"] == pytest.approx(1.0, abs=0.01)
@@ -82,6 +89,14 @@ def test_the_recipe_leaves_tables_and_a_figure(tmp_path, policy):
     assert set(found.threads_s["dense"]) == {"1", "2"} if usable_cores() > 1 else {"1"}
     assert found.tail_s["p50"] <= found.tail_s["p99.9"] <= found.tail_s["max"]
     assert (tmp_path / "out" / "query_threads.png").stat().st_size > 0
+
+
+@needs_native
+def test_a_library_that_is_none_is_one_line(policy, tmp_path):
+    (tmp_path / "libtsp.so").write_bytes(b"no library")
+    for path in (tmp_path / "libtsp.so", Path("nowhere.so")):
+        with pytest.raises(ValueError, match=r"^library: expected libtsp\.so, got "):
+            exported_call(policy, path).__enter__()
 
 
 def test_no_threads_at_all_are_refused():

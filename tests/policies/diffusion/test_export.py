@@ -123,10 +123,9 @@ def check_equal(example, policy, path, **options):
     ("prefix", "runner", "flags"),
     [
         ("", [], ["-DPORTABLE_ONLY"]),
-        ("aarch64-linux-gnu-", ["qemu-aarch64"], ["-DPORTABLE_ONLY"]),
         ("aarch64-linux-gnu-", ["qemu-aarch64"], []),
     ],
-    ids=["portable", "ARM portable", "ARM NEON"],
+    ids=["portable", "ARM"],
 )
 def test_other_machines_answer_alike(example, tmp_path, prefix, runner, flags):
     """As far as the order of sums allows, whatever the type of the weights."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from ctypes import c_size_t, c_uint64, c_void_p
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +26,9 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = [
     "busy_cores",
+    "exported_call",
     "paced_seconds",
+    "policy_call",
     "query_parts",
     "serial_share",
     "state_query",
@@ -83,7 +89,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
     mask, watch = policy.plan.static_mask, NativeWatch(policy.network)
     latency = measure_latency(
         {
-            "query": lambda: policy(query.copy()),
+            "query": policy_call(policy),
             "noise": partial(policy.sample_noise, seed),
             "weights": watch.state,
             "answer": lambda: engine.answer(noise, state, policy.normalizer, mask, policy.plan.reuse),
@@ -143,25 +149,63 @@ def serial_share(seconds: dict[int, float]) -> float:
 
 @torch.no_grad()
 def paced_seconds(
-    policy: DiffusionPolicy,
+    call: Callable[[], Any],
     queries: int,
     hz: float | None,
     on_query: Callable[[int, int], None] | None = None,
 ) -> list[float]:
-    """Time each of many queries, which begin ``hz`` times a second as a control loop's do; None: one after the other."""
-    query, samples = state_query(policy), []
-    policy(query.copy())
-    begin = time.perf_counter()
+    """Time each of many queries, which begin ``hz`` times a second as a control loop's do; None: one after the other.
+
+    A query that comes late delays the next; it is timed from its own beginning.
+    """
+    call()
+    samples, begin = [], time.perf_counter()
     for number in range(queries):
         if hz is not None:
             time.sleep(max(0.0, begin + number / hz - time.perf_counter()))
-        data = query.copy()
         start = time.perf_counter()
-        policy(data)
+        call()
         samples.append(time.perf_counter() - start)
         if on_query is not None:
             on_query(number + 1, queries)
     return samples
+
+
+def policy_call(policy: DiffusionPolicy) -> Callable[[], Any]:
+    """Return a query of the policy in Python, its observation in a new TensorDict."""
+    query = state_query(policy)
+    return lambda: policy(query.copy())
+
+
+@contextmanager
+def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[], Any]]:
+    """Export the policy and lend the same query of the C interface, ``tsp.h``, as a robot calls it.
+
+    Args:
+        policy: of states, which `DiffusionPolicy.export` can write.
+        library: the shared library that CMake makes, ``libtsp.so``.
+
+    Raises:
+        ValueError: if the library cannot be loaded or the policy not exported.
+    """
+    state = state_query(policy)["history", "state"].contiguous()
+    chunk = torch.empty(policy.horizon - policy.n_obs_steps + 1, policy.network.output_dim)
+    try:
+        found = ctypes.CDLL(str(library.resolve()))
+    except OSError as error:
+        raise ValueError(f"library: expected libtsp.so, got {library} ({error})") from error
+    found.tsp_load.restype, found.tsp_free.argtypes = c_void_p, [c_void_p]
+    found.tsp_query.argtypes = [c_void_p, c_void_p, c_uint64, c_void_p]
+    with tempfile.TemporaryDirectory() as folder:
+        policy.export(Path(folder) / "policy.tsp")
+        reason = ctypes.create_string_buffer(256)
+        handle = found.tsp_load(f"{folder}/policy.tsp".encode(), reason, c_size_t(len(reason)))
+    if handle is None:
+        raise ValueError(f"library: {reason.value.decode()}")
+    try:
+        yield lambda: found.tsp_query(handle, state.data_ptr(), 1, chunk.data_ptr())
+    finally:
+        found.tsp_free(handle)
 
 
 def tail(samples: Sequence[float]) -> dict[str, float]:

@@ -25,6 +25,7 @@ class QueryProfile:
         tail_s: ``"p50"``, ``"p99"``, ``"p99.9"`` and ``"max"`` of ``queries``.
         queries: that were timed for the tail.
         hz: how often they began; None is one after the other.
+        exported_tail_s: the same of the exported policy's queries in C, if it was asked for.
         busy: other processes that computed meanwhile.
     """
 
@@ -37,6 +38,7 @@ class QueryProfile:
     queries: int
     busy: int
     hz: float | None = None
+    exported_tail_s: dict[str, float] | None = None
 
 
 def format_query_profile(found: QueryProfile) -> str:
@@ -48,7 +50,12 @@ def format_query_profile(found: QueryProfile) -> str:
     ]
     threads = [_thread_row(name, seconds) for name, seconds in found.threads_s.items()]
     pace = "one after the other" if found.hz is None else f"{found.hz:g} times a second"
-    late = {f"{name}, ms": f"{1e3 * seconds:.3f}" for name, seconds in found.tail_s.items()}
+    tails = {"Python": found.tail_s, "C": found.exported_tail_s or {}}
+    late = [
+        {"called from": name, **{f"{at}, ms": f"{1e3 * seconds:.3f}" for at, seconds in tail.items()}}
+        for name, tail in tails.items()
+        if tail
+    ]
     return "\n\n".join(
         [
             f"A query, {found.sampler}: {whole / found.parts_s['blocks']:.2f} times its blocks.",
@@ -56,7 +63,7 @@ def format_query_profile(found: QueryProfile) -> str:
             "Queries by number of threads, milliseconds.",
             markdown_table(threads),
             f"{found.queries} queries, {pace}, beside {found.busy} busy processes.",
-            markdown_table([late]),
+            markdown_table(late),
         ]
     )
 
