@@ -84,6 +84,7 @@ OPTIONS: dict[str, Any] = {
     "calibrate_bac.sampler": Word | None,
     "looking.sampler": Word | None,
     "pruner": Word | None,
+    "played": Literal["pruned", "dense"],
     "specprune": Section,
     "options": Section,
     "preset": Word,
