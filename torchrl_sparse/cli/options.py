@@ -76,7 +76,6 @@ OPTIONS: dict[str, Any] = {
     "timesteps": Annotated[list[Whole], Field(min_length=1)],
     "kind": Word,
     "eta": Annotated[float, Field(ge=0, le=1)],
-    "spacing": Word,
     "spacings": Words,
     "samplers": Words,
     "draws": Annotated[int, Field(ge=3)],
