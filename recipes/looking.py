@@ -36,7 +36,8 @@ def main(config: DictConfig) -> None:
     policy, task = make_policy(config), find_task(config.task).name
     n_action_steps = published_shape(task).n_action_steps
     seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
-    actor = ChunkExecutor(policy, n_action_steps)
+    played = policy if config.played == "pruned" else policy.with_plan(None)
+    actor = ChunkExecutor(played, n_action_steps)
     queries = record_queries(actor, diffusion_env(task, policy), seeds)
     out, results = Path(config.out), {"task": task, "policy": policy.fingerprint}
     sources = reuse_sources(policy, queries[: config.samples])
