@@ -26,7 +26,7 @@ def test_the_command_lists_every_recipe_with_its_purpose(capsys):
 
 def test_an_unknown_recipe_is_one_line(capsys):
     assert main(["benchmrak"]) == 2
-    assert "expected env or one of benchmark" in capsys.readouterr().err
+    assert "expected env or one of accelerate_policy, benchmark" in capsys.readouterr().err
 
 
 def test_a_fault_can_be_reported_with_the_installation(capsys):

@@ -1,8 +1,13 @@
-"""Writes what the pinned tests compare with, from the code as it is: ``python -m tests.pinned.record``."""
+"""Writes what the pinned tests compare with, from the code as it is: ``python -m tests.pinned.record``.
+
+What is stored already stays as it is, unless it is named: ``python -m tests.pinned.record assets/can`` records Can's anew.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -33,13 +38,18 @@ def packed(answer: dict[str, Tensor]) -> dict[str, Tensor]:
     return {**answer, "mask": torch.from_numpy(stored)}
 
 
-def main() -> None:
-    answers = {str(case): packed(case.answer()) for case in actions.cases()}
+def main(anew: set[str]) -> None:
+    """Record what is new, and the assets in ``anew``; what is no more is dropped."""
+    stored = {case: answer for case, answer in load_actions().items() if case.partition("/")[0] not in anew}
+    answers = {
+        name: stored.get(name) or packed(case.answer()) for case in actions.cases() if (name := str(case))
+    }
     tensors = {f"{case}/{name}": value for case, answer in answers.items() for name, value in answer.items()}
     save_file({name: value.contiguous() for name, value in tensors.items()}, actions.STORED)
-    text = json.dumps({name: tables.table(name) for name in tables.names()}, indent=1, ensure_ascii=False)
-    tables.STORED.write_text(text + "\n", encoding="utf-8")
+    lines = {name: lines for name, lines in load_tables().items() if name.partition("/")[0] not in anew}
+    made = {name: lines.get(name) or tables.table(name) for name in tables.names()}
+    tables.STORED.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    main({Path(argument).name for argument in sys.argv[1:]})

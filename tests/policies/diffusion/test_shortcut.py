@@ -1,4 +1,4 @@
-"""A query in one native call is the query of the three stages: the same keys, the same bits."""
+"""A query in one native call is the query of the stages: the same keys, the same bits."""
 
 import pytest
 import torch
@@ -9,11 +9,19 @@ from torchrl_sparse.blocks.engine.native import native_available
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.policies.diffusion import policy as module
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
+from torchrl_sparse.policies.diffusion.warm_start import WarmStart
 
 from .test_export import Half, Looks, make_policy
 
 AVAILABLE, REASON = native_available()
 pytestmark = pytest.mark.skipif(not AVAILABLE, reason=REASON)
+
+
+class OddSteps(Half):
+    """Its mask is one column, which lies in memory once."""
+
+    def mask(self, spec):
+        return (torch.arange(spec.num_inference_steps) % 2 == 1)[:, None].expand(-1, spec.num_blocks)
 
 
 def make_query(batch):
@@ -49,6 +57,14 @@ def test_the_same_keys_and_bits(batch, plan, noise, monkeypatch):
     assert got[keys.LATENCY] > 0 if batch == () else got[keys.LATENCY].min() > 0
 
 
+def test_a_mask_that_is_spread_is_read_as_it_is(monkeypatch):
+    policy = make_policy(plan=OddSteps("block"))
+    assert not policy.plan.static_mask.is_contiguous()
+    got = policy(make_query((2,)))
+    monkeypatch.setattr(module, "answer_directly", lambda *_: False)
+    assert torch.equal(got[keys.CHUNK], policy(make_query((2,)))[keys.CHUNK])
+
+
 def test_masks_of_rows_can_be_written_to_and_change_no_other():
     policy = make_policy(plan=Half("block"))
     data = policy(make_query((2,)))
@@ -65,6 +81,7 @@ def test_masks_of_rows_can_be_written_to_and_change_no_other():
         "looks at the observation",
         "hook",
         "engine",
+        "warm start",
         "double",
         "gradients",
         "turned",
@@ -80,6 +97,8 @@ def test_where_the_stages_have_to_run_it_leaves_everything_alone(why):
         policy.train()
     if why == "hook":
         policy.module["plan"].register_forward_hook(lambda *_: None)
+    if why == "warm start":
+        policy.start = WarmStart(1)
     if why == "engine":
         policy.engine = "torch"
     changed = {

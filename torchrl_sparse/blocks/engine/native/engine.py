@@ -206,6 +206,7 @@ class NativeEngine:
         """
         packed, rows = self._current(), len(state)
         packed.check(noise=noise, cond=state)
+        noise, state, mask = noise.contiguous(), state.contiguous(), mask.contiguous()
         threads, horizon, past = self._num_threads(rows), noise.shape[2], state.shape[1] - 1
         cond, actions = torch.empty_like(state), noise.new_empty(rows, *noise.shape[2:])
         chunk = noise.new_empty(rows, horizon - past, noise.shape[3])
