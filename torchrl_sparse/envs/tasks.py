@@ -97,7 +97,6 @@ class RobosuiteTask(_Named):
 
     @property
     def acts_in_poses(self) -> bool:
-        """Always True."""
         return True
 
     @property
@@ -110,16 +109,13 @@ class RobosuiteTask(_Named):
 
     @property
     def demonstrator(self) -> type:
-        """See `Task`."""
         return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
 
     @property
     def pose_slices(self) -> list[tuple[slice, slice]]:
         """For each arm, where its position and its quaternion (xyzw) lie in the state."""
-        return [
-            (self.state_slice(f"robot{arm}_eef_pos"), self.state_slice(f"robot{arm}_eef_quat_site"))
-            for arm in range(self.arms)
-        ]
+        place = self.state_slice
+        return [(place(f"robot{i}_eef_pos"), place(f"robot{i}_eef_quat_site")) for i in range(self.arms)]
 
     def state_slice(self, key: str) -> slice:
         """Locate one of `state_keys` in the state."""
@@ -136,9 +132,8 @@ class RobosuiteTask(_Named):
         arms = {f"robot{i}_{name}": size for i in range(self.arms) for name, size in _OBSERVED.items()}
         sizes = {"object": self.object_dim, **arms}
         if not state_keys or not set(state_keys) <= sizes.keys() or len({*state_keys}) < len(state_keys):
-            raise ValueError(
-                f"state_keys: expected some of {', '.join(sizes)} for {self.name}, got {', '.join(state_keys) or 'none'}"
-            )
+            got = ", ".join(state_keys) or "none"
+            raise ValueError(f"state_keys: expected some of {', '.join(sizes)} for {self.name}, got {got}")
         return sum(sizes[key] for key in state_keys)
 
     def make(self, **kwargs: Any) -> EnvBase:

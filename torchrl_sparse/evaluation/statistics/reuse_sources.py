@@ -48,8 +48,8 @@ def source_similarity(features: Tensor, before: Tensor | None = None) -> Tensor:
         before: of the query before.
 
     >>> features = torch.tensor([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]], [[1.0, 1.0], [0.0, 1.0]]])
-    >>> source_similarity(features)[0].round(decimals=2).tolist()
-    [[0.0, 1.0], [0.0, 0.71], [0.0, 0.71]]
+    >>> (100 * source_similarity(features)[0]).round().int().tolist()
+    [[0, 100], [0, 71], [0, 71]]
     """
     kinds = len(BLOCK_TYPES)
     own, latest = torch.zeros_like(features), torch.zeros_like(features)

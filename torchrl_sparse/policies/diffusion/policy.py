@@ -85,16 +85,14 @@ class DiffusionPolicy(TensorDictSequential):
         plan: Planner | None = None,
         engine: EngineName = "auto",
     ):
-        sampler = Sampler() if sampler is None else sampler
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
             start=ColdStart(),
             plan=Dense(),
-            denoise=ActionDenoiser(network, normalizer, sampler, engine),
+            denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
         super().__init__(stages)
-        self.plan = plan  # binds it to this network and sampler
-        self.source: dict[str, Any] = {}
+        self.plan, self.source = plan, {}  # the plan is bound to this network and sampler
         self.eval()
 
     @property
