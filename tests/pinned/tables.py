@@ -86,15 +86,18 @@ def _sweep(path: Path) -> list[str]:
 
 
 def _episodes(folder: Path) -> list[str]:
-    """Tables of the logs that are long enough, numbers to more digits, and all methods against ddim10."""
+    """Tables of the logs that are long enough, numbers to more digits, and all methods against ddim10 or dense."""
     logs = {log.stem: build.episodes_of(log) for log in sorted(folder.glob("*.jsonl"))}
     made = []
     for count in _COUNTS:
         episodes = {name: log[:count] for name, log in logs.items() if len(log) >= count}
+        if "dense" not in episodes:
+            continue
+        other = "ddim10" if "ddim10" in episodes else "dense"
         results = build.results_of(episodes, like=build.load_results(folder.parent / "results.json"))
         made.append(build.format_table(results))
         made += [f"{name}: {_numbers(build.to_plain(method))}" for name, method in results.methods.items()]
-        made.append(build.format_pairs(episodes, [(name, "ddim10") for name in episodes]))
+        made.append(build.format_pairs(episodes, [(name, other) for name in episodes]))
     return made
 
 
