@@ -49,7 +49,8 @@ class TokenMethod:
         number: the argument of ``make`` that NAME@NUMBER sets; None where there is none.
         matches: whether NAME@METHOD may be written: its number is a share in (0, 1], of which more keeps more tokens.
         settings: the section of a benchmark's settings whose entries are further arguments of ``make``; None for none.
-        controller: returns what a `ChunkExecutor` runs at every step beside the policy; None for nothing.
+        controller: called with the section ``controller`` of the settings as keyword arguments; returns what a
+            `ChunkExecutor` runs at every step beside the policy. None for nothing.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
     """
 
@@ -57,7 +58,7 @@ class TokenMethod:
     number: str | None = None
     matches: bool = False
     settings: str | None = None
-    controller: Callable[[], TensorDictModuleBase] | None = None
+    controller: Callable[..., TensorDictModuleBase] | None = None
     color: str | None = None
 
 
@@ -72,7 +73,11 @@ def _static_specprune(**options: Any) -> SpecPrune:
 TOKEN_METHODS: dict[str, TokenMethod] = {
     "dense": TokenMethod(_dense, color="#333333"),
     "specprune": TokenMethod(
-        SpecPrune, "alpha", settings="specprune", controller=ActionAwareController, color="#009E73"
+        SpecPrune,
+        "alpha",
+        settings="specprune",
+        controller=ActionAwareController.from_options,
+        color="#009E73",
     ),
     "specprune_uncontrolled": TokenMethod(SpecPrune, "alpha", settings="specprune", color="#8C6BB1"),
     "specprune_static": TokenMethod(_static_specprune, "alpha", settings="specprune", color="#A6761D"),
@@ -161,10 +166,19 @@ def make_pruner(
     return TOKEN_METHODS[written.name].make(**arguments)
 
 
-def make_controller(text: str) -> TensorDictModuleBase | None:
-    """Return the controller of a method, None where it has none."""
+def make_controller(text: str, settings: Settings | None = None) -> TensorDictModuleBase | None:
+    """Return the controller of a method, None where it has none.
+
+    Args:
+        text: the method.
+        settings: with its arguments under ``controller``.
+
+    Examples:
+        >>> make_controller("specprune", {"controller": {"fine": 36.0}}).budgets
+        (24.0, 36.0)
+    """
     make = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
-    return None if make is None else make()
+    return None if make is None else make(**(settings or {}).get("controller", {}))
 
 
 def settings_of(text: str, settings: Settings | None) -> dict[str, Any]:
