@@ -27,6 +27,7 @@ from torchrl_sparse.evaluation.benchmarks.vla import (
     matched_number,
     matches_last,
     record_methods,
+    skipped_layers,
     token_settings,
 )
 from torchrl_sparse.evaluation.benchmarks.vla_measure import draw_methods, measure_methods
@@ -61,6 +62,9 @@ def main(config: DictConfig) -> None:
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}
     recorded = record_methods(methods, dense, make_env, **probed, settings=options)
+    if any(TokenMethodName.parse(name).name == "efficientvla_layers" for name in methods):
+        skipped = skipped_layers(dense, recorded["dense"], config.skipped_layers)
+        options["efficientvla"] = {"skipped": skipped}
 
     actors, numbers, played = {}, {}, {}
 

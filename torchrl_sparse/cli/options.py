@@ -129,7 +129,7 @@ OPTIONS: dict[str, Any] = {
     "workers": Count,
     "backend": Literal["process", "ray"],
     "suites": Words | None,
-    "task_id": Whole,
+    **dict.fromkeys(("task_id", "skipped_layers"), Whole),
     "quality": Word,
     "keep_failures": bool,
     # what is measured, and how

@@ -14,12 +14,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.tokens.base import TokenPruner
+from torchrl_sparse.tokens.dense_first import DenseFirst
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
@@ -66,8 +68,25 @@ def _dense() -> None:
     return None
 
 
-def _static_specprune(**options: Any) -> SpecPrune:
-    return SpecPrune(**{**options, "dynamic": False})
+def _without(ingredient: str, **options: Any) -> SpecPrune:
+    """Return `SpecPrune` without one of its ingredients, an option that is True or False."""
+    return SpecPrune(**{**options, ingredient: False})
+
+
+def _dense_first(make: Callable[..., TokenPruner], share: float = 0.5) -> DenseFirst:
+    return DenseFirst(make(share))
+
+
+def _ablation(ingredient: str, color: str) -> TokenMethod:
+    """Return SpecPrune, with its controller, without one of the three sets of Eq. 6."""
+    return TokenMethod(
+        partial(_without, ingredient),
+        "alpha",
+        matches=True,
+        settings="specprune",
+        controller=ActionAwareController.from_options,
+        color=color,
+    )
 
 
 TOKEN_METHODS: dict[str, TokenMethod] = {
@@ -80,16 +99,37 @@ TOKEN_METHODS: dict[str, TokenMethod] = {
         color="#009E73",
     ),
     "specprune_uncontrolled": TokenMethod(SpecPrune, "alpha", settings="specprune", color="#8C6BB1"),
-    "specprune_static": TokenMethod(_static_specprune, "alpha", settings="specprune", color="#A6761D"),
+    "specprune_static": TokenMethod(
+        partial(_without, "dynamic"), "alpha", settings="specprune", color="#A6761D"
+    ),
+    "specprune_no_carry": _ablation("carry", "#74A9CF"),
+    "specprune_no_changed": _ablation("changed", "#F46D43"),
+    "specprune_no_local": _ablation("local", "#3F2A8C"),
     "frame_difference": TokenMethod(FrameDifferencePruner, "share", matches=True, color="#B2182B"),
     "fastv": TokenMethod(FastVPruner, "share", matches=True, color="#4D4D4D"),
+    "fastv_scaled": TokenMethod(partial(FastVPruner, depth=32), "share", matches=True, color="#9E9AC8"),
+    "fastv_dense_first": TokenMethod(
+        partial(_dense_first, FastVPruner), "share", matches=True, color="#7A4B2A"
+    ),
     "random": TokenMethod(RandomPruner, "share", matches=True, color="#66A61E"),
+    "random_dense_first": TokenMethod(
+        partial(_dense_first, RandomPruner), "share", matches=True, color="#00441B"
+    ),
     "efficientvla": TokenMethod(EfficientVLAPruner, "share", matches=True, color="#E7298A"),
+    "efficientvla_dense_first": TokenMethod(
+        partial(_dense_first, EfficientVLAPruner), "share", matches=True, color="#FB9A99"
+    ),
+    "efficientvla_layers": TokenMethod(EfficientVLAPruner, "share", matches=True, settings="efficientvla"),
     "vla_cache": TokenMethod(VLACachePruner, "static_share", color="#1B7F79"),
     "sparsevlm": TokenMethod(SparseVLMPruner, "scale", color="#BCBD22"),
+    "sparsevlm_embeddings": TokenMethod(partial(SparseVLMPruner, raters="embeddings"), "scale"),
 }
 """Name -> method. ``specprune`` runs with the controller; ``specprune_uncontrolled`` (static and dynamic pruning) and
-``specprune_static`` are its ablations."""
+``specprune_static`` are its ablations, and so are, with the controller, those that lack one of the sets of Eq. 6.
+``..._dense_first`` leaves an episode's first query dense, as SpecPrune and frame difference do. ``fastv`` prunes after two
+layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``efficientvla`` is its half that is about tokens,
+``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the words that rate tokens in each layer,
+``sparsevlm_embeddings`` once, as the authors' release."""
 
 
 @dataclass(frozen=True)

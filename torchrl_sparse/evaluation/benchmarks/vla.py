@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
@@ -17,9 +18,10 @@ from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName,
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.budget import TokenBudget
+from torchrl_sparse.tokens.efficientvla import SIMILARITY, LayerSimilarity, redundant_layers
 from torchrl_sparse.tokens.selection import check_budget
 from torchrl_sparse.tokens.specprune import SpecPrune
-from torchrl_sparse.training.vla.token_budget import recorded_queries
+from torchrl_sparse.training.vla.token_budget import recorded_queries, replay
 
 __all__ = [
     "Recorded",
@@ -28,6 +30,7 @@ __all__ = [
     "matched_number",
     "matches_last",
     "record_methods",
+    "skipped_layers",
     "token_settings",
 ]
 
@@ -89,6 +92,12 @@ def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return {"specprune": dict(changes), "controller": dict(options["controller"])}
 
 
+def skipped_layers(dense: VLAPolicy, recorded: Recorded, count: int) -> list[int]:
+    """Return the decoder layers that change their input least on recorded queries, see `redundant_layers`."""
+    similarity = [replay(dense, queries, LayerSimilarity())[SIMILARITY] for queries in recorded]
+    return redundant_layers(torch.cat(similarity), count)
+
+
 def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) -> None:
     """Refuse methods whose controller grants more tokens than a model has, before any episode is played.
 
@@ -146,8 +155,14 @@ def matched_number(
     if written.like is None:
         return written.number
     kept = token_totals(episodes[written.like]).mean
+    budgets = getattr(make_controller(text, settings), "budgets", (1.0,))
+    fits = dense.network.config.visual_spec.per_camera / max(budgets)  # of an alpha, which multiplies them
     return matching_share(
-        lambda share: make_pruner(text, number=share, settings=settings), dense, recorded, kept
+        lambda share: make_pruner(text, number=share, settings=settings),
+        dense,
+        recorded,
+        kept,
+        most=min(1.0, fits),
     )
 
 

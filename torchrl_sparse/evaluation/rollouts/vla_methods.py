@@ -45,12 +45,16 @@ def matching_share(
     policy: VLAPolicy,
     episodes: Iterable[Sequence[TensorDictBase]],
     kept: float,
+    *,
+    most: float = 1.0,
 ) -> float:
     """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all queries.
 
     Args:
         make: called with a share in (0, 1]; more of it keeps more.
         episodes: their queries, as `recorded_queries` yields them.
+        kept: that many.
+        most: the largest share that is tried.
 
     Raises:
         ValueError: if even the smallest share keeps more.
@@ -61,7 +65,7 @@ def matching_share(
         answers = [replay(policy, queries, make(share)) for queries in episodes]
         return torch.cat([answer[keys.KEPT] for answer in answers]).mean().item()
 
-    low, high = 2.0**-_HALVINGS, 1.0
+    low, high = most * 2.0**-_HALVINGS, most
     if (least := keeps(low)) > kept:
         raise ValueError(
             f"expected a pruner that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
