@@ -66,10 +66,16 @@ def test_a_trial_is_on_disk_before_it_runs_and_runs_again_after_a_kill(tmp_path)
         again.finish(trial)
 
 
-def test_another_sweep_in_the_folder_is_refused(tmp_path):
-    LocalSweep(BAYES, tmp_path, count=2).next_trial()
-    with pytest.raises(ValueError, match=r"sweep.json: holds another sweep"):
-        LocalSweep({**BAYES, "method": "random"}, tmp_path, count=2)
+def test_another_sweep_in_the_folder_is_refused_once_a_trial_of_it_is_through(tmp_path):
+    failed = LocalSweep(BAYES, tmp_path, count=2).next_trial()
+    other = LocalSweep({**BAYES, "method": "random"}, tmp_path, count=2)
+    trial = other.next_trial()
+    assert other.trials == [trial] != [failed]
+    other.results_file(trial).parent.mkdir()
+    other.results_file(trial).touch()
+    other.finish(trial)
+    with pytest.raises(ValueError, match=r"sweep.json: holds another sweep: method is 'bayes' here and 'random'"):
+        LocalSweep(BAYES, tmp_path, count=2)
 
 
 def test_what_wandb_would_refuse_is_named(tmp_path):

@@ -99,7 +99,7 @@ class LocalSweep:
 
     Args:
         config: the sweep.
-        out: the folder; an earlier one of the same sweep is resumed.
+        out: the folder; an earlier one of the same sweep is resumed, another of which no trial finished is forgotten.
         count: trials in all; None runs until the engine has no more, as a grid does.
 
     Raises:
@@ -113,10 +113,12 @@ class LocalSweep:
             raise ValueError(f"count: expected a number of trials for method {config['method']!r}, got None")
         if self._file.exists():
             found = read_json(self._file, SavedSweep)
-            if found.config != to_plain(self.config):
-                differing = describe_differences(found.config, to_plain(self.config))
-                raise ValueError(f"{self._file}: holds another sweep: {differing}; choose another out")
-            self.trials = list(found.trials)
+            if not (differing := describe_differences(found.config, to_plain(self.config))):
+                self.trials = list(found.trials)
+            elif any(trial.finished for trial in found.trials):
+                raise ValueError(
+                    f"{self._file}: holds another sweep: {differing}; choose another out or move it away"
+                )
 
     @property
     def _file(self) -> Path:
