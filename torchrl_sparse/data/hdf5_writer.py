@@ -21,7 +21,7 @@ in the file                   shape, type            meaning
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,15 @@ def merge_episodes(
                 copy_attributes(source["demo"], data[name])
                 for child in source["demo"]:
                     source.copy(f"demo/{child}", data[name])
+
+
+def split_episodes(path: Path, part: Callable[[int], Path]) -> None:
+    """Undo `merge_episodes`: write each demonstration as the file ``part(seed)``, unless that is there."""
+    with h5py.File(path, "r") as source:
+        for demo in source["data"].values():
+            if not (episode := part(int(demo.attrs["seed"]))).exists():
+                with new_hdf5(episode) as file:
+                    source.copy(demo, file, "demo")
 
 
 def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:
