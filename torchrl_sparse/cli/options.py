@@ -44,8 +44,7 @@ OPTIONS: dict[str, Any] = {
     # what is done, on what, where to
     "task": Word,
     "policy": Word,
-    "benchmark_engine.policy": Word | None,
-    "libero_smoke.policy": Word | None,
+    **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy"), Word | None),
     "planners": Word,
     "demos": Word | None,
     "out": Word,
@@ -68,6 +67,7 @@ OPTIONS: dict[str, Any] = {
     # methods
     "method": Word,
     "methods": Words,
+    "benchmark.methods": Words | None,
     "benchmark_vla.methods": list[Word],  # none: dense alone
     "calibrate_bac.methods": Annotated[
         list[Literal["bac", "bac_blockwise", "bac_unified"]], Field(min_length=1)
