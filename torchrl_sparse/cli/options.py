@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
+from torchrl_sparse.runtime.devices import check_device
 from torchrl_sparse.storage.json import check_plain
 
 _PACKAGE = Path(__file__).parents[1]
@@ -142,8 +143,7 @@ OPTIONS: dict[str, Any] = {
     "quick": bool,
     "compile": bool,
     "batch": Count,
-    "cases": Annotated[list[Section], Field(min_length=1)],
-    "gpu_cases": Annotated[list[Section], Field(min_length=1)],
+    **dict.fromkeys(("cases", "gpu_cases"), Annotated[list[Section], Field(min_length=1)]),
     "shape": Word,
     "threads": Count | None,
     "thread_counts": Annotated[list[Annotated[int, Field(ge=1, le=64)]], Field(min_length=1)],
@@ -152,7 +152,7 @@ OPTIONS: dict[str, Any] = {
     "busy": Whole,
     "library": Word | None,
     "engine": Word,
-    "device": Word,
+    "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"],
     # cameras
     "cameras": Section,

@@ -139,7 +139,11 @@ def demonstrate(task: Task, env: EnvBase, seed: int, quality: str = "proficient"
         executed_actions=arrays["executed"],
         rewards=arrays["success"].astype(np.float64),
         dones=arrays["success"].astype(np.int64),
-        observations={key: arrays[_OBSERVED + key] for key in task.state_keys},
+        observations={
+            name.removeprefix(_OBSERVED): array
+            for name, array in arrays.items()
+            if name.startswith(_OBSERVED)
+        },
     )
 
 

@@ -14,7 +14,8 @@ in the file                   shape, type            meaning
                                                      rotation vector, rad; gripper, -1 open to 1 closed
 ``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
 ``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
-``obs/<key>``                 f64 [T, n]             observations before each action
+``obs/<key>``                 f64 [T, n]             observations before each action: the task's state and, of robosuite's
+                                                     tasks, ``robot<i>_eef_quat``, which published policies observe
 ============================  =====================  =========================================================
 """
 

@@ -204,6 +204,11 @@ class RobosuiteEnv(SeededEnv):
 
     # -- observations --------------------------------------------------------------------------------------------------
 
+    @property
+    def recorded_keys(self) -> tuple[str, ...]:
+        """What demonstrations record: the task's state, and the rotation of the hands' bodies, which published policies observe."""
+        return (*self.task.state_keys, *(f"robot{arm}_eef_quat" for arm in range(self.task.arms)))
+
     def raw_observation(self, state_keys: Sequence[str] | None = None) -> Mapping[str, np.ndarray]:
         """Return the parts of the task's state, or those of ``state_keys``, by robosuite's names, f64, in that order."""
         # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.

@@ -33,13 +33,14 @@ def finish(sweep, trial):
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
-def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials(path, tmp_path):
+def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials_in_any_folder(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     sweep = LocalSweep(read_sweep(path), tmp_path / path.stem)
     seen = set()
     while trial := sweep.next_trial():
         command = trial_command(sweep.config, trial)
         assert command[:2] == ["/usr/bin/env", "python"]
-        assert (path.parents[2] / command[2]).is_file()
+        assert Path(command[2]).is_file()
         assert not any(word.startswith("${") for word in command)
         options = dict(word.split("=", 1) for word in command if "=" in word)
         assert evaluation_seeds(options["split"], int(options["seed"]), 1)[0] == DEVELOPMENT_SEED
