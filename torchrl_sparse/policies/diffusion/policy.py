@@ -30,6 +30,7 @@ from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, c
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
+from torchrl_sparse.policies.diffusion.kinds import check_kinds
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 from torchrl_sparse.runtime.clock import synchronised_clock
@@ -136,6 +137,7 @@ class DiffusionPolicy(TensorDictSequential):
     def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
+        check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
         if (recalls := keys.RECALL in plan.out_keys) and start.name:
             raise ValueError(f"start: expected None with a planner that recalls, got {start.name}")
         start.bind(self.network, self.normalizer, sampler)
@@ -225,9 +227,7 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
-        self.plan.train(
-            self.plan.training
-        )  # a learned planner forgets what it keeps whenever its mode is set
+        self.plan.train(self.plan.training)  # whenever its mode is set, a learned planner forgets what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
