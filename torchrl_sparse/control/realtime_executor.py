@@ -37,6 +37,7 @@ class RealtimeExecutor(ChunkExecutor):
             share a measured time, so measured latencies want batches of one.
         control_freq: steps a second.
         controller: as for `ChunkExecutor`; not heard while an answer is awaited.
+        num_samples, selector: as for `ChunkExecutor`.
 
     Raises:
         ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
@@ -61,8 +62,10 @@ class RealtimeExecutor(ChunkExecutor):
         latency: float | None = None,
         control_freq: float = 20.0,
         controller: TensorDictModuleBase | None = None,
+        num_samples: int = 1,
+        selector: TensorDictModuleBase | None = None,
     ):
-        super().__init__(policy, n_action_steps, controller)
+        super().__init__(policy, n_action_steps, controller, num_samples=num_samples, selector=selector)
         if latency is not None and not (math.isfinite(latency) and latency >= 0):
             raise ValueError(f"latency: expected None or seconds >= 0, got {latency}")
         self.hold = hold

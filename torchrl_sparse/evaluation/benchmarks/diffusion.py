@@ -78,7 +78,10 @@ def measure_methods(
         threads: of PyTorch while timing.
     """
     with progress("latency", "round", repeats) as show:
-        latency = time_queries(methods, queries, repeats=repeats, threads=threads, on_round=show)
+        samples = {name: MethodName.parse(name).samples for name in methods}
+        latency = time_queries(
+            methods, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
+        )
     planning = time_planning(_adaptive(methods), queries, threads=threads)
     return {
         name: MethodRun(

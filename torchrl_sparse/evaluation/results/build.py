@@ -125,12 +125,16 @@ def build_results(
 
 
 def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms) -> MethodEntry:
-    cost, tokens = totals(run.episodes), token_totals(run.episodes)
+    cost, baseline, tokens = totals(run.episodes), totals(dense.episodes), token_totals(run.episodes)
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),
         prune_rate=cost.prune_rate,
-        flops=Flops(cost.flops_per_query, cost.flops_per_query / totals(dense.episodes).flops_per_query),
+        flops=Flops(
+            cost.flops_per_query,
+            cost.flops_per_query / baseline.flops_per_query,
+            cost.flops_per_step / baseline.flops_per_step,
+        ),
         latency_s=Percentiles.of(run.latency),
         speedup_vs_dense=dense.latency.p50 / run.latency.p50,
         speedup_ci95=_speedup_interval(run.latency, dense.latency),

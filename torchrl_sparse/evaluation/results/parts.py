@@ -156,10 +156,12 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class Flops:
-    """FLOPs of a query, and over those of a dense one."""
+    """FLOPs of a query, and over those of a dense one; over dense's an environment step too, where methods are not asked
+    equally often. None in files that were written before that was counted."""
 
     per_query: float
     ratio_to_dense: float
+    per_step_ratio: float | None = None
 
     def __post_init__(self) -> None:
         require(self.per_query >= 0, "per_query", "at least 0", self.per_query)

@@ -69,6 +69,7 @@ def _comparisons(results: Results) -> int:
 
 def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> dict[str, str]:
     error, baseline = method.action_error_vs_dense, name == DENSE
+    per_step = method.flops.per_step_ratio
     survives = survivors is None or f"{name} success" in survivors
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
     return {
@@ -81,6 +82,7 @@ def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> d
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
         "FLOPs ratio": f"{method.flops.ratio_to_dense:.3f}",
+        **({} if per_step is None else {"FLOPs ratio/step": f"{per_step:.3f}"}),
         "p50, ms": milliseconds_text(method.latency_s.p50),
         "p95, ms": milliseconds_text(method.latency_s.p95),
         "speed-up": f"{method.speedup_vs_dense:.2f}×",
