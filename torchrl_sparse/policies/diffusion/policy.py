@@ -31,7 +31,7 @@ from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -254,14 +254,14 @@ class DiffusionPolicy(TensorDictSequential):
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
         Raises:
-            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or there is a start,
-                which no file says; nothing is written.
+            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
+                None nor a `WarmStart`; nothing is written.
         """
-        if self.start.name:
-            raise ValueError(f"start: expected None in a policy that is saved, got {self.start.name}")
-        plan = save_beside(self.plan, Path(path))
-        stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
-        write_pretrained(Path(path), stored, half=half)
+        warm = stored_start(self.start)
+        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm
+        write_pretrained(
+            Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
+        )
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
@@ -270,7 +270,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler and planner; a ``.ckpt`` as `from_diffusion_policy` does.
+        """Read what `save_pretrained` wrote, with sampler, start and planner; a ``.ckpt`` as `from_diffusion_policy` does.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -297,4 +297,5 @@ class DiffusionPolicy(TensorDictSequential):
         options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
         policy = cls(stored.network, stored.normalizer, **options)
         policy.source = stored.source
+        policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
         return policy
