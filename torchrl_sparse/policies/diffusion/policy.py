@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
-from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
+from torchrl_sparse.blocks.engine.factory import EngineName
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.blocks.saved import load_planner, save_beside
@@ -26,7 +26,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.fingerprint import networks_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise, check_recalling
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
@@ -136,8 +136,8 @@ class DiffusionPolicy(TensorDictSequential):
     def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
-        if (recalls := keys.RECALL in plan.out_keys) and start.name:
-            raise ValueError(f"start: expected None with a planner that recalls, got {start.name}")
+        if recalls := keys.RECALL in plan.out_keys:
+            check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
@@ -208,13 +208,13 @@ class DiffusionPolicy(TensorDictSequential):
 
     @engine.setter
     def engine(self, name: EngineName) -> None:
-        self.module["denoise"].engine = EngineSlot(name)
+        self.module["denoise"].choose(name)
 
     def engine_info(self) -> str:
         """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why
         ``"auto"`` had to do without the native one. ValueError if the chosen engine cannot run this network here.
         """
-        return self.module["denoise"].engine.describe(self.network, self.sampler)
+        return self.module["denoise"].describe()
 
     describe = describe  # "observes the last 2 of\n  state, 19 numbers: …"
 
@@ -225,9 +225,8 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
-        self.plan.train(
-            self.plan.training
-        )  # a learned planner forgets what it keeps whenever its mode is set
+        # A learned planner forgets what it keeps whenever its mode is set.
+        self.plan.train(self.plan.training)
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
