@@ -89,6 +89,7 @@ def measure_methods(
             latency[name],
             error_to_dense(method, answer(method, queries), queries),
             planning.get(name),
+            MethodName.parse(name).every,
         )
         for name, method in methods.items()
     }

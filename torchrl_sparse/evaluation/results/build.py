@@ -48,12 +48,14 @@ class MethodRun:
         action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
             observations and the same noise; (0, 0) for the dense policy.
         planning: of the planner alone, within a query; where it looks at the observation.
+        every: environment steps from one query to the next, of a method that says so itself.
     """
 
     episodes: Sequence[EpisodeResult]
     latency: Latency
     action_error: tuple[float, float]
     planning: Latency | None = None
+    every: int | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def build_results(
     """
     if DENSE not in runs:
         raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
-    design = terms.design
+    design, uneven = terms.design, any(run.every for run in runs.values())
     return Results(
         SCHEMA,
         task,
@@ -118,23 +120,20 @@ def build_results(
         terms.episode_horizon,
         machine,
         policy,
-        {name: _entry(name, run, runs[DENSE], terms) for name, run in runs.items()},
+        {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
     )
 
 
-def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms) -> MethodEntry:
+def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven: bool) -> MethodEntry:
     cost, baseline, tokens = totals(run.episodes), totals(dense.episodes), token_totals(run.episodes)
+    per_step = cost.flops_per_step / baseline.flops_per_step if uneven else None
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),
         prune_rate=cost.prune_rate,
-        flops=Flops(
-            cost.flops_per_query,
-            cost.flops_per_query / baseline.flops_per_query,
-            cost.flops_per_step / baseline.flops_per_step,
-        ),
+        flops=Flops(cost.flops_per_query, cost.flops_per_query / baseline.flops_per_query, per_step),
         latency_s=Percentiles.of(run.latency),
         speedup_vs_dense=dense.latency.p50 / run.latency.p50,
         speedup_ci95=_speedup_interval(run.latency, dense.latency),

@@ -156,8 +156,8 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class Flops:
-    """FLOPs of a query, and over those of a dense one; over dense's an environment step too, where methods are not asked
-    equally often. None in files that were written before that was counted."""
+    """FLOPs of a query, and over those of a dense one; and those of an environment step over dense's, where some method of the
+    table is asked more or less often than the others."""
 
     per_query: float
     ratio_to_dense: float
