@@ -43,9 +43,7 @@ def test_build_computes_what_the_schema_promises():
     entry = results.methods["fast"]
     assert entry.success == Success(k=10, n=20, rate=0.5, ci95=wilson_interval(10, 20))
     assert entry.paired_vs_dense == Difference(-0.25, tango_interval(0, 5, 20), 0.1, "undecided")
-    assert entry.flops == Flops(
-        per_query=2.0, ratio_to_dense=0.2, per_step_ratio=pytest.approx(0.2 * 37.5 / 45)
-    )
+    assert entry.flops == Flops(per_query=2.0, ratio_to_dense=0.2)
     assert entry.latency_s == Percentiles(0.25, 0.25, 5)
     assert entry.speedup_vs_dense == 4.0
     assert entry.action_error_vs_dense == ActionError(0.1, 0.4)
@@ -55,6 +53,16 @@ def test_build_computes_what_the_schema_promises():
     assert max(share for steps, share in entry.success_within.items() if int(steps) < 30) == 0
     assert entry.speedup_ci95 == (4.0, 4.0)
     assert (results.schema, results.split, results.seed, results.first_seed) == (2, "test", 3, 210_003)
+
+
+def test_where_methods_are_not_asked_equally_often_flops_are_of_a_step_too():
+    dense, often = run([1] * 20), replace(run([1] * 20, queries=8, flops=2.0), every=2)
+    results = build({"dense": dense, "fast_every2": often})
+    assert results.methods["fast_every2"].flops == Flops(
+        per_query=2.0, ratio_to_dense=0.2, per_step_ratio=0.8
+    )
+    assert [row["FLOPs ratio/step"] for row in results_rows(results)] == ["1.000", "0.800"]
+    assert "FLOPs ratio/step" not in results_rows(build({"dense": dense}))[0]
 
 
 def test_visual_tokens_are_reported_where_there_are_any():
