@@ -21,7 +21,7 @@ demo: install
 		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 lint: install
 	$(BIN)/ruff check .

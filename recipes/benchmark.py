@@ -27,10 +27,11 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
 )
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
-from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, format_benchmark
+from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
 from torchrl_sparse.evaluation.figures.ways import plot_ways
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
+from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.results.ways import told_ways
@@ -90,6 +91,7 @@ def main(config: DictConfig) -> None:
         terms=terms,
         machine=describe_machine(threads=config.threads),
         policy=describe_policy(policy, config.n_action_steps),
+        pairs=config.pairs,
     )
     save_results(results, out / "results.json")
     draw_methods(results, methods, queries, calibration(), out)
@@ -103,7 +105,7 @@ def main(config: DictConfig) -> None:
         print(f"no video: {error}")
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
+    print(f"\n{format_table(results)}")
     print(f"\nFiles are in {out}")
 
 

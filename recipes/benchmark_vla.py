@@ -10,9 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
-from torchrl_sparse import keys
 from torchrl_sparse.cli.options import check_names
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
@@ -22,18 +20,20 @@ from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.film import film_tokens
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
-from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, error_to_dense, format_benchmark
+from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
 from torchrl_sparse.evaluation.benchmarks.vla import (
+    check_budgets,
+    filmed_methods,
     matched_number,
     matches_last,
-    replay_all,
-    time_methods,
+    record_methods,
+    skipped_layers,
+    token_settings,
 )
-from torchrl_sparse.evaluation.figures.curves import plot_success_within
-from torchrl_sparse.evaluation.figures.pareto import plot_pareto
-from torchrl_sparse.evaluation.figures.tokens import plot_tokens_per_layer
+from torchrl_sparse.evaluation.benchmarks.vla_measure import draw_methods, measure_methods
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
+from torchrl_sparse.evaluation.results.build import Terms, build_results
+from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
@@ -42,16 +42,17 @@ from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
 from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
-from torchrl_sparse.training.vla.token_budget import recorded_queries
 
 
 @recipe("benchmark_vla")
 def main(config: DictConfig) -> None:
-    out, options = Path(config.out), {"specprune": OmegaConf.to_container(config.specprune)}
-    methods = [*dict.fromkeys(["dense", *config.methods])]
+    out, methods = Path(config.out), [*dict.fromkeys(["dense", *config.methods])]
     check_names(config, TokenMethodName.parse)
     check_matches(methods)
+    filmed = filmed_methods(config.videos, methods)
+    options = token_settings(OmegaConf.to_container(config, resolve=True))
     dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
+    check_budgets(methods, dense.network.config.visual_spec, options)
     cameras = chosen_cameras(config.cameras)
     make_env = instructed_env(config.task, dense.network.config, cameras, config.horizon)
     design = make_design(config.until, config.episodes, config.max_episodes)
@@ -59,17 +60,19 @@ def main(config: DictConfig) -> None:
     early_cut = find_task(config.task).early_cut
     terms = Terms(design, episode_horizon(make_env), early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
-    probed = seeds[: config.probe_episodes]
-    recorded = recorded_queries(dense, ChunkExecutor(dense, config.n_action_steps), make_env, probed)
-    recorded = [*tqdm(recorded, total=len(probed), unit="episode", desc="recording")]
+    probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}
+    recorded = record_methods(methods, dense, make_env, **probed, settings=options)
+    if any(TokenMethodName.parse(name).name == "efficientvla_layers" for name in methods):
+        skipped = skipped_layers(dense, recorded["dense"], config.skipped_layers)
+        options["efficientvla"] = {"skipped": skipped}
 
     actors, numbers, played = {}, {}, {}
 
     def play(name: str, count: int) -> list[EpisodeResult]:
         if name not in actors:  # what it matches has been played
-            numbers[name] = matched_number(name, dense, recorded, played, options)
+            numbers[name] = matched_number(name, dense, recorded[name], played, options)
             policy = dense.with_pruner(make_pruner(name, number=numbers[name], settings=options))
-            actors[name] = ChunkExecutor(policy, config.n_action_steps, make_controller(name))
+            actors[name] = ChunkExecutor(policy, config.n_action_steps, make_controller(name, options))
         played[name] = evaluate(
             name,
             actors[name],
@@ -89,29 +92,24 @@ def main(config: DictConfig) -> None:
     policies = {name: actors[name].policy for name in methods}  # in the order asked for
 
     timing = {"repeats": config.latency_repeats, "threads": config.threads, "device": config.device}
-    latency = time_methods(policies, recorded, **timing)
-    answers = {name: replay_all(policy, recorded) for name, policy in policies.items()}
-    errors = {name: error_to_dense(dense, answers[name], answers["dense"]) for name in policies}
     results = build_results(
-        {name: MethodRun(episodes[name], latency[name], errors[name]) for name in policies},
+        measure_methods(policies, recorded, episodes, **timing),
         task=config.task,
         split=config.split,
         seed=config.seed,
         terms=terms,
         machine=describe_machine(config.device, config.threads),
         policy=describe_policy(dense, config.n_action_steps),
+        pairs=config.pairs,
+        settings={**options, "numbers": numbers, "probe_episodes": config.probe_episodes},
     )
     save_results(results, out / "results.json")
-    plot_pareto(results, out / "pareto.png")
-    plot_success_within(results, out / "success_within.png")
-    depth = {name: answer[keys.TOKEN_DEPTH].numpy(force=True) for name, answer in answers.items()}
-    plot_tokens_per_layer(depth, dense.network.config.llm.layers, out / "tokens_per_layer.png")
-    for name in config.videos:
-        if name in actors:
-            film_tokens(name, actors[name], make_env, seeds[0], out)
+    draw_methods(results, policies, recorded, out)
+    for video, name in filmed.items():
+        film_tokens(video, actors[name], make_env, seeds[0], out)
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_benchmark(results, episodes, config.pairs, config.margin)}")
+    print(f"\n{format_table(results)}")
     print(f"\nFiles are in {out}")
 
 

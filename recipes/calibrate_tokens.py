@@ -90,9 +90,9 @@ def demonstrations(config: DictConfig) -> InstructedDemonstrations:
 
 
 def executor(policy: VLAPolicy, config: DictConfig) -> ChunkExecutor:
-    return ChunkExecutor(
-        policy, config.n_action_steps, ActionAwareController() if config.controller else None
-    )
+    options = OmegaConf.to_container(config.controller) if config.controller else None
+    controller = None if options is None else ActionAwareController.from_options(**options)
+    return ChunkExecutor(policy, config.n_action_steps, controller)
 
 
 def seeds(config: DictConfig) -> range:

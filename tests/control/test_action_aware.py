@@ -20,6 +20,7 @@ from torchrl_sparse import (
 from torchrl_sparse.control.action_aware import (
     COMMANDED,
     MEASURED,
+    ReleaseThresholds,
     Thresholds,
     fine_mode,
     rotation_speed,
@@ -67,7 +68,54 @@ def test_one_slow_arm_enters_and_all_must_move_to_leave():
         assert fine_mode(twist, torch.tensor([[True]]), LIMITS).item() == stays
 
 
-@pytest.mark.parametrize("limits", [MEASURED, COMMANDED])
+def release_rule(action, was_fine, queue):
+    """The rule of the authors' release in plain numbers: action [6], and how many actions are left of the chunk."""
+    speed, planar = sum(x * x for x in action[:3]) ** 0.5, sum(x * x for x in action[:2]) ** 0.5
+    turn, rise = sum(x * x for x in action[3:]) ** 0.5, action[2]
+    if was_fine:
+        return not (rise > 0.2 or (turn > 0.3 and queue == 0))
+    return speed < 0.4 or (planar < 0.1 and rise < 0.1 and turn < 0.2)
+
+
+def test_the_release_has_another_rule():
+    generator = torch.Generator().manual_seed(0)
+    twist = torch.randn(2000, 1, 6, generator=generator) * torch.tensor([0.15, 0.15, 0.4, 0.2, 0.2, 0.2])
+    was, used_up = torch.rand(2, 2000, 1, generator=generator) < 0.5
+    fine = fine_mode(twist, was, COMMANDED, used_up)
+    rows = zip(twist[:, 0].tolist(), was.flatten().tolist(), used_up.flatten().tolist(), strict=True)
+    expected = [release_rule(action, before, queue=0 if last else 3) for action, before, last in rows]
+    assert fine.flatten().tolist() == expected
+    assert len({*zip(expected, was.flatten().tolist(), used_up.flatten().tolist(), strict=True)}) == 8
+    both = fine_mode(twist, torch.zeros_like(was), COMMANDED) & ~fine_mode(
+        twist, ~torch.zeros_like(was), COMMANDED
+    )
+    assert both.any()  # such motions alternate, as they do there
+
+
+def test_options_of_recipes_make_controllers():
+    thresholds = {
+        "translation": 0.1,
+        "rotation": 0.2,
+        "leave_translation": 0.3,
+        "leave_rotation": 0.4,
+        "leave_rise": 0.0,
+    }
+    controller = ActionAwareController.from_options(coarse=12, thresholds=thresholds)
+    assert controller.budgets == (12.0, 40.0)
+    assert controller.thresholds == Thresholds(**thresholds)
+    released = ActionAwareController.from_options(
+        motion="commanded", thresholds={"speed": 0.2}, chunk_steps=4
+    )
+    assert released.thresholds == ReleaseThresholds(speed=0.2)
+    with pytest.raises(
+        ValueError, match="controller: motion: expected 'measured' or 'commanded', got 'speed'"
+    ):
+        ActionAwareController.from_options(motion="speed")
+    with pytest.raises(ValueError, match="thresholds: expected Thresholds with on='measured'"):
+        ActionAwareController.from_options(thresholds={"speed": 0.2})
+
+
+@pytest.mark.parametrize("limits", [MEASURED, LIMITS])
 def test_no_motion_both_enters_and_leaves(limits):
     generator = torch.Generator().manual_seed(0)
     scale = torch.tensor([1.0, 1, 1, 2, 2, 2]) * 0.3

@@ -19,8 +19,27 @@ def test_names_make_pruners():
     assert make_pruner("fastv@specprune", number=0.125).share == 0.125
 
 
-def test_specprune_alone_runs_with_a_controller():
-    assert [name for name in TOKEN_METHODS if make_controller(name) is not None] == ["specprune"]
+def test_specprune_runs_with_a_controller_and_so_do_those_that_lack_one_of_its_sets():
+    controlled = [name for name in TOKEN_METHODS if make_controller(name) is not None]
+    lacking = {f"specprune_no_{name}": name for name in ("carry", "changed", "local")}
+    assert controlled == ["specprune", *lacking]
+    assert make_controller("specprune", {"controller": {"coarse": 9}}).budgets == (9, 40)
+    for name, ingredient in lacking.items():
+        options = make_pruner(f"{name}@0.3").options
+        assert {key: getattr(options, key) for key in lacking.values()} == {
+            key: key != ingredient for key in lacking.values()
+        }
+    check_matches(["specprune@0.2", "specprune_no_local@specprune@0.2"])
+
+
+def test_controls_are_made_as_they_are_named():
+    assert make_pruner("random_dense_first@0.25").inner.share == 0.25
+    assert make_pruner("fastv_dense_first").inner.layer == 2
+    assert make_pruner("fastv_scaled").layers_scored(8) == {0}
+    assert make_pruner("sparsevlm_embeddings@0.2").raters == "embeddings"
+    skipping = make_pruner("efficientvla_layers@0.5", settings={"efficientvla": {"skipped": [3, 4]}})
+    assert skipping.layers_skipped(8) == {3, 4}
+    assert make_pruner("efficientvla@0.5").layers_skipped(8) == set()
 
 
 @pytest.mark.parametrize(

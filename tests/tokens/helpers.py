@@ -8,6 +8,7 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
+from torchrl_sparse.tokens.dense_first import DenseFirst
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
@@ -30,6 +31,10 @@ PRUNERS = {
     "sparsevlm": SparseVLMPruner,
     "vla_cache": VLACachePruner,
     "efficientvla": lambda: EfficientVLAPruner(skipped=[3]),
+    "fastv_dense_first": lambda: DenseFirst(FastVPruner()),
+    "random_dense_first": lambda: DenseFirst(RandomPruner()),
+    "sparsevlm_dense_first": lambda: DenseFirst(SparseVLMPruner(raters="embeddings")),
+    "no_local": lambda: SpecPrune(budget=4, local=False),
     "random": RandomPruner,
     "frame_difference": FrameDifferencePruner,
 }
@@ -42,6 +47,10 @@ KEEP_ALL = {
     "sparsevlm": lambda: SparseVLMPruner(scale=1e-6),
     "vla_cache": lambda: VLACachePruner(threshold=2.0),
     "efficientvla": lambda: EfficientVLAPruner(share=1.0),
+    "fastv_dense_first": lambda: DenseFirst(FastVPruner(share=1.0)),
+    "random_dense_first": lambda: DenseFirst(RandomPruner(share=1.0)),
+    "sparsevlm_dense_first": lambda: DenseFirst(SparseVLMPruner(scale=1e-6, raters="embeddings")),
+    "no_local": lambda: SpecPrune(budget=PER_CAMERA, keep_share=1.0, local=False, threshold=2.0),
     "random": lambda: RandomPruner(share=1.0),
     "frame_difference": lambda: FrameDifferencePruner(share=1.0),
 }
@@ -100,7 +109,15 @@ class Recorder(TokenPruner):
     def __init__(self, inner):
         self.inner, self.seen = inner, []
         self.in_keys, self.out_keys = inner.in_keys, inner.out_keys
-        for name in ("bind", "layers_scored", "layers_skipped", "begin", "score_rows", "end"):
+        for name in (
+            "bind",
+            "layers_scored",
+            "layers_skipped",
+            "begin",
+            "before_layers",
+            "score_rows",
+            "end",
+        ):
             setattr(self, name, getattr(inner, name))
 
     def after_layer(self, index, state):

@@ -53,6 +53,24 @@ def test_static_pruning_alone_keeps_the_union_after_two_layers():
     assert set(depth.tolist()) == {2, LAYERS}
 
 
+@pytest.mark.parametrize("without", ["carry", "changed", "local"])
+def test_each_of_the_three_sets_can_be_left_out(without):
+    """What stays for good is the union of the other two."""
+    options = {"budget": 2, "dynamic": False, "threshold": 0.9}
+    first = make_policy(SpecPrune(**options))(query(1))
+    td = later(first, changed=[(0, 5), (1, 1)])
+    sets = {}
+    for only in ("carry", "changed", "local"):
+        alone = SpecPrune(**options, **{name: name == only for name in ("carry", "changed", "local")})
+        sets[only] = make_policy(alone)(td.clone())[keys.TOKEN_DEPTH] == LAYERS
+    assert sets["changed"].nonzero()[:, 1].tolist() == [5, PER_CAMERA + 1]
+    others = [chosen for name, chosen in sets.items() if name != without]
+    found = make_policy(SpecPrune(**options, **{without: False}))(td.clone())[keys.TOKEN_DEPTH] == LAYERS
+    assert torch.equal(found, others[0] | others[1])
+    with pytest.raises(ValueError, match="expected one of carry, changed and local, got none of them"):
+        SpecPrune(carry=False, changed=False, local=False)
+
+
 def test_first_query_of_an_episode_keeps_all_until_the_dynamic_layers():
     assert lengths(SpecPrune(budget=2, dynamic=False), query(1)) == [[2 * PER_CAMERA]] * LAYERS
 

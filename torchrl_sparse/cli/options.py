@@ -105,7 +105,7 @@ OPTIONS: dict[str, Any] = {
     "shares": list[Share],
     "measure": Word,
     "tolerance": NotNegative,
-    "controller": bool,
+    "controller": Section | None,
     # episodes
     "episodes": Count,
     "split": Literal["development", "test"],
@@ -129,7 +129,7 @@ OPTIONS: dict[str, Any] = {
     "workers": Count,
     "backend": Literal["process", "ray"],
     "suites": Words | None,
-    "task_id": Whole,
+    **dict.fromkeys(("task_id", "skipped_layers"), Whole),
     "quality": Word,
     "keep_failures": bool,
     # what is measured, and how
@@ -139,8 +139,7 @@ OPTIONS: dict[str, Any] = {
     "latency_repeats": Count,
     "repeats": Count,
     "warmup": Whole,
-    "quick": bool,
-    "compile": bool,
+    **dict.fromkeys(("quick", "compile", "calibrated"), bool),
     "batch": Count,
     "cases": Annotated[list[Section], Field(min_length=1)],
     "gpu_cases": Annotated[list[Section], Field(min_length=1)],
@@ -228,7 +227,7 @@ OPTIONS: dict[str, Any] = {
 }
 """Option, of one recipe alone after its name and a dot -> type. Of nested options the last word counts."""
 
-OPEN_SECTIONS = ("specprune", "options", "train_vla.network")
+OPEN_SECTIONS = ("specprune", "options", "controller", "train_vla.network")
 """Sections whose entries are those of a dataclass of the library, which checks them."""
 
 

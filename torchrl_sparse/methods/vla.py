@@ -14,12 +14,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.tokens.base import TokenPruner
+from torchrl_sparse.tokens.dense_first import DenseFirst
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
 from torchrl_sparse.tokens.fastv import FastVPruner
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
@@ -49,7 +51,8 @@ class TokenMethod:
         number: the argument of ``make`` that NAME@NUMBER sets; None where there is none.
         matches: whether NAME@METHOD may be written: its number is a share in (0, 1], of which more keeps more tokens.
         settings: the section of a benchmark's settings whose entries are further arguments of ``make``; None for none.
-        controller: returns what a `ChunkExecutor` runs at every step beside the policy; None for nothing.
+        controller: called with the section ``controller`` of the settings as keyword arguments; returns what a
+            `ChunkExecutor` runs at every step beside the policy. None for nothing.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
     """
 
@@ -57,7 +60,7 @@ class TokenMethod:
     number: str | None = None
     matches: bool = False
     settings: str | None = None
-    controller: Callable[[], TensorDictModuleBase] | None = None
+    controller: Callable[..., TensorDictModuleBase] | None = None
     color: str | None = None
 
 
@@ -65,26 +68,68 @@ def _dense() -> None:
     return None
 
 
-def _static_specprune(**options: Any) -> SpecPrune:
-    return SpecPrune(**{**options, "dynamic": False})
+def _without(ingredient: str, **options: Any) -> SpecPrune:
+    """Return `SpecPrune` without one of its ingredients, an option that is True or False."""
+    return SpecPrune(**{**options, ingredient: False})
+
+
+def _dense_first(make: Callable[..., TokenPruner], share: float = 0.5) -> DenseFirst:
+    return DenseFirst(make(share))
+
+
+def _ablation(ingredient: str, color: str) -> TokenMethod:
+    """Return SpecPrune, with its controller, without one of the three sets of Eq. 6."""
+    return TokenMethod(
+        partial(_without, ingredient),
+        "alpha",
+        matches=True,
+        settings="specprune",
+        controller=ActionAwareController.from_options,
+        color=color,
+    )
 
 
 TOKEN_METHODS: dict[str, TokenMethod] = {
     "dense": TokenMethod(_dense, color="#333333"),
     "specprune": TokenMethod(
-        SpecPrune, "alpha", settings="specprune", controller=ActionAwareController, color="#009E73"
+        SpecPrune,
+        "alpha",
+        settings="specprune",
+        controller=ActionAwareController.from_options,
+        color="#009E73",
     ),
     "specprune_uncontrolled": TokenMethod(SpecPrune, "alpha", settings="specprune", color="#8C6BB1"),
-    "specprune_static": TokenMethod(_static_specprune, "alpha", settings="specprune", color="#A6761D"),
+    "specprune_static": TokenMethod(
+        partial(_without, "dynamic"), "alpha", settings="specprune", color="#A6761D"
+    ),
+    "specprune_no_carry": _ablation("carry", "#74A9CF"),
+    "specprune_no_changed": _ablation("changed", "#F46D43"),
+    "specprune_no_local": _ablation("local", "#3F2A8C"),
     "frame_difference": TokenMethod(FrameDifferencePruner, "share", matches=True, color="#B2182B"),
     "fastv": TokenMethod(FastVPruner, "share", matches=True, color="#4D4D4D"),
+    "fastv_scaled": TokenMethod(partial(FastVPruner, depth=32), "share", matches=True, color="#9E9AC8"),
+    "fastv_dense_first": TokenMethod(
+        partial(_dense_first, FastVPruner), "share", matches=True, color="#7A4B2A"
+    ),
     "random": TokenMethod(RandomPruner, "share", matches=True, color="#66A61E"),
+    "random_dense_first": TokenMethod(
+        partial(_dense_first, RandomPruner), "share", matches=True, color="#00441B"
+    ),
     "efficientvla": TokenMethod(EfficientVLAPruner, "share", matches=True, color="#E7298A"),
+    "efficientvla_dense_first": TokenMethod(
+        partial(_dense_first, EfficientVLAPruner), "share", matches=True, color="#FB9A99"
+    ),
+    "efficientvla_layers": TokenMethod(EfficientVLAPruner, "share", matches=True, settings="efficientvla"),
     "vla_cache": TokenMethod(VLACachePruner, "static_share", color="#1B7F79"),
     "sparsevlm": TokenMethod(SparseVLMPruner, "scale", color="#BCBD22"),
+    "sparsevlm_embeddings": TokenMethod(partial(SparseVLMPruner, raters="embeddings"), "scale"),
 }
 """Name -> method. ``specprune`` runs with the controller; ``specprune_uncontrolled`` (static and dynamic pruning) and
-``specprune_static`` are its ablations."""
+``specprune_static`` are its ablations, and so are, with the controller, those that lack one of the sets of Eq. 6.
+``..._dense_first`` leaves an episode's first query dense, as SpecPrune and frame difference do. ``fastv`` prunes after two
+layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``efficientvla`` is its half that is about tokens,
+``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the words that rate tokens in each layer,
+``sparsevlm_embeddings`` once, as the authors' release."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +206,19 @@ def make_pruner(
     return TOKEN_METHODS[written.name].make(**arguments)
 
 
-def make_controller(text: str) -> TensorDictModuleBase | None:
-    """Return the controller of a method, None where it has none."""
+def make_controller(text: str, settings: Settings | None = None) -> TensorDictModuleBase | None:
+    """Return the controller of a method, None where it has none.
+
+    Args:
+        text: the method.
+        settings: with its arguments under ``controller``.
+
+    Examples:
+        >>> make_controller("specprune", {"controller": {"fine": 36.0}}).budgets
+        (24.0, 36.0)
+    """
     make = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
-    return None if make is None else make()
+    return None if make is None else make(**(settings or {}).get("controller", {}))
 
 
 def settings_of(text: str, settings: Settings | None) -> dict[str, Any]:

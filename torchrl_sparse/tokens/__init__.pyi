@@ -3,7 +3,12 @@ from .budget import (
     BudgetPoint as BudgetPoint,
     TokenBudget as TokenBudget,
 )
-from .efficientvla import EfficientVLAPruner as EfficientVLAPruner
+from .dense_first import DenseFirst as DenseFirst
+from .efficientvla import (
+    EfficientVLAPruner as EfficientVLAPruner,
+    LayerSimilarity as LayerSimilarity,
+    redundant_layers as redundant_layers,
+)
 from .fastv import FastVPruner as FastVPruner
 from .frame_difference import FrameDifferencePruner as FrameDifferencePruner
 from .random import RandomPruner as RandomPruner

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional
 
@@ -50,7 +51,7 @@ class EfficientVLAPruner(TokenPruner):
     Args:
         share: of all visual tokens that stay, in (0, 1].
         skipped: layers that are not run, none of the first two, whose attention is needed. The paper takes those whose output
-            is most similar to their input.
+            is most similar to their input, see `redundant_layers`. None of them is the half of the method that is about tokens.
         key_share: of the tokens that stay, those that are key tokens.
         relevant_share: of the others, those chosen by relevance; the rest are chosen for diversity.
     """
@@ -91,3 +92,51 @@ class EfficientVLAPruner(TokenPruner):
             state.scores, state.visual_features, state.visual_alive, count, key_count, self.relevant_share
         )
         return state.keep_visual(chosen)
+
+
+SIMILARITY = ("efficientvla", "similarity")
+_INPUT = ("efficientvla", "input")
+
+
+class LayerSimilarity(TokenPruner):
+    """Drops nothing, and says how little each layer changes: ``("efficientvla", "similarity")``, f32 [B, L].
+
+    It is the cosine between a token before and after the layer, mean over tokens. That of the first layer is not measured: 0.
+    """
+
+    out_keys = [SIMILARITY]
+
+    def bind(self, spec: VisualSpec) -> None:
+        self._num_layers = spec.num_layers
+
+    def begin(self, td: TensorDictBase) -> None:
+        td.set(SIMILARITY, torch.zeros(*td.batch_size, self._num_layers, device=td.device))
+
+    def after_layer(self, index: int, state: LayerState) -> None:
+        if index:
+            alike = functional.cosine_similarity(state.td.get(_INPUT).float(), state.hidden.float(), dim=-1)
+            alive = state.alive.float()
+            state.td.get(SIMILARITY)[:, index] = (alike * alive).sum(-1) / alive.sum(-1)
+        state.td.set(_INPUT, state.hidden)
+
+
+def redundant_layers(similarity: Tensor, count: int) -> list[int]:
+    """Return the ``count`` layers, none of the first two, that change their input least.
+
+    Args:
+        similarity: f32 [Q, L], what `LayerSimilarity` says of Q queries of the dense policy.
+        count: layers to skip.
+
+    Raises:
+        ValueError: if there are not so many.
+
+    Examples:
+        >>> redundant_layers(torch.tensor([[0.0, 0.9, 0.3, 0.8, 0.5]]), 2)
+        [3, 4]
+    """
+    mean = similarity.mean(0)
+    free = len(mean) - EfficientVLAPruner._LAYER - 1
+    if not 0 <= count <= free:
+        raise ValueError(f"expected 0 to {free} layers to skip, got {count}")
+    order = mean[-free:].argsort(descending=True, stable=True)[:count] + len(mean) - free
+    return sorted(order.tolist())

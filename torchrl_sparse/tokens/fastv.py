@@ -34,23 +34,26 @@ class FastVPruner(TokenPruner):
     Args:
         share: of all visual tokens that stay (the paper's 1 - R), in (0, 1].
         layer: layers that see every token (the paper's K).
+        depth: of the decoder that ``layer`` is meant for, 32 in the paper: it is scaled to the model's depth, at least 1. None
+            takes it as it is.
     """
 
-    def __init__(self, share: float = 0.5, layer: int = 2):
+    def __init__(self, share: float = 0.5, layer: int = 2, depth: int | None = None):
         check_share("share", share)
         if layer < 1:
             raise ValueError(f"layer: expected at least 1, got {layer}")
         self.share = share
-        self.layer = layer
+        self.layer, self.depth = layer, depth
 
     def bind(self, spec: VisualSpec) -> None:
-        if self.layer >= spec.num_layers:
-            raise ValueError(
-                f"layer: expected less than the model's {spec.num_layers} layers, got {self.layer}"
-            )
+        if (layer := self._scaled(spec.num_layers)) >= spec.num_layers:
+            raise ValueError(f"layer: expected less than the model's {spec.num_layers} layers, got {layer}")
+
+    def _scaled(self, num_layers: int) -> int:
+        return self.layer if self.depth is None else max(1, round(self.layer * num_layers / self.depth))
 
     def layers_scored(self, num_layers: int) -> set[int]:
-        return {self.layer - 1}
+        return {self._scaled(num_layers) - 1}
 
     def score_rows(self, state: LayerState) -> Tensor:
         return last_text_token(state.kind, state.alive)

@@ -7,6 +7,7 @@ the fewer. A merged token takes the place, and the position, of the token at the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import check_share, scaled_layers
 
 _DEPTH = 32
+_RATERS = ("sparsevlm", "raters")
 
 
 def text_raters(hidden: Tensor, is_visual: Tensor, is_text: Tensor) -> Tensor:
@@ -82,6 +84,11 @@ def merge(points: Tensor, cluster: Tensor, count: int) -> Tensor:
     return (member.T @ points) / member.sum(0)[:, None]
 
 
+def _raters(state: LayerState) -> Tensor:
+    text = state.alive & (state.kind == TokenKind.TEXT)
+    return text_raters(state.hidden, state.is_visual, text)
+
+
 class SparseVLMPruner(TokenPruner):
     """Drops and recycles visual tokens in several layers.
 
@@ -90,6 +97,11 @@ class SparseVLMPruner(TokenPruner):
         layers: after which to prune, in a decoder 32 deep; scaled to the model's depth.
         recycled: share of the dropped tokens, the best, that are merged.
         clusters: merged tokens, as a share of those.
+        raters: which words rate: ``"layer"`` chooses them anew in each of the ``layers``, from what reaches it;
+            ``"embeddings"``, as the authors' release, once and before the decoder.
+
+    Raises:
+        ValueError: for a share outside (0, 1], or other raters.
     """
 
     def __init__(
@@ -98,18 +110,27 @@ class SparseVLMPruner(TokenPruner):
         layers: Sequence[int] = (2, 6, 15),
         recycled: float = 0.3,
         clusters: float = 0.1,
+        raters: Literal["layer", "embeddings"] = "layer",
     ):
+        if raters not in ("layer", "embeddings"):
+            raise ValueError(f"raters: expected 'layer' or 'embeddings', got {raters!r}")
         for name, value in {"scale": scale, "recycled": recycled, "clusters": clusters}.items():
             check_share(name, value)
         self.scale, self.recycled, self.clusters = scale, recycled, clusters
-        self.layers = tuple(layers)
+        self.layers, self.raters = tuple(layers), raters
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return set(scaled_layers(self.layers, _DEPTH, num_layers))
 
+    def before_layers(self, state: LayerState) -> None:
+        if self.raters == "embeddings":  # kept by position, as the sequence becomes shorter
+            chosen = state.alive.new_zeros(len(state.alive), int(state.positions.max()) + 1)
+            state.td.set(_RATERS, chosen.scatter(1, state.positions, _raters(state) & state.alive))
+
     def score_rows(self, state: LayerState) -> Tensor:
-        text = state.alive & (state.kind == TokenKind.TEXT)
-        return text_raters(state.hidden, state.is_visual, text)
+        if self.raters == "embeddings":
+            return state.td.get(_RATERS).gather(1, state.positions) & state.alive
+        return _raters(state)
 
     def after_layer(self, index: int, state: LayerState) -> Tensor | None:
         if state.scores is None:

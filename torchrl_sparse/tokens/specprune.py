@@ -15,7 +15,8 @@ Eq.    function                          defines
 7      `layer_score`                     a token's importance in one layer
 8      `rank_weight`                     from the token's place in that layer
 9      `confidence`                      of the layer
-10     `updated_score`                   moving average over layers
+10     `updated_score`                   moving average over the layers that are scored: the first two, the dynamic ones
+                                         and those whose scores are carried, 0, 1, 5, 10, 15 and 20 of 32
 11, 12 `translation_speed`,              the controller, `control.action_aware`, which grants the budget
        `rotation_speed`
 ====== ================================= =============================================================================
@@ -121,7 +122,9 @@ class SpecPruneOptions:
         threshold: patches less similar than this (Eq. 2) have changed.
         static_share: None: what changed joins in up to the budget (Eq. 3). Else the release's rule: everything stays but the
             most similar patches, up to this share of a camera in coarse and in fine mode.
-        carry: use the last query's scores.
+        carry: use the last query's scores (the set V_global of Eq. 6).
+        changed: use what changed since the last query (V_dynamic).
+        local: use what this query's first two layers pick (V_local).
         early: None, or prune after the first layer as well, to so many times K.
         dynamic: prune in deeper layers.
         dynamic_layers, keep_share: where, and the share of the visual tokens that stays each time.
@@ -135,6 +138,8 @@ class SpecPruneOptions:
     threshold: float = 0.986
     static_share: tuple[float, float] | None = None
     carry: bool = True
+    changed: bool = True
+    local: bool = True
     early: float | None = None
     dynamic: bool = True
     dynamic_layers: tuple[int, ...] = (5, 10, 15, 20)
@@ -196,6 +201,10 @@ class SpecPrune(TokenPruner):
         self.options = replace(PRESETS[preset], **changes)
         for name in ("keep_share", "wrist_share", "beta"):
             check_share(name, getattr(self.options, name))
+        if not (self.options.carry or self.options.changed or self.options.local):
+            raise ValueError(
+                "expected one of carry, changed and local, got none of them, which would keep nothing"
+            )
         self.in_keys = [*FRAME_KEYS, keys.TOKEN_BUDGET]
         self.in_keys += [keys.FINE] if self.options.static_share else []
         self.in_keys += [keys.TOKEN_SCORE] if self.options.carry else []
@@ -237,6 +246,8 @@ class SpecPrune(TokenPruner):
         return best_per_camera(carried, counts, carried > 0)
 
     def _changed_set(self, td: TensorDictBase, alike: Tensor, counts: list[Tensor]) -> Tensor:
+        if not self.options.changed:
+            return torch.zeros_like(alike, dtype=torch.bool)
         if self.options.static_share is None:
             return dynamic_set(alike, counts, self.options.threshold)
         coarse, fine = (int(share * self.spec.per_camera) for share in self.options.static_share)
@@ -274,7 +285,7 @@ class SpecPrune(TokenPruner):
             local = layer_set(state.scores, [(self.options.early * count).long() for count in counts], alive)
         else:
             local = local_set(td.get(_FIRST), chosen)
-        return state.keep_visual(retain_set(td.get(_CARRIED), td.get(_CHANGED), local))
+        return state.keep_visual(retain_set(td.get(_CARRIED), td.get(_CHANGED), local & self.options.local))
 
     def _prune_further(self, state: LayerState) -> Tensor:
         """Return the ``keep_share`` of the living visual tokens with the highest running score."""

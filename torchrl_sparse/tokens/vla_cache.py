@@ -1,9 +1,14 @@
 """VLA-Cache: tokens that did not change are taken from the last query instead of being computed (Xu et al., arXiv:2502.02175).
 
 Nothing is dropped. A token is reused where its patch did not change and the instruction did not attend to it; the share of such
-tokens grows from layer to layer, the more, the more focused attention is. The authors keep keys and values; here it is the
-residual stream from which the next layer makes the same keys and values. The decoder computes those tokens all the same: this
-shows what reuse does to the actions, not what it saves. ``("tokens", "reused")`` says how many tokens a layer would be spared.
+tokens grows from layer to layer, the more, the more focused attention is.
+
+This emulates the method. The authors put the last query's keys and values in a layer's attention and compute nothing of a
+reused token. Here every token is computed, and what the last query left in the residual stream behind a layer is put in its
+place, from which the next layer makes its keys and values: a layer's reuse takes effect one layer later, and none in the first.
+Entropy and relevance are those of the last query, relevance that of one layer, the 15th of 32. So it shows what reuse does to
+the actions, not what it saves: FLOPs and time are those of a decoder that reuses nothing.
+``("tokens", "reused")`` says how many tokens a layer would be spared.
 """
 
 from __future__ import annotations

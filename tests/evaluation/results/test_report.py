@@ -6,6 +6,7 @@ import pytest
 from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
+from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
     Difference,
@@ -15,6 +16,7 @@ from torchrl_sparse.evaluation.results.parts import (
     TokensKept,
 )
 from torchrl_sparse.evaluation.results.report import format_pairs, format_table, results_rows
+from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
@@ -55,14 +57,12 @@ def test_build_computes_what_the_schema_promises():
     assert (results.schema, results.split, results.seed, results.first_seed) == (2, "test", 3, 210_003)
 
 
-def test_where_methods_are_not_asked_equally_often_flops_are_of_a_step_too():
+def test_where_methods_are_not_asked_equally_often_an_episode_says_what_they_cost():
     dense, often = run([1] * 20), replace(run([1] * 20, queries=8, flops=2.0), every=2)
     results = build({"dense": dense, "fast_every2": often})
-    assert results.methods["fast_every2"].flops == Flops(
-        per_query=2.0, ratio_to_dense=0.2, per_step_ratio=0.8
-    )
-    assert [row["FLOPs ratio/step"] for row in results_rows(results)] == ["1.000", "0.800"]
-    assert "FLOPs ratio/step" not in results_rows(build({"dense": dense}))[0]
+    assert results.methods["fast_every2"].per_episode.flops_per_step_to_dense == 0.8
+    assert [row["a second"] for row in results_rows(results)] == ["1.000", "0.800"]
+    assert "a second" not in results_rows(build({"dense": dense}))[0]
 
 
 def test_visual_tokens_are_reported_where_there_are_any():
@@ -197,3 +197,45 @@ def test_a_verdict_that_many_comparisons_explain_is_marked():
     assert alone["verdict"].startswith("non-inferior")
     assert among["verdict"] == alone["verdict"].replace("non-inferior", "non-inferior†", 1)
     assert "62 comparisons with dense" in format_table(build(many))
+
+
+def test_an_episode_of_more_queries_costs_more_of_them():
+    """A fifth of the FLOPs a query is saved; of an episode, which is twice as long, more than dense's are spent."""
+    dense = [EpisodeResult(i, True, 20, 5, 5 * 100.0, 0.0, kept=(8.0,) * 5) for i in range(4)]
+    pruned = [EpisodeResult(i, True, 40, 10, 10 * 80.0, 0.5, kept=(4.0,) * 10) for i in range(4)]
+    runs = {
+        "dense": MethodRun(dense, summarize_latency([1.0, 1.0]), (0.0, 0.0)),
+        "pruned": MethodRun(pruned, summarize_latency([0.9, 0.3]), (0.0, 0.0)),
+    }
+    results = build(runs)
+    cost = results.methods["pruned"].per_episode
+    assert (cost.queries, cost.flops, cost.flops_per_step) == (10, 800, 20)
+    assert (cost.flops_to_dense, cost.flops_per_step_to_dense) == (1.6, 0.8)
+    assert cost.seconds == pytest.approx(6.0)  # of the mean of what was timed
+    assert cost.seconds_to_dense == pytest.approx(1.2)
+    row = results_rows(results)[1]
+    assert [row[name] for name in ("an episode", "a second", "queries")] == ["1.600", "0.800", "10.0"]
+    assert build({"dense": run([1, 0])}).dense.per_episode is None
+
+
+def test_pairs_are_part_of_the_file(tmp_path):
+    dense, fast, slow = run([1] * 20), run([1, 1, 1, 0] * 5), run([1, 0, 0, 0] * 5)
+    runs = {"dense": dense, "fast": fast, "slow": slow}
+    results = build_results(
+        runs,
+        terms=Terms(Design(20), 60),
+        pairs=[["fast", "slow"]],
+        settings={"numbers": {"slow": 0.5}},
+        **ABOUT,
+    )
+    save_results(results, tmp_path / "results.json")
+    found = load_results(tmp_path / "results.json")
+    assert found == results
+    (pair,) = found.pairs
+    assert (pair.solved, pair.n, pair.success.diff) == ((15, 5), 20, 0.5)
+    assert pair.time.ratio == pytest.approx((15 * 30 + 5 * 60) / (5 * 30 + 15 * 60))
+    table = read_table(tmp_path / "results.json", "pairs")
+    assert (table.rows[0]["success"], table.rows[0]["against"]) == ("15 : 5", "slow")
+    assert "| fast     | slow      |    15 : 5 |" in format_table(found)
+    with pytest.raises(ValueError, match=r"pairs: expected two of dense, fast, slow, got \['fast', 'sag'\]"):
+        build_results(runs, terms=Terms(Design(20), 60), pairs=[["fast", "sag"]], **ABOUT)

@@ -19,7 +19,7 @@ from torchrl_sparse.envs.rendering import GL_HINT
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
     matching_share,
-    mid_episode_query,
+    prepared_queries,
     seen_images,
 )
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
@@ -54,17 +54,18 @@ def test_a_pruner_that_cannot_keep_so_few_is_refused():
         matching_share(FastVPruner, make_policy(), [episode(2)], 1.0)
 
 
-def test_a_query_in_mid_episode_remembers_those_before():
+def test_prepared_queries_remember_those_before():
     policy = make_policy(SpecPrune(alpha=0.2, budget=8))
     queries = episode()
-    prepared = mid_episode_query(policy, queries)
-    before = set(prepared.keys(True))
-    expected = replay(policy, queries, policy.pruner)[2]
-    for _ in range(2):  # asking leaves the query as it is
-        answered = answer(policy, prepared)
-        assert torch.equal(answered[keys.CHUNK], expected[keys.CHUNK])
-        assert torch.equal(answered[keys.TOKEN_DEPTH], expected[keys.TOKEN_DEPTH])
-    assert set(prepared.keys(True)) == before
+    prepared = prepared_queries(policy, queries)
+    before = [set(query.keys(True)) for query in prepared]
+    expected = replay(policy, queries, policy.pruner)
+    for _ in range(2):  # asking leaves the queries as they are
+        for index in (3, 0, 4, 2, 1):
+            answered = answer(policy, prepared[index])
+            assert torch.equal(answered[keys.CHUNK], expected[index][keys.CHUNK])
+            assert torch.equal(answered[keys.TOKEN_DEPTH], expected[index][keys.TOKEN_DEPTH])
+    assert [set(query.keys(True)) for query in prepared] == before
 
 
 def test_images_are_seen_as_the_network_crops_them():
@@ -105,13 +106,14 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
         tmp_path,
         methods,
         "pairs=[[specprune@0.2,fastv@specprune@0.2]]",
-        "videos=[specprune@0.2]",
+        "videos=[specprune]",
         "+specprune.keep_share=0.9",
     )
     if GL_HINT in done.stderr:
         pytest.skip(GL_HINT)
     assert done.returncode == 0, done.stderr[-3000:]
-    results = load_results(tmp_path / "results.json").methods
+    whole = load_results(tmp_path / "results.json")
+    results = whole.methods
     assert list(results) == ["dense", "specprune@0.2", "fastv@specprune@0.2"]
     kept = [method.tokens.kept_mean for method in results.values()]
     assert kept[0] == 32
@@ -120,9 +122,16 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
     assert results["specprune@0.2"].prune_rate == pytest.approx(1 - kept[1] / 32)
     assert results["dense"].action_error_vs_dense.max == 0
     assert "| specprune@0.2 | fastv@specprune@0.2 |" in done.stdout
-    for picture in ("pareto", "tokens_per_layer", "strip_specprune@0.2", "control_specprune@0.2"):
+    assert [(pair.method, pair.against, pair.n) for pair in whole.pairs] == [
+        ("specprune@0.2", "fastv@specprune@0.2", 2)
+    ]
+    assert whole.settings["specprune"] == {"keep_share": 0.9}
+    assert 0 < whole.settings["numbers"]["fastv@specprune@0.2"] < 1
+    cost = results["specprune@0.2"].per_episode
+    assert cost.flops == pytest.approx(cost.queries * results["specprune@0.2"].flops.per_query)
+    for picture in ("pareto", "tokens_per_layer", "strip_specprune", "control_specprune"):
         assert iio.imread(tmp_path / f"{picture}.png").std() > 5
-    frames = iio.imread(tmp_path / "rollout_specprune@0.2.mp4")
+    frames = iio.imread(tmp_path / "rollout_specprune.mp4")
     assert frames[:8].std() > 5
 
     log = tmp_path / "episodes" / "dense.jsonl"
@@ -137,6 +146,27 @@ def test_the_recipe_measures_draws_and_goes_on(policy_folder, tmp_path):
     assert again.returncode == 0, again.stderr[-3000:]
     assert read_episodes(log) == found
     assert sorted(found) == [100000, 100001]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["methods=[specprune@0.5]"],
+            "methods: specprune@0.5: alpha * budget: expected more than 0 and at most the model's 16 tokens per camera, got 20",
+        ),
+        (["methods=[fastv]", "videos=[specprune]"], "videos: expected one of dense, fastv, got 'specprune'"),
+        (
+            ["+controller.coarce=3", "methods=[specprune@0.1]"],
+            "controller: coarce: expected no such key, got 3",
+        ),
+    ],
+)
+def test_what_cannot_be_played_is_refused_before(policy_folder, tmp_path, options, message):
+    done = run(policy_folder, tmp_path, "pairs=[]", "videos=[]", *options)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not list(tmp_path.glob("episodes/*"))
 
 
 def test_a_reference_that_is_not_run_is_refused(policy_folder, tmp_path):

@@ -16,5 +16,4 @@ from .rounds import (
 from .summary import (
     describe_policy as describe_policy,
     error_to_dense as error_to_dense,
-    format_benchmark as format_benchmark,
 )

@@ -1,21 +1,16 @@
-"""The same for every benchmark: which policy it was of, how far a method is from dense, and what is printed at the end."""
+"""The same for every benchmark: which policy it was of, and how far a method is from dense."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 
 from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.results.parts import PolicyShape
-from torchrl_sparse.evaluation.results.report import format_pairs, format_table
-from torchrl_sparse.evaluation.results.schema import Results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.fidelity import action_error
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
-__all__ = ["describe_policy", "error_to_dense", "format_benchmark"]
+__all__ = ["describe_policy", "error_to_dense"]
 
 
 def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) -> PolicyShape:
@@ -50,25 +45,3 @@ def error_to_dense(
     """
     normalize = policy.normalizer.normalize_action
     return action_error(normalize(answers[keys.CHUNK]), normalize(dense_answers[keys.CHUNK]))
-
-
-def format_benchmark(
-    results: Results,
-    episodes: Mapping[str, Sequence[EpisodeResult]],
-    pairs: Sequence[Sequence[str]],
-    margin: float,
-) -> str:
-    """Return the table of all methods against dense and, if ``pairs`` are named, of one against another, in Markdown.
-
-    Args:
-        results: content of a ``results.json``.
-        episodes: method -> its episodes.
-        pairs, margin: see `format_pairs`.
-    """
-    table = format_table(results)
-    if not pairs:
-        return table
-    if results.until_decided is not None:  # methods may have stopped after different numbers of episodes
-        shared = set.intersection(*({episode.seed for episode in played} for played in episodes.values()))
-        episodes = {n: [e for e in played if e.seed in shared] for n, played in episodes.items()}
-    return f"{table}\n\n{format_pairs(episodes, pairs, margin)}"

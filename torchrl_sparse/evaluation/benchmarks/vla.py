@@ -1,30 +1,144 @@
-"""A benchmark of a vision-language-action policy: methods that match each other, and what is measured of all of them."""
+"""A benchmark of a vision-language-action policy: its methods, which may match each other, and the queries they are asked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
 
-from torchrl_sparse import keys
-from torchrl_sparse.control.queries import answer
-from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
-from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share, mid_episode_query
-from torchrl_sparse.methods.vla import Settings, TokenMethodName, make_pruner
+from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
+from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, make_controller, make_pruner
+from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.runtime.progress import progress
-from torchrl_sparse.training.vla.token_budget import replay
+from torchrl_sparse.tokens.budget import TokenBudget
+from torchrl_sparse.tokens.efficientvla import SIMILARITY, LayerSimilarity, redundant_layers
+from torchrl_sparse.tokens.selection import check_budget
+from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.training.vla.token_budget import recorded_queries, replay
 
-__all__ = ["matched_number", "matches_last", "replay_all", "time_methods"]
+__all__ = [
+    "Recorded",
+    "check_budgets",
+    "filmed_methods",
+    "matched_number",
+    "matches_last",
+    "record_methods",
+    "skipped_layers",
+    "token_settings",
+]
+
+Recorded = Sequence[Sequence[TensorDictBase]]
+"""The queries, each [], of dense episodes."""
+
+
+def record_methods(
+    texts: Iterable[str],
+    dense: VLAPolicy,
+    make_env: Callable[..., EnvBase],
+    seeds: Sequence[int],
+    *,
+    n_action_steps: int,
+    settings: Settings,
+) -> dict[str, Recorded]:
+    """Record the queries that each method is measured on: those of dense episodes under the method's own controller.
+
+    The controller asks for queries of its own where motion becomes fine, and grants each its budget; both are replayed with
+    it. Methods without one, and those with the same, share their episodes.
+
+    Args:
+        texts: of methods.
+        dense: the dense policy, which acts.
+        make_env: called as ``make_env(seeds=[seed])``.
+        seeds: of the episodes.
+        n_action_steps: actions of a chunk that are executed.
+        settings: see `make_controller`.
+    """
+    recorded, by_controller = {}, {}
+    for text in texts:
+        controller = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
+        if controller not in by_controller:
+            actor = ChunkExecutor(dense, n_action_steps, make_controller(text, settings))
+            episodes = recorded_queries(dense, actor, make_env, seeds)
+            by_controller[controller] = [*tqdm(episodes, total=len(seeds), unit="episode", desc="recording")]
+        recorded[text] = by_controller[controller]
+    return recorded
+
+
+def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the settings of pruners and controllers, see `make_pruner`, of a benchmark's options.
+
+    `SpecPrune` is as ``calibrate_tokens`` chose it for the policy, where no other fields are written.
+
+    Args:
+        options: with ``policy``, its folder; ``calibrated``, whether to read ``specprune.json`` in it, if there is one;
+            ``specprune``, fields of `SpecPruneOptions` that go before; and ``controller``, see `ControllerOptions`.
+
+    Examples:
+        >>> options = {"policy": "assets/vla", "calibrated": True, "specprune": {"keep_share": 0.9}, "controller": {}}
+        >>> token_settings(options)["specprune"]["alpha"]
+        0.17
+    """
+    path, changes = Path(options["policy"]) / "specprune.json", options["specprune"]
+    if options["calibrated"] and path.is_file():
+        budget = TokenBudget.from_pretrained(path)
+        changes = {"preset": budget.preset, "alpha": budget.alpha, **budget.options, **changes}
+    return {"specprune": dict(changes), "controller": dict(options["controller"])}
+
+
+def skipped_layers(dense: VLAPolicy, recorded: Recorded, count: int) -> list[int]:
+    """Return the decoder layers that change their input least on recorded queries, see `redundant_layers`."""
+    similarity = [replay(dense, queries, LayerSimilarity())[SIMILARITY] for queries in recorded]
+    return redundant_layers(torch.cat(similarity), count)
+
+
+def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) -> None:
+    """Refuse methods whose controller grants more tokens than a model has, before any episode is played.
+
+    Args:
+        texts: of methods; of those that match another's tokens the number is not known yet.
+        spec: of the model.
+        settings: see `make_pruner`.
+
+    Raises:
+        ValueError: naming the method.
+    """
+    for text in texts:
+        if TokenMethodName.parse(text).like is None and (pruner := make_pruner(text, settings=settings)):
+            budgets = getattr(make_controller(text, settings), "budgets", ())
+            for budget in budgets if isinstance(pruner, SpecPrune) else ():
+                check_budget(f"methods: {text}: alpha * budget", pruner.options.alpha * budget, spec)
+            pruner.bind(spec)
+
+
+def filmed_methods(videos: Iterable[str], methods: Sequence[str]) -> dict[str, str]:
+    """Return what to film: video -> method. A video is named as its method, or only as what is before the @.
+
+    Raises:
+        ValueError: if none or several of the methods are meant.
+
+    >>> filmed_methods(["dense", "specprune"], ["dense", "specprune@0.17", "fastv@specprune@0.17"])
+    {'dense': 'dense', 'specprune': 'specprune@0.17'}
+    """
+    filmed = {}
+    for video in videos:
+        meant = [name for name in methods if video in (name, TokenMethodName.parse(name).name)]
+        if video not in meant and len(meant) != 1:
+            raise ValueError(f"videos: expected one of {', '.join(methods)}, got {video!r}")
+        filmed[video] = video if video in meant else meant[0]
+    return filmed
 
 
 def matched_number(
     text: str,
     dense: VLAPolicy,
-    recorded: Sequence[Sequence[TensorDictBase]],
+    recorded: Recorded,
     episodes: Mapping[str, Sequence[EpisodeResult]],
     settings: Settings,
 ) -> float | None:
@@ -33,7 +147,7 @@ def matched_number(
     Args:
         text: the method, see `torchrl_sparse.methods.vla`.
         dense: the dense policy.
-        recorded: queries of dense episodes, see `recorded_queries`.
+        recorded: the method's queries, see `record_methods`.
         episodes: name -> episodes, those of the method that is matched among them.
         settings: see `make_pruner`.
     """
@@ -41,37 +155,17 @@ def matched_number(
     if written.like is None:
         return written.number
     kept = token_totals(episodes[written.like]).mean
+    budgets = getattr(make_controller(text, settings), "budgets", (1.0,))
+    fits = dense.network.config.visual_spec.per_camera / max(budgets)  # of an alpha, which multiplies them
     return matching_share(
-        lambda share: make_pruner(text, number=share, settings=settings), dense, recorded, kept
+        lambda share: make_pruner(text, number=share, settings=settings),
+        dense,
+        recorded,
+        kept,
+        most=min(1.0, fits),
     )
 
 
 def matches_last(texts: Iterable[str]) -> list[str]:
     """Return methods in the order in which they can run: those that match another after all others."""
     return sorted(texts, key=lambda text: TokenMethodName.parse(text).like is not None)
-
-
-def time_methods(
-    policies: Mapping[str, VLAPolicy],
-    recorded: Sequence[Sequence[TensorDictBase]],
-    *,
-    repeats: int,
-    threads: int,
-    device: str,
-) -> dict[str, Latency]:
-    """Time the middle query of the first recorded episode under each method, interleaved.
-
-    Args:
-        policies: name -> policy.
-        recorded: queries of dense episodes, see `recorded_queries`.
-        repeats, threads, device: see `measure_latency`.
-    """
-    calls = {name: partial(answer, p, mid_episode_query(p, recorded[0])) for name, p in policies.items()}
-    with progress("latency", "round", repeats) as show:
-        return measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=show)
-
-
-def replay_all(policy: VLAPolicy, recorded: Sequence[Sequence[TensorDictBase]]) -> TensorDictBase:
-    """Return the policy's answers to all queries of all episodes, [Q]: chunks, and how deep each token went."""
-    wanted = (keys.CHUNK, keys.TOKEN_DEPTH)
-    return torch.cat([replay(policy, queries, policy.pruner).select(*wanted) for queries in recorded])

@@ -145,12 +145,17 @@ class _Recorder(TokenPruner):
         for name in ("bind", "layers_scored", "layers_skipped", "end"):
             setattr(self, name, getattr(inner, name))
         self.start: TensorDictBase
+        self.embedded: LayerState
         self.scored: list[tuple[LayerState, Tensor]] = []
         self.answered: list[tuple[LayerState, Tensor | None]] = []
 
     def begin(self, td: TensorDictBase) -> None:
         self.start = td.clone(recurse=False)
         self.inner.begin(td)
+
+    def before_layers(self, state: LayerState) -> None:
+        self.embedded = replace(state)
+        self.inner.before_layers(state)
 
     def score_rows(self, state: LayerState) -> Tensor:
         rows = self.inner.score_rows(state)
@@ -167,6 +172,7 @@ class _Recorder(TokenPruner):
         """Do all of the pruner's own work."""
         td = self.start.clone(recurse=False)
         self.inner.begin(td)
+        self.inner.before_layers(replace(self.embedded, td=td))
         for state, _ in self.scored:
             self.inner.score_rows(replace(state, td=td))
         for state, _ in self.answered:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
     Difference,
+    EpisodeCost,
     Flops,
     Interval,
+    PairedEntry,
     Percentiles,
     PolicyShape,
     PValues,
@@ -34,7 +36,7 @@ from torchrl_sparse.evaluation.statistics.durations import (
 from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, paired_difference
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
-__all__ = ["MethodRun", "Terms", "build_results", "compare_episodes"]
+__all__ = ["MethodRun", "Terms", "build_results", "compare_episodes", "compare_pair"]
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,8 @@ def build_results(
     terms: Terms,
     machine: Machine,
     policy: PolicyShape,
+    pairs: Sequence[Sequence[str]] = (),
+    settings: Mapping[str, Any] | None = None,
 ) -> Results:
     """Make the content of ``results.json`` from what was measured.
 
@@ -105,9 +109,12 @@ def build_results(
         terms: of the comparisons.
         machine: see `describe_machine`.
         policy: the dense policy.
+        pairs: of methods that are compared with each other.
+        settings: what else the methods depend on, as JSON values.
 
     Raises:
-        ValueError: if dense is missing, methods ran on different seeds, or a value is out of range.
+        ValueError: if dense is missing, a pair is not two of the methods, methods ran on different seeds, or a value is out of
+            range.
     """
     if DENSE not in runs:
         raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
@@ -123,17 +130,19 @@ def build_results(
         {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
+        pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
+        settings=None if settings is None else dict(settings),
     )
 
 
 def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven: bool) -> MethodEntry:
-    cost, baseline, tokens = totals(run.episodes), totals(dense.episodes), token_totals(run.episodes)
-    per_step = cost.flops_per_step / baseline.flops_per_step if uneven else None
+    cost, tokens = totals(run.episodes), token_totals(run.episodes)
+    whole = uneven or tokens is not None  # a query does not say what an episode costs
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),
         prune_rate=cost.prune_rate,
-        flops=Flops(cost.flops_per_query, cost.flops_per_query / baseline.flops_per_query, per_step),
+        flops=Flops(cost.flops_per_query, cost.flops_per_query / totals(dense.episodes).flops_per_query),
         latency_s=Percentiles.of(run.latency),
         speedup_vs_dense=dense.latency.p50 / run.latency.p50,
         speedup_ci95=_speedup_interval(run.latency, dense.latency),
@@ -141,6 +150,67 @@ def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven:
         episode_length=cost.episode_length,
         planning_s=None if run.planning is None else Percentiles.of(run.planning),
         tokens=None if tokens is None else TokensKept(tokens.mean, tokens.fine, tokens.coarse),
+        per_episode=_episode_cost(run, dense) if whole else None,
+    )
+
+
+def _episode_cost(run: MethodRun, dense: MethodRun) -> EpisodeCost:
+    """Compare an episode's cost with that of dense's episodes on the same seeds."""
+    seeds = {episode.seed for episode in run.episodes}
+    paired = replace(dense, episodes=[episode for episode in dense.episodes if episode.seed in seeds])
+    ours, theirs = _spent(run), _spent(paired)
+    ratios = {
+        f"{name}_to_dense": ours[name] / theirs[name] for name in ("flops", "flops_per_step", "seconds")
+    }
+    return EpisodeCost(**ours, **ratios)
+
+
+def _spent(run: MethodRun) -> dict[str, float]:
+    cost, latency = totals(run.episodes), run.latency
+    queries = cost.queries / len(run.episodes)
+    flops = queries * cost.flops_per_query
+    second = sum(latency.samples) / len(latency.samples) if latency.samples else latency.p50
+    return {
+        "queries": queries,
+        "flops": flops,
+        "flops_per_step": flops / cost.episode_length,
+        "seconds": queries * second,
+    }
+
+
+def _pair(names: Sequence[str], runs: Mapping[str, MethodRun], terms: Terms) -> PairedEntry:
+    if len(names) != 2 or not set(names) <= set(runs):
+        raise ValueError(f"pairs: expected two of {', '.join(runs)}, got {list(names)}")
+    first, second = (runs[name].episodes for name in names)
+    if terms.design.looks > 1:  # methods may have stopped after different numbers of episodes
+        shared = {episode.seed for episode in first} & {episode.seed for episode in second}
+        first, second = ([e for e in episodes if e.seed in shared] for episodes in (first, second))
+    return compare_pair(names[0], first, names[1], second, terms)
+
+
+def compare_pair(
+    method: str,
+    episodes: Sequence[EpisodeResult],
+    against: str,
+    others: Sequence[EpisodeResult],
+    terms: Terms,
+) -> PairedEntry:
+    """Compare two methods, neither of which need be dense, by the protocol of all comparisons with dense.
+
+    Args:
+        method, against: their names.
+        episodes, others: theirs, on the same seeds.
+        terms: of the comparison.
+
+    Raises:
+        ValueError: if the seeds differ.
+    """
+    pairs, horizon = pair_episodes(method, episodes, against, others), terms.episode_horizon
+    solved = paired_difference(*pairs.solved, terms.margin)
+    times = time_ratio(*pairs.times(horizon), horizon, terms.time_margin)
+    counts = tuple(map(sum, pairs.solved))
+    return PairedEntry(
+        method, against, counts, len(pairs.method), Difference.of(solved), TimeDifference.of(times)
     )
 
 

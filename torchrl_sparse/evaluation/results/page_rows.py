@@ -10,7 +10,7 @@ from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_agg
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
-from torchrl_sparse.evaluation.results.report import pair_rows, results_rows
+from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.results.text import percent_text
@@ -74,10 +74,16 @@ def _results(path: Path) -> dict[str, Table]:
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
     methods = _table(results.task, whole, len(rows[0]))
+    pairs = results.pairs if isinstance(results, Results) else None
+    compared = {"pairs": _table(results.task, comparison_rows(pairs))} if pairs else {}
     if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
-        return {"methods": methods}
+        return {"methods": methods} | compared
     chosen = {"headline": headline_rows(results), "budgets": budget_rows(results)}
-    return {"methods": methods} | {name: _table(results.task, of_one) for name, of_one in chosen.items()}
+    return (
+        {"methods": methods}
+        | compared
+        | {name: _table(results.task, of_one) for name, of_one in chosen.items()}
+    )
 
 
 def _more(results: AnyResults, name: str) -> Row:

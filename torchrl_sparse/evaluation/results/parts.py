@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_sparse.evaluation.latency.measure import Latency
@@ -14,9 +14,11 @@ from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Ver
 __all__ = [
     "ActionError",
     "Difference",
+    "EpisodeCost",
     "Flops",
     "Interval",
     "PValues",
+    "PairedEntry",
     "Percentiles",
     "PolicyShape",
     "Success",
@@ -156,16 +158,65 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class Flops:
-    """FLOPs of a query, and over those of a dense one; and those of an environment step over dense's, where some method of the
-    table is asked more or less often than the others."""
+    """FLOPs of a query, and over those of a dense one."""
 
     per_query: float
     ratio_to_dense: float
-    per_step_ratio: float | None = None
 
     def __post_init__(self) -> None:
         require(self.per_query >= 0, "per_query", "at least 0", self.per_query)
         require(self.ratio_to_dense >= 0, "ratio_to_dense", "at least 0", self.ratio_to_dense)
+
+
+@dataclass(frozen=True)
+class EpisodeCost:
+    """What an episode costs, mean over episodes. A method that saves of a query may lose it again in longer episodes.
+
+    Attributes:
+        queries: calls of the policy.
+        flops: of all of them.
+        flops_to_dense: those over dense's.
+        flops_per_step: of an environment step, mean; times the control frequency, those of a second of motion.
+        flops_per_step_to_dense: those over dense's.
+        seconds: of all queries, each as long as the mean of those that were timed.
+        seconds_to_dense: those over dense's.
+    """
+
+    queries: float
+    flops: float
+    flops_to_dense: float
+    flops_per_step: float
+    flops_per_step_to_dense: float
+    seconds: float
+    seconds_to_dense: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            require(0 <= value < math.inf, field.name, "a finite number >= 0", value)
+
+
+@dataclass(frozen=True)
+class PairedEntry:
+    """One method against another, neither of them dense, on the same seeds.
+
+    Attributes:
+        method, against: their names.
+        solved: episodes that each of them solved.
+        n: episodes of each.
+        success: of the first minus that of the second.
+        time: restricted mean time of the first over that of the second.
+    """
+
+    method: str
+    against: str
+    solved: tuple[int, int]
+    n: int
+    success: Difference
+    time: TimeDifference
+
+    def __post_init__(self) -> None:
+        require(all(0 <= k <= self.n for k in self.solved), "solved", f"0 to {self.n}", self.solved)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
-from torchrl_sparse.evaluation.results.parts import Difference, TokensKept
+from torchrl_sparse.evaluation.results.parts import Difference, EpisodeCost, PairedEntry, TokensKept
 from torchrl_sparse.evaluation.results.schema import (
     DENSE,
     AnyResults,
@@ -17,7 +17,6 @@ from torchrl_sparse.evaluation.results.text import (
     count_text,
     difference_text,
     milliseconds_text,
-    points_text,
     ratio_text,
     threads_text,
     verdict_text,
@@ -33,6 +32,7 @@ from torchrl_sparse.evaluation.statistics.intervals import (
 from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
 __all__ = [
+    "comparison_rows",
     "format_pairs",
     "format_table",
     "pair_rows",
@@ -43,7 +43,10 @@ __all__ = [
 
 def format_table(results: AnyResults) -> str:
     """Return the table of a benchmark, as Markdown that also lines up in a terminal, and the lines that explain it."""
-    return f"{markdown_table(results_rows(results))}\n\n{results_note(results)}"
+    table = f"{markdown_table(results_rows(results))}\n\n{results_note(results)}"
+    if not isinstance(results, Results) or not results.pairs:
+        return table
+    return f"{table}\n\n{markdown_table(comparison_rows(results.pairs))}"
 
 
 def results_rows(results: AnyResults) -> list[dict[str, str]]:
@@ -69,7 +72,6 @@ def _comparisons(results: Results) -> int:
 
 def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> dict[str, str]:
     error, baseline = method.action_error_vs_dense, name == DENSE
-    per_step = method.flops.per_step_ratio
     survives = survivors is None or f"{name} success" in survivors
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
     return {
@@ -82,7 +84,7 @@ def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> d
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
         "FLOPs ratio": f"{method.flops.ratio_to_dense:.3f}",
-        **({} if per_step is None else {"FLOPs ratio/step": f"{per_step:.3f}"}),
+        **(_episode_cells(getattr(method, "per_episode", None))),
         "p50, ms": milliseconds_text(method.latency_s.p50),
         "p95, ms": milliseconds_text(method.latency_s.p95),
         "speed-up": f"{method.speedup_vs_dense:.2f}×",
@@ -101,6 +103,18 @@ def _time_cells(name: str, method: MethodEntry, survivors: Collection[str]) -> d
         "time vs dense": ratio_text(method.time_vs_dense),
         "time verdict": verdict_text(method.time_vs_dense, f"{name} time" in survivors),
         "correlation": "" if correlation is None else f"{correlation:.2f}",
+    }
+
+
+def _episode_cells(cost: EpisodeCost | None) -> dict[str, str]:
+    """Return what an episode and a step cost beside dense's; nothing of a file that does not say."""
+    if cost is None:
+        return {}
+    return {
+        "an episode": f"{cost.flops_to_dense:.3f}",
+        "a second": f"{cost.flops_per_step_to_dense:.3f}",
+        "queries": f"{cost.queries:.1f}",
+        "time, an episode": f"{cost.seconds_to_dense:.3f}",
     }
 
 
@@ -147,13 +161,29 @@ def _pair_row(
         raise ValueError(f"pairs: expected two of {', '.join(episodes)}, got {list(pair)}")
     pairs = pair_episodes(pair[0], episodes[pair[0]], pair[1], episodes[pair[1]])
     ours, theirs = pairs.solved
-    paired = paired_difference(ours, theirs, margin)
+    difference = Difference.of(paired_difference(ours, theirs, margin))
+    return _success_cells(pair, (sum(ours), sum(theirs)), difference)
+
+
+def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:
+    """Return the rows of the table of a file's pairs, with times: column -> text."""
+    return [
+        {
+            **_success_cells((pair.method, pair.against), pair.solved, pair.success),
+            "time ratio": ratio_text(pair.time),
+            "time verdict": verdict_text(pair.time),
+        }
+        for pair in pairs
+    ]
+
+
+def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Difference) -> dict[str, str]:
     return {
         "method": pair[0],
         "against": pair[1],
-        "success": f"{sum(ours)} : {sum(theirs)}",
-        "difference, points": points_text(paired.diff, paired.ci),
-        "verdict": verdict_text(Difference.of(paired)),
+        "success": f"{solved[0]} : {solved[1]}",
+        "difference, points": difference_text(difference),
+        "verdict": verdict_text(difference),
     }
 
 
@@ -177,6 +207,11 @@ def results_note(results: AnyResults) -> str:
         f"{machine.cpu}, {machine.device}, {threads_text(machine.threads)}, torch {machine.torch}, "
         f"{machine.date[:10]}.",
     ]
+    if any(getattr(method, "per_episode", None) for method in results.methods.values()):
+        lines.append(
+            "FLOPs ratio is that of a query; beside it that of *an episode*, whose length methods change, and of *a second* of "
+            "motion. Queries are those of an episode, *time, an episode* the seconds that all of them take, over dense's."
+        )
     if planning := ", ".join(_planning(results.methods)):
         lines.append(f"Planning takes, of that and measured within queries, {planning}.")
     if n < episodes_needed(margin):

@@ -17,8 +17,10 @@ from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
     Difference,
+    EpisodeCost,
     Flops,
     Interval,
+    PairedEntry,
     Percentiles,
     PolicyShape,
     PValues,
@@ -96,6 +98,8 @@ class MethodEntry(MethodEntry1):
         correlation_with_dense: Pearson's, of times over the seeds; None also where times never differ.
         p_values: of the two verdicts.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement.
+        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, and where methods are not asked
+            equally often.
     """
 
     restricted_mean_time: float | None = None
@@ -104,6 +108,7 @@ class MethodEntry(MethodEntry1):
     correlation_with_dense: float | None = None
     p_values: PValues | None = None
     speedup_ci95: Interval | None = None
+    per_episode: EpisodeCost | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -182,6 +187,9 @@ class Results(_Methods):
         methods: name -> entry.
         early_cut: steps of the task's pre-registered early cut; None for a task without one.
         until_decided: where methods have as many episodes as their verdicts took; None where all have the same.
+        pairs: methods against each other; None where none were asked for.
+        settings: what else the methods depend on, such as the options of pruners and controllers, and the shares at which
+            methods match another's tokens; None in older files.
     """
 
     schema: Literal[2]
@@ -194,9 +202,14 @@ class Results(_Methods):
     methods: dict[str, MethodEntry]
     early_cut: int | None = None
     until_decided: Stopping | None = None
+    pairs: tuple[PairedEntry, ...] | None = None
+    settings: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         self._check_methods(same_episodes=self.until_decided is None)
+        for pair in self.pairs or ():
+            known = {pair.method, pair.against} <= self.methods.keys()
+            require(known, "pairs", f"two of {', '.join(self.methods)}", [pair.method, pair.against])
 
     @property
     def first_seed(self) -> int:

@@ -55,14 +55,12 @@ class Totals:
 
     Attributes:
         flops_per_query: FLOPs (2 * MAC).
-        flops_per_step: the same, of an environment step.
         prune_rate: mean over queries, in [0, 1].
         episode_length: mean environment steps.
         queries: number of queries.
     """
 
     flops_per_query: float
-    flops_per_step: float
     prune_rate: float
     episode_length: float
     queries: int
@@ -87,18 +85,15 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
         ValueError: if there are no episodes or no query.
 
     >>> totals([EpisodeResult(0, True, 8, 1, 10.0, 0.5), EpisodeResult(1, True, 24, 3, 90.0, 0.9)])
-    Totals(flops_per_query=25.0, flops_per_step=3.125, prune_rate=0.8, episode_length=16.0, queries=4)
+    Totals(flops_per_query=25.0, prune_rate=0.8, episode_length=16.0, queries=4)
     """
     queries = sum(episode.queries for episode in episodes)
     if queries == 0:
         raise ValueError(f"expected at least one query of the policy, got none in {len(episodes)} episodes")
-    flops = sum(episode.flops_total for episode in episodes)
-    steps = sum(episode.length for episode in episodes)
     return Totals(
-        flops_per_query=flops / queries,
-        flops_per_step=flops / steps,
+        flops_per_query=sum(episode.flops_total for episode in episodes) / queries,
         prune_rate=sum(episode.prune_rate * episode.queries for episode in episodes) / queries,
-        episode_length=steps / len(episodes),
+        episode_length=sum(episode.length for episode in episodes) / len(episodes),
         queries=queries,
     )
 

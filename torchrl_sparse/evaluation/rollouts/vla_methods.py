@@ -1,4 +1,4 @@
-"""The methods of a vision-language-action benchmark on the same queries: matched in tokens, asked in mid-episode."""
+"""The methods of a vision-language-action benchmark on recorded queries: matched in tokens, asked one after the other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import replay
 
-__all__ = ["matching_share", "method_identity", "mid_episode_query", "seen_images"]
+__all__ = ["matching_share", "method_identity", "prepared_queries", "seen_images"]
 
 _HALVINGS = 10
 
@@ -32,8 +32,11 @@ def method_identity(text: str, number: float | None, policy: VLAPolicy, settings
         settings: sections that its pruner was made with.
     """
     identity = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
-    if TOKEN_METHODS[TokenMethodName.parse(text).name].settings is not None:
+    method = TOKEN_METHODS[TokenMethodName.parse(text).name]
+    if method.settings is not None:
         identity["options"] = settings_of(text, settings)
+    if method.controller is not None:
+        identity["controller"] = dict(settings.get("controller", {}))
     return identity
 
 
@@ -42,12 +45,16 @@ def matching_share(
     policy: VLAPolicy,
     episodes: Iterable[Sequence[TensorDictBase]],
     kept: float,
+    *,
+    most: float = 1.0,
 ) -> float:
     """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all queries.
 
     Args:
         make: called with a share in (0, 1]; more of it keeps more.
         episodes: their queries, as `recorded_queries` yields them.
+        kept: that many.
+        most: the largest share that is tried.
 
     Raises:
         ValueError: if even the smallest share keeps more.
@@ -58,7 +65,7 @@ def matching_share(
         answers = [replay(policy, queries, make(share)) for queries in episodes]
         return torch.cat([answer[keys.KEPT] for answer in answers]).mean().item()
 
-    low, high = 2.0**-_HALVINGS, 1.0
+    low, high = most * 2.0**-_HALVINGS, most
     if (least := keeps(low)) > kept:
         raise ValueError(
             f"expected a pruner that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
@@ -70,13 +77,12 @@ def matching_share(
 
 
 @torch.no_grad()
-def mid_episode_query(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> TensorDictBase:
-    """Return the middle one of an episode's queries, [], with what the policy remembers of those before."""
-    last = len(queries) // 2
-    answers = replay(policy, queries[: last + 1], policy.pruner)
+def prepared_queries(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+    """Return an episode's queries, each [], with what the policy remembers of the one before: each can be asked by itself."""
     remembered = [key for key in policy.out_keys if key in policy.in_keys]
-    query = queries[last].exclude(*remembered)
-    return query.update(answers[last - 1].select(*remembered)) if last else query
+    left = replay(policy, queries, policy.pruner).select(*remembered)[:-1]
+    first, *others = (query.exclude(*remembered) for query in queries)
+    return [first, *(query.update(before) for query, before in zip(others, left, strict=True))]
 
 
 def seen_images(policy: VLAPolicy, step: TensorDictBase) -> Tensor:

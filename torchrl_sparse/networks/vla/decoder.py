@@ -76,6 +76,7 @@ class BidirectionalLlama(nn.Module):
         layers, hooks = self.llama.layers, LayerHooks() if hooks is None else hooks
         scored_layers, skipped = hooks.layers_scored(len(layers)), hooks.layers_skipped(len(layers))
         state, mask = pack(state, state.alive)
+        hooks.before_layers(state)
         rotary, lengths, seen = self._rotary(state), state.alive.sum(1), state.visual_alive
         tokens, depth, scored = [], [], torch.zeros_like(lengths)
         for index, layer in enumerate(layers):

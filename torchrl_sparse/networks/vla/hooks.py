@@ -2,6 +2,7 @@
 
 The decoder calls one `LayerHooks` object around every layer::
 
+    hooks.before_layers(state)                   # once, of the embeddings
     for layer in range(num_layers):              # but those in hooks.layers_skipped(num_layers)
         rows = hooks.score_rows(state)           # only where layer is in hooks.layers_scored(num_layers)
         ...                                      # the decoder layer, with fused attention everywhere
@@ -150,6 +151,9 @@ class LayerHooks:
     def layers_skipped(self, num_layers: int) -> set[int]:
         """Return the decoder layers that are not run at all, as the identity; `after_layer` is not called for them."""
         return set()
+
+    def before_layers(self, state: LayerState) -> None:
+        """Take note of the sequence before the first layer, whose ``hidden`` are the embeddings."""
 
     def score_rows(self, state: LayerState) -> Tensor:
         """Return the tokens whose attention is the score in this layer, bool [B, S]; here the instruction's words."""

@@ -25,6 +25,7 @@ __all__ = ["demonstrated_queries", "measure_errors", "measure_success", "recorde
 Actor = Callable[[TensorDictBase], TensorDictBase]
 
 _FOREVER = 2**31  # environments end an episode themselves
+_BESIDE = (keys.IS_INIT, keys.EPISODE_SEED, keys.EPISODE_STEP, keys.TOKEN_BUDGET, keys.FINE)
 
 
 # -- queries -----------------------------------------------------------------------------------------------------------
@@ -39,11 +40,11 @@ def recorded_queries(
     """Record the queries, each [], that ``actor`` makes of a dense policy in one episode per seed.
 
     Args:
-        policy: whose inputs are recorded, and the budget that a controller granted.
+        policy: whose inputs are recorded, with what pruners and controllers read beside them, and what a controller granted.
         actor: a `ChunkExecutor` of ``policy``.
         make_env: called as ``make_env(seeds=[seed])``.
     """
-    names = [*policy.in_keys, keys.IS_INIT, keys.TOKEN_BUDGET, keys.FINE]
+    names = [*policy.in_keys, *_BESIDE]
     for seed in seeds:
         steps = _rollout(actor, make_env, seed)
         yield [*steps[steps[keys.QUERIED].squeeze(-1)].select(*names, strict=False).unbind(0)]

@@ -1,0 +1,68 @@
+"""A pruner that leaves an episode's first query dense, as those do that compare each query with the last."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
+from torchrl_sparse.tokens.base import TokenPruner
+
+__all__ = ["DenseFirst"]
+
+
+class DenseFirst(TokenPruner):
+    """Another pruner, but for rows with ``"is_init"``, which keep all tokens as they are.
+
+    SpecPrune and frame difference see an episode's first query whole, since nothing is known of the scene yet. A control that
+    is to be compared with them gets the same.
+
+    Args:
+        inner: that pruner.
+
+    Raises:
+        ValueError: when it is assigned to a model, if ``inner`` skips layers, which it does for a whole batch.
+
+    Examples:
+        >>> from torchrl_sparse.tokens.random import RandomPruner
+        >>> DenseFirst(RandomPruner(0.5)).in_keys[-1]
+        'is_init'
+    """
+
+    def __init__(self, inner: TokenPruner):
+        self.inner = inner
+        self.in_keys = list(dict.fromkeys([*inner.in_keys, keys.IS_INIT]))
+        self.out_keys = inner.out_keys
+
+    def bind(self, spec: VisualSpec) -> None:
+        if skipped := self.inner.layers_skipped(spec.num_layers):
+            raise ValueError(
+                f"inner: expected a pruner that skips no layers, got one that skips {sorted(skipped)}"
+            )
+        self.inner.bind(spec)
+
+    def layers_scored(self, num_layers: int) -> set[int]:
+        return self.inner.layers_scored(num_layers)
+
+    def begin(self, td: TensorDictBase) -> None:
+        self.inner.begin(td)
+        if keys.KEEP_MASK in self.out_keys:
+            td.set(keys.KEEP_MASK, td.get(keys.KEEP_MASK) | keys.read(td, keys.IS_INIT))
+
+    def before_layers(self, state: LayerState) -> None:
+        self.inner.before_layers(state)
+
+    def score_rows(self, state: LayerState) -> Tensor:
+        return self.inner.score_rows(state)
+
+    def after_layer(self, index: int, state: LayerState) -> Tensor | None:
+        first, before = keys.read(state.td, keys.IS_INIT), state.hidden
+        keep = self.inner.after_layer(index, state)
+        if state.hidden is not before:
+            state.hidden = torch.where(first[..., None], before, state.hidden)
+        return None if keep is None else keep | first
+
+    def end(self, td: TensorDictBase) -> None:
+        self.inner.end(td)
