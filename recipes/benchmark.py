@@ -15,7 +15,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.options import check_names
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
@@ -39,7 +38,8 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.results.ways import told_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.methods.diffusion import check_method, make_controller, method_identity
+from torchrl_sparse.methods.diffusion import check_method, method_identity
+from torchrl_sparse.methods.executor import make_executor
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -61,14 +61,11 @@ def main(config: DictConfig) -> None:
     methods = make_methods(
         config.methods, policy, num_updates=config.num_updates, planners=planners, calibration=calibration
     )
-    actors = {
-        name: ChunkExecutor(method, config.n_action_steps, make_controller(name))
-        for name, method in methods.items()
-    }
+    actors = {name: make_executor(name, method, config.n_action_steps) for name, method in methods.items()}
     design = make_design(config.until, config.episodes, config.max_episodes)
     seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
     terms = Terms(design, episode_horizon(make_env), task.early_cut, config.margin, config.time_margin)
-    settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
+    settings = {"task": config.task, "horizon": config.horizon}
 
     def play(name: str, count: int) -> list[EpisodeResult]:
         return evaluate(
@@ -77,7 +74,9 @@ def main(config: DictConfig) -> None:
             make_env,
             seeds[:count],
             log=episode_log(out, name, config.dense_log),
-            identity=method_identity(name, methods[name]) | settings,
+            identity=method_identity(name, methods[name])
+            | settings
+            | {"n_action_steps": actors[name].n_action_steps},
             num_envs=config.num_envs,
             workers=config.workers,
             backend=config.backend,

@@ -33,6 +33,7 @@ from torchrl_sparse.evaluation.results.realtime import (
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, method_identity
+from torchrl_sparse.methods.executor import executed_every, execution_options
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -58,7 +59,10 @@ def main(config: DictConfig) -> None:
     )
     seeds = evaluation_seeds(config.split, config.seed, config.episodes)
     queries = record_queries(ChunkExecutor(policy), make_env, seeds[:1])
-    latency = time_queries(methods, queries, repeats=config.latency_repeats, threads=config.threads)
+    samples = {name: execution_options(name)["num_samples"] for name in methods}
+    latency = time_queries(
+        methods, queries, repeats=config.latency_repeats, threads=config.threads, samples=samples
+    )
 
     runs = {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all runs
@@ -91,11 +95,12 @@ def evaluate_delayed(
     actor = RealtimeExecutor(
         policy,
         hold,
-        config.n_action_steps,
+        executed_every(name, policy, config.n_action_steps),
         latency=steps / config.control_freq,
         control_freq=config.control_freq,
+        **execution_options(name),
     )
-    settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
+    settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": actor.n_action_steps}
     return evaluate(
         f"{name} +{steps}",
         actor,

@@ -179,12 +179,12 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
 def test_realtime_leaves_a_curve_per_method(work, policy):
     out = work / "realtime"
     options = (
-        "task=lift_moving", f"policy={policy}", "methods=[ddim2]", "latencies=[0,0.1]", "episodes=1", "horizon=12",
+        "task=lift_moving", f"policy={policy}", "methods=[ddim2_every2_of3]", "latencies=[0,0.1]", "episodes=1", "horizon=12",
         "latency_repeats=1", f"out={out}",
     )  # fmt: skip
     output = run("realtime", *options)
     results = load_realtime(out / "realtime.json")
-    assert list(results.methods) == ["dense", "ddim2"]
+    assert list(results.methods) == ["dense", "ddim2_every2_of3"]
     for name, method in results.methods.items():
         assert name in output
         assert {0, 2} <= {point.delay_steps for point in method.points}

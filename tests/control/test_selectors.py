@@ -3,10 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.realtime_executor import RealtimeExecutor
 from torchrl_sparse.control.selectors import CoherentChunk, backward_coherence, disagreement
 from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 
@@ -45,6 +46,16 @@ def test_a_query_plays_the_sample_that_goes_on_as_the_last_one_did():
     assert chosen == [[0, 0]] * 4  # the first has nothing to agree with, and then 5 goes on with 5
     assert actions[2] == [7, 17]
     assert td[keys.FLOPS].flatten().tolist() == [0, 0]
+
+
+def test_late_answers_are_chosen_among_too():
+    hold = TensorDictModule(lambda state: state - 100, in_keys=["state"], out_keys=[keys.HOLD])
+    options = {"num_samples": 3, "selector": CoherentChunk()}
+    at_once = RealtimeExecutor(Drawing(), hold, 2, latency=0.0, **options)
+    assert played(at_once, 6)[:2] == played(ChunkExecutor(Drawing(), 2, **options), 6)[:2]
+    actions = played(RealtimeExecutor(Drawing(), hold, 2, latency=0.05, **options), 4)[0]
+    # Held for a step; then the first sample, which 5 more than the state tells from the others, and on.
+    assert actions == [[-100, -90], [6, 16], [7, 17], [8, 18]]
 
 
 def test_the_samples_can_agree_among_themselves_and_a_new_episode_agrees_with_nothing_before():

@@ -24,6 +24,8 @@ from torchrl_sparse.methods.diffusion import (
     make_method,
     method_identity,
 )
+from torchrl_sparse.methods.executor import make_executor
+from torchrl_sparse.methods.names import MethodName
 
 LAYERS = 2
 QUERY = TensorDict({"history": {"state": torch.zeros(1, 2, SIZES["cond_dim"])}}, [1])
@@ -81,6 +83,26 @@ def test_a_warm_start_is_written_behind_its_sampler(make):
     assert "start" not in method_identity("ddpm_82_41_14", make("ddpm_82_41_14"))
     with pytest.raises(ValueError, match="num_steps: expected fewer than the sampler's 2, got 2"):
         make("ddim2_warm2")
+
+
+def test_how_often_and_for_how_many_chunks_is_written_behind_any_method(make):
+    for text, every, samples in (
+        ("ddpm_82_14_every2_of8", 2, 8),
+        ("recall2_every1", 1, 1),
+        ("dense_of4", 8, 4),
+    ):
+        actor = make_executor(text, make(text), n_action_steps=8)
+        assert (actor.n_action_steps, actor.num_samples) == (every, samples)
+        assert (actor.selector is not None) == (samples > 1)
+    assert make("ddpm_82_14_every2_of8").sampler.name == "ddpm_82_14"
+    assert MethodName.parse("sag_every2:int8@0.9") == MethodName("sag", (0.9,), "int8", every=2)
+
+
+def test_a_chunk_is_not_executed_beyond_its_end(make):
+    with pytest.raises(
+        ValueError, match="methods: dense_every9: expected at most the 5 actions of a chunk, got 9"
+    ):
+        make_executor("dense_every9", make("dense_every9"), n_action_steps=2)
 
 
 def test_recalling_is_written_as_uniform_caching_is(make):

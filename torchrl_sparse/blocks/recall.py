@@ -3,7 +3,8 @@
 Every query computes its first step and each `interval`-th other one, another each time; in the steps between, all blocks return
 what the last query that computed the step had there (:mod:`torchrl_sparse.blocks.engine.recall`). TTS learns, cell by cell,
 whether to compute, to reuse within the query or to recall; this asks what recalling alone is worth, at the cost of
-`uniform<interval>`. The first query of an episode computes everything.
+`uniform<interval>`. The first query of an episode computes everything. Only the reference engine recalls: counts of FLOPs say
+what it is worth, times do not.
 """
 
 from __future__ import annotations

@@ -2,7 +2,15 @@
 
 A query takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is for
 the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
-asynchronous inference; real-time chunking (arXiv:2506.07339) blends the two chunks besides, which is not done here.
+asynchronous inference. Two remedies for the seam between the chunks are published and not done here:
+
+* Real-time chunking (arXiv:2506.07339) inpaints: every denoising step is guided towards the actions that play meanwhile, by a
+  gradient through the network. Engines run a query's chain as one program without gradients, so it would run in the reference
+  engine alone, at several times the cost of what it is to make up for. Nearest to it here: the policy begins from the old
+  chunk (`WarmStart`), or samples several chunks of which the one that goes on best is played (``num_samples``).
+* VLASH (arXiv:2512.01031) shows the policy its robot's state rolled forward to when the answer begins, for which it trains the
+  policy. The policies here were not, and half of their state, such as the vector from hand to cube, is what no commanded pose
+  tells.
 """
 
 from __future__ import annotations
@@ -37,6 +45,7 @@ class RealtimeExecutor(ChunkExecutor):
             share a measured time, so measured latencies want batches of one.
         control_freq: steps a second.
         controller: as for `ChunkExecutor`; not heard while an answer is awaited.
+        num_samples, selector: as for `ChunkExecutor`.
 
     Raises:
         ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
@@ -61,8 +70,10 @@ class RealtimeExecutor(ChunkExecutor):
         latency: float | None = None,
         control_freq: float = 20.0,
         controller: TensorDictModuleBase | None = None,
+        num_samples: int = 1,
+        selector: TensorDictModuleBase | None = None,
     ):
-        super().__init__(policy, n_action_steps, controller)
+        super().__init__(policy, n_action_steps, controller, num_samples=num_samples, selector=selector)
         if latency is not None and not (math.isfinite(latency) and latency >= 0):
             raise ValueError(f"latency: expected None or seconds >= 0, got {latency}")
         self.hold = hold

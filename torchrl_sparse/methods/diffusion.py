@@ -2,16 +2,17 @@
 
 A method is written ``NAME``, ``NAME@RATE`` (every query is asked for that prune rate) or ``NAME@COARSE-FINE`` (a
 controller asks for the first rate in coarse motion and for the second in fine motion). ``NAME:bf16`` and ``NAME:int8``, of
-any of them (``sag:int8@0.9``), run it in the native engine with rounded weights and activations. NAME is a key of
-:data:`METHODS`, or matches the pattern of one, or names a planner that is saved in the folder at hand, as ``NAME.json`` or
-``NAME/``; saved planners bring the sampler that they were made for.
+any of them (``sag:int8@0.9``), run it in the native engine with rounded weights and activations. ``NAME_every2`` queries
+every two steps, ``NAME_of8`` samples eight chunks and plays one (:mod:`torchrl_sparse.methods.executor`), ``NAME_every2_of8``
+does both. NAME is a key of :data:`METHODS`, or matches the pattern of one, or names a planner that is saved in the folder at
+hand, as ``NAME.json`` or ``NAME/``; saved planners bring the sampler that they were made for.
 
 ==================== ===========================================================================================
 ``ddpm_82_14``       a sampler with its steps, as :mod:`torchrl_sparse.networks.diffusion.naming` says, nothing pruned
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
-``recall2``          every second step of the queries after an episode's first, the other steps as in the query before
+``recall2``          every second step of the queries after an episode's first, others as in the one before; reference engine
 ``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ==================== ===========================================================================================
 

@@ -7,34 +7,53 @@ from dataclasses import dataclass
 
 __all__ = ["MethodName"]
 
+_PATTERN = re.compile(
+    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?"  # the policy, and how its chunks are executed
+    r"(?::(bf16|int8))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
+)
+
 
 @dataclass(frozen=True)
 class MethodName:
-    """A method as it is written: ``NAME``, ``NAME@RATE`` or ``NAME@COARSE-FINE``, NAME also as ``NAME:WEIGHTS``.
+    """A method as it is written: ``NAME``, ``NAME_everyN``, ``NAME_ofS`` or ``NAME_everyN_ofS``, behind that perhaps
+    ``:WEIGHTS``, and behind that ``@RATE`` or ``@COARSE-FINE``.
 
     Attributes:
         name: see `torchrl_sparse.methods.diffusion`.
         rates: prune rates: none, one for every query, or two, of coarse and of fine motion.
         weights: ``"bf16"``, ``"int8"``, or None, which rounds nothing.
+        every: environment steps from one query to the next; None leaves them to the benchmark.
+        samples: chunks that a query samples, of which the one that agrees best with the last chunk is played.
     """
 
     name: str
     rates: tuple[float, ...] = ()
     weights: str | None = None
+    every: int | None = None
+    samples: int = 1
 
     @classmethod
     def parse(cls, text: str) -> MethodName:
         """Raise ValueError unless ``text`` is written as above.
 
-        >>> MethodName.parse("sag_rates@0.95-0.7")
-        MethodName(name='sag_rates', rates=(0.95, 0.7), weights=None)
+        >>> MethodName.parse("sag_rates@0.95-0.7").rates
+        (0.95, 0.7)
         >>> MethodName.parse("dense:int8").weights
         'int8'
+        >>> MethodName.parse("ddpm3_logsnr_every2_of8")
+        MethodName(name='ddpm3_logsnr', rates=(), weights=None, every=2, samples=8)
         """
-        match = re.fullmatch(r"(\w+(?:\.\d+)?)(?::(bf16|int8))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?", text)
+        match = _PATTERN.fullmatch(text)
         if match is None:
             raise ValueError(
-                f"methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME:bf16 or NAME:int8, got {text!r}"
+                "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME:bf16 or "
+                f"NAME:int8, got {text!r}"
             )
-        name, weights, *rates = match.groups()
-        return cls(name, tuple(float(rate) for rate in rates if rate is not None), weights)
+        name, every, samples, weights, *rates = match.groups()
+        return cls(
+            name,
+            tuple(float(rate) for rate in rates if rate is not None),
+            weights,
+            None if every is None else int(every),
+            int(samples or 1),
+        )

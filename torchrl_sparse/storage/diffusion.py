@@ -6,6 +6,7 @@
      "network": {arguments of TransformerForDiffusion},
      "schedule": {arguments of Sampler},
      "plan": "plan.json" or "plan", a planner's file or folder beside this one; only where something is pruned,
+     "warm_start": steps of a query that begins from the last chunk; only where not all begin from noise,
      "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
 
@@ -45,6 +46,7 @@ class _Config:
     vision: dict[str, Any] | None = None
     source: dict[str, Any] | None = None
     plan: PlanName | None = None
+    warm_start: int | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class StoredPolicy:
             names of the observations that make up the state, in order, and ``"cameras"``, name of the image here ->
             robomimic's; None for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
+        warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
     """
 
     network: TransformerForDiffusion
@@ -70,14 +73,14 @@ class StoredPolicy:
     vision: VisionEncoder | None = None
     source: dict[str, Any] = field(default_factory=dict)
     plan: PlanName | None = None
+    warm_start: int | None = None
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
     """Write both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
     vision = None if policy.vision is None else policy.vision.config
-    config = _Config(
-        FORMAT, policy.network.config, policy.sampler.config, vision, policy.source or None, policy.plan
-    )
+    network, schedule, kept = policy.network.config, policy.sampler.config, (policy.plan, policy.warm_start)
+    config = _Config(FORMAT, network, schedule, vision, policy.source or None, *kept)
     weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
     if policy.vision is not None:
         weights |= {_VISION + name: value for name, value in policy.vision.state_dict().items()}
@@ -97,6 +100,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
     check_folder(path)
     config = read_json(path / "config.json", _Config)
     sampler = _make(path / "config.json", "schedule", Sampler, config.schedule)
+    _check_warm_start(path / "config.json", config.warm_start, sampler)
     with torch.device("meta"):  # the configuration is compared with the weights before memory is taken for it
         expected = _state(_modules(path / "config.json", config))
     tensors = read_tensors(path / "model.safetensors", expected)
@@ -106,7 +110,14 @@ def read_pretrained(path: Path) -> StoredPolicy:
         module.eval()
     normalizer = _make(path / "model.safetensors", "normalizer", Normalizer, take(tensors, _NORMALIZER))
     vision, source = modules.get(_VISION), config.source or {}
-    return StoredPolicy(modules[_NETWORK], normalizer, sampler, vision, source, config.plan)
+    kept = config.plan, config.warm_start
+    return StoredPolicy(modules[_NETWORK], normalizer, sampler, vision, source, *kept)
+
+
+def _check_warm_start(file: Path, steps: int | None, sampler: Sampler) -> None:
+    if steps is not None and not 1 <= steps < sampler.num_inference_steps:
+        most = sampler.num_inference_steps - 1
+        raise ValueError(f"{file}: warm_start: expected 1 to {most} of the schedule's steps, got {steps}")
 
 
 def _modules(file: Path, config: _Config) -> dict[str, nn.Module]:

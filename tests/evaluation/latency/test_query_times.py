@@ -18,10 +18,11 @@ class Slow(Planner):
 
     def __init__(self):
         super().__init__()
-        self.asked = []
+        self.asked, self.rows = [], []
 
     def masks(self, cond):
         self.asked.append(cond[0, 0, 0].item())
+        self.rows.append(len(cond))
         time.sleep(0.02)
         return torch.zeros(len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool)
 
@@ -40,6 +41,12 @@ def test_every_round_asks_all_methods_the_next_query(policy):
     # After three rounds to warm up.
     assert policy.plan.asked == twin.plan.asked == [0, 1, 2, 0, 1, 2, 0]
     assert latency["a"].n == latency["b"].n == 4
+
+
+def test_a_query_of_several_samples_is_timed_as_one_batch(policy):
+    time_queries({"of4": policy}, QUERIES, repeats=1, threads=1, samples={"of4": 4})
+    assert set(policy.plan.rows) == {4}
+    assert policy.plan.asked == [0, 1, 2, 0]
 
 
 def test_the_planner_is_timed_within_its_queries(policy):

@@ -57,6 +57,14 @@ def test_build_computes_what_the_schema_promises():
     assert (results.schema, results.split, results.seed, results.first_seed) == (2, "test", 3, 210_003)
 
 
+def test_where_methods_are_not_asked_equally_often_an_episode_says_what_they_cost():
+    dense, often = run([1] * 20), replace(run([1] * 20, queries=8, flops=2.0), every=2)
+    results = build({"dense": dense, "fast_every2": often})
+    assert results.methods["fast_every2"].per_episode.flops_per_step_to_dense == 0.8
+    assert [row["a second"] for row in results_rows(results)] == ["1.000", "0.800"]
+    assert "a second" not in results_rows(build({"dense": dense}))[0]
+
+
 def test_visual_tokens_are_reported_where_there_are_any():
     blind, sighted = run([1, 0]), run([1, 1])
     kept = {"kept": (90.0, 30.0), "fine": (True, False)}

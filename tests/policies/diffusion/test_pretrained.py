@@ -83,6 +83,12 @@ CONFIG_FAULTS = {
         r"config.json: schedule: timesteps: expected 2 .* got \[10, 90\]",
     ),
     "depth": (lambda c: c["network"].update(n_layer=3), "missing"),
+    "warm start": (
+        lambda c: c.update(warm_start=c["schedule"]["num_inference_steps"]),
+        r"config.json: warm_start: expected 1 to \d+ of the schedule's steps, got \d+",
+    ),
+    "no warm step": (lambda c: c.update(warm_start=0), "warm_start: expected 1 to .* got 0"),
+    "kind of warm start": (lambda c: c.update(warm_start=True), "warm_start: expected .* got True"),
 }
 
 

@@ -92,8 +92,17 @@ def test_what_does_not_go_together_is_refused(policy):
     policy.plan = Recall(2)
     with pytest.raises(ValueError, match="start: expected None with a planner that recalls, got warm2"):
         policy.start = WarmStart(2)
+    assert policy.engine_info().startswith("reference: ")
+    with pytest.raises(
+        ValueError, match="engine: expected 'auto' or 'reference' with a planner that recalls, got 'torch'"
+    ):
+        policy.engine = "torch"
     assert keys.FEATURES in policy.out_keys
     policy.plan = None
+    assert keys.FEATURES not in policy.out_keys
+    policy.engine = "torch"
+    with pytest.raises(ValueError, match="engine: expected 'auto' or 'reference'"):
+        policy.plan = Recall(2)
     assert keys.FEATURES not in policy.out_keys
     with pytest.raises(ValueError, match="interval: expected at least 2, got 1"):
         Recall(1)

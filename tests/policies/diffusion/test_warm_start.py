@@ -4,11 +4,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_sparse import ChunkExecutor, Sampler, keys
+from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.networks.diffusion.noise import sample_noise
-from torchrl_sparse.policies.diffusion.warm_start import WarmStart, shift_chunk
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, shift_chunk
 
 ENGINES = ["reference", "torch", *(["native"] if native_available()[0] else [])]
 SAMPLERS = ["ddpm8", "ddpm_82_41_14", "ddim10_eta0.5", "unipc10", "sde2m5"]
@@ -159,6 +159,22 @@ def test_what_cannot_be_served_is_refused_and_changes_nothing(policy, tmp_path):
     with pytest.raises(ValueError, match="num_steps: expected fewer than the sampler's 2, got 3"):
         policy.sampler = Sampler("ddpm", timesteps=[82, 14])
     assert policy.num_inference_steps == 8
-    with pytest.raises(ValueError, match="start: expected None in a policy that is saved, got warm3"):
+    policy.start = Elsewhere()
+    with pytest.raises(ValueError, match="start: expected None or a WarmStart, to save it, got Elsewhere"):
         policy.save_pretrained(tmp_path / "policy")
     assert not (tmp_path / "policy").exists()
+
+
+class Elsewhere(ColdStart):
+    """A start of another package."""
+
+
+def test_a_saved_policy_begins_where_it_did(policy, asked, tmp_path):
+    policy.start = WarmStart(3)
+    policy.save_pretrained(tmp_path, half=False)
+    loaded = DiffusionPolicy.from_pretrained(tmp_path)
+    assert loaded.start.name == "warm3"
+    assert torch.equal(loaded(asked.clone())[keys.CHUNK], policy(asked.clone())[keys.CHUNK])
+    policy.start = None
+    policy.save_pretrained(tmp_path, half=False)
+    assert DiffusionPolicy.from_pretrained(tmp_path).start.name == ""

@@ -89,7 +89,10 @@ def measure_methods(
         threads: of PyTorch while timing.
     """
     with progress("latency", "round", repeats) as show:
-        latency = time_queries(methods, queries, repeats=repeats, threads=threads, on_round=show)
+        samples = {name: MethodName.parse(name).samples for name in methods}
+        latency = time_queries(
+            methods, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
+        )
     planning = time_planning(_adaptive(methods), queries, threads=threads)
     return {
         name: MethodRun(
@@ -97,6 +100,7 @@ def measure_methods(
             latency[name],
             error_to_dense(method, answer(method, queries), queries),
             planning.get(name),
+            MethodName.parse(name).every,
         )
         for name, method in methods.items()
     }

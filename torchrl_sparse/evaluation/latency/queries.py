@@ -24,14 +24,18 @@ def time_queries(
     *,
     repeats: int,
     threads: int,
+    samples: Mapping[str, int] | None = None,
     on_round: Callable[[int, int], None] | None = None,
 ) -> dict[str, Latency]:
     """Time recorded queries [N] under each method, interleaved; see `measure_latency`.
 
-    Every round asks all methods the next query: asked the same again, an engine would know the mask already.
+    Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods in
+    ``samples`` are asked it so many times at once.
     """
+    samples = samples or {}
     calls = {
-        name: partial(_answer_next, method, cycle(queries.unbind(0))) for name, method in methods.items()
+        name: partial(_answer_next, method, cycle(_copied(queries, samples.get(name, 1)).unbind(0)))
+        for name, method in methods.items()
     }
     return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)
 
@@ -51,6 +55,11 @@ def time_planning(
             for name, policy in methods.items():
                 seconds[name].append(_planning_seconds(policy, query))
     return {name: summarize_latency(samples) for name, samples in seconds.items()}
+
+
+def _copied(queries: TensorDictBase, samples: int) -> TensorDictBase:
+    """Return queries [N, samples], or [N] as they are for one."""
+    return queries if samples == 1 else queries[:, None].expand(len(queries), samples).contiguous()
 
 
 def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> None:

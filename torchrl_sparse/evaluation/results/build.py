@@ -50,12 +50,14 @@ class MethodRun:
         action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
             observations and the same noise; (0, 0) for the dense policy.
         planning: of the planner alone, within a query; where it looks at the observation.
+        every: environment steps from one query to the next, of a method that says so itself.
     """
 
     episodes: Sequence[EpisodeResult]
     latency: Latency
     action_error: tuple[float, float]
     planning: Latency | None = None
+    every: int | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def build_results(
     """
     if DENSE not in runs:
         raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
-    design = terms.design
+    design, uneven = terms.design, any(run.every for run in runs.values())
     return Results(
         SCHEMA,
         task,
@@ -125,7 +127,7 @@ def build_results(
         terms.episode_horizon,
         machine,
         policy,
-        {name: _entry(name, run, runs[DENSE], terms) for name, run in runs.items()},
+        {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
         pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
@@ -133,8 +135,9 @@ def build_results(
     )
 
 
-def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms) -> MethodEntry:
+def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven: bool) -> MethodEntry:
     cost, tokens = totals(run.episodes), token_totals(run.episodes)
+    whole = uneven or tokens is not None  # a query does not say what an episode costs
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),
@@ -147,7 +150,7 @@ def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms) -> MethodE
         episode_length=cost.episode_length,
         planning_s=None if run.planning is None else Percentiles.of(run.planning),
         tokens=None if tokens is None else TokensKept(tokens.mean, tokens.fine, tokens.coarse),
-        per_episode=None if tokens is None else _episode_cost(run, dense),
+        per_episode=_episode_cost(run, dense) if whole else None,
     )
 
 

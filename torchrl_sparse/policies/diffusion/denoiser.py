@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.recall import Memory
-from torchrl_sparse.blocks.engine.reference import denoise
+from torchrl_sparse.blocks.engine.reference import ReferenceEngine, denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.philox import philox_noise
@@ -18,7 +18,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["NOISES", "ActionDenoiser", "check_noise"]
+__all__ = ["NOISES", "ActionDenoiser", "check_noise", "check_recalling"]
 
 NOISES = {"torch": sample_noise, "philox": philox_noise}
 """What a seed stands for -> the function that draws it: PyTorch's generator, with which everything here was measured, or
@@ -30,6 +30,20 @@ def check_noise(name: str) -> str:
     if name not in NOISES:
         raise ValueError(f"noise: expected one of {list(NOISES)}, got {name!r}")
     return name
+
+
+def check_recalling(engine: EngineName, start: str) -> None:
+    """Raise ValueError unless a planner that recalls can run: in the reference engine, with queries that begin from noise.
+
+    The other engines run programs in which a run of pruned blocks is one sum of outputs of this query; what a row recalls is
+    in no such sum. ``"auto"`` is taken as the reference.
+    """
+    if start:
+        raise ValueError(f"start: expected None with a planner that recalls, got {start}")
+    if engine not in ("auto", "reference"):
+        raise ValueError(
+            f"engine: expected 'auto' or 'reference' with a planner that recalls, got {engine!r}"
+        )
 
 
 class ActionDenoiser(TensorDictModuleBase):
@@ -66,6 +80,18 @@ class ActionDenoiser(TensorDictModuleBase):
     @property
     def out_keys(self):
         return [keys.CHUNK, keys.FLOPS, *([keys.FEATURES] if self.recalls else ())]
+
+    def choose(self, engine: EngineName) -> None:
+        """Take another engine from the next query on; ValueError as `check_recalling`, or for an unknown name."""
+        if self.recalls:
+            check_recalling(engine, start="")
+        self.engine = EngineSlot(engine)
+
+    def describe(self) -> str:
+        """Say which engine runs and on what, and why not a faster one."""
+        if self.recalls:
+            return f"reference: {ReferenceEngine.detail} (not native, torch: the planner recalls)"
+        return self.engine.describe(self.network, self.sampler)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
-from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
+from torchrl_sparse.blocks.engine.factory import EngineName
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.blocks.saved import load_planner, save_beside
@@ -26,13 +26,13 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.fingerprint import networks_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise, check_recalling
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart
+from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
@@ -46,8 +46,7 @@ class DiffusionPolicy(TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
-    Weights may change at any time: the next query sees it. Only after writing to a part of a tensor through ``.data``,
-    which PyTorch does not record, call `refresh`.
+    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then.
 
     Args:
         network: the denoiser.
@@ -138,8 +137,8 @@ class DiffusionPolicy(TensorDictSequential):
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
-        if (recalls := keys.RECALL in plan.out_keys) and start.name:
-            raise ValueError(f"start: expected None with a planner that recalls, got {start.name}")
+        if recalls := keys.RECALL in plan.out_keys:
+            check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
@@ -210,13 +209,13 @@ class DiffusionPolicy(TensorDictSequential):
 
     @engine.setter
     def engine(self, name: EngineName) -> None:
-        self.module["denoise"].engine = EngineSlot(name)
+        self.module["denoise"].choose(name)
 
     def engine_info(self) -> str:
         """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why
         ``"auto"`` had to do without the native one. ValueError if the chosen engine cannot run this network here.
         """
-        return self.module["denoise"].engine.describe(self.network, self.sampler)
+        return self.module["denoise"].describe()
 
     describe = describe  # "observes the last 2 of\n  state, 19 numbers: …"
 
@@ -254,14 +253,14 @@ class DiffusionPolicy(TensorDictSequential):
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
         Raises:
-            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or there is a start,
-                which no file says; nothing is written.
+            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
+                None nor a `WarmStart`; nothing is written.
         """
-        if self.start.name:
-            raise ValueError(f"start: expected None in a policy that is saved, got {self.start.name}")
-        plan = save_beside(self.plan, Path(path))
-        stored = StoredPolicy(self.network, self.normalizer, self.sampler, self.vision, self.source, plan)
-        write_pretrained(Path(path), stored, half=half)
+        warm = stored_start(self.start)
+        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm
+        write_pretrained(
+            Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
+        )
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
@@ -270,7 +269,7 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler and planner; a ``.ckpt`` as `from_diffusion_policy` does.
+        """Read what `save_pretrained` wrote, with sampler, start and planner; a ``.ckpt`` as `from_diffusion_policy` does.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -297,4 +296,5 @@ class DiffusionPolicy(TensorDictSequential):
         options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
         policy = cls(stored.network, stored.normalizer, **options)
         policy.source = stored.source
+        policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
         return policy

@@ -34,7 +34,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["ColdStart", "WarmStart", "shift_chunk"]
+__all__ = ["ColdStart", "WarmStart", "shift_chunk", "stored_start"]
 
 
 def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
@@ -132,3 +132,17 @@ class WarmStart(ColdStart):
             guess = torch.where(warm[..., None], normalizer.normalize_action(last), guess)
         tensordict.set(keys.START, guess)
         return tensordict.set(keys.NUM_STEPS, torch.where(warm, self.num_steps, sampler.num_inference_steps))
+
+
+def stored_start(start: ColdStart) -> int | None:
+    """Return what a policy's file says of its start: the steps of a warm query, None where all begin from noise.
+
+    Raises:
+        ValueError: for a start of another class.
+
+    >>> stored_start(WarmStart(2)), stored_start(ColdStart())
+    (2, None)
+    """
+    if type(start) not in (ColdStart, WarmStart):
+        raise ValueError(f"start: expected None or a WarmStart, to save it, got {type(start).__name__}")
+    return start.num_steps if isinstance(start, WarmStart) else None

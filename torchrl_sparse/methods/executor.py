@@ -1,0 +1,52 @@
+"""How the chunks of a method are executed: how often it is asked, for how many chunks at a time, beside which controller."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.selectors import CoherentChunk
+from torchrl_sparse.methods.diffusion import make_controller
+from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+__all__ = ["execution_options", "executed_every", "make_executor"]
+
+
+def executed_every(text: str, policy: DiffusionPolicy, n_action_steps: int) -> int:
+    """Return the environment steps from one query of a method to the next.
+
+    Args:
+        text: the method, such as ``"ddpm3_logsnr_every2"``.
+        policy: whose chunks they are.
+        n_action_steps: of methods that do not say.
+
+    Raises:
+        ValueError: if a chunk has fewer actions than the method says.
+    """
+    every, length = MethodName.parse(text).every, policy.horizon - policy.n_obs_steps + 1
+    if every is not None and every > length:
+        raise ValueError(f"methods: {text}: expected at most the {length} actions of a chunk, got {every}")
+    return every or n_action_steps
+
+
+def execution_options(text: str) -> dict[str, Any]:
+    """Return ``num_samples`` and ``selector`` of an executor: backward coherence alone, where several chunks are sampled."""
+    samples = MethodName.parse(text).samples
+    selector: TensorDictModuleBase | None = CoherentChunk() if samples > 1 else None
+    return {"num_samples": samples, "selector": selector}
+
+
+def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> ChunkExecutor:
+    """Return what executes the chunks of a method; the arguments are those of `executed_every`.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> actor = make_executor("dense_every2_of4", policy, 8)
+        >>> actor.n_action_steps, actor.num_samples
+        (2, 4)
+    """
+    steps = executed_every(text, policy, n_action_steps)
+    return ChunkExecutor(policy, steps, make_controller(text), **execution_options(text))
