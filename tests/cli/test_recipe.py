@@ -53,6 +53,8 @@ def fail(monkeypatch, capsys):
         ("benchmark_vla", ["policy=nope/vla"], "policy: expected a folder that holds config.json, or a .ckpt"),
         ("benchmark_vla", ["policy=assets/lift"], "assets/lift/config.json: format: expected 'torchrl_sparse.vla"),
         ("calibrate_bac", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
+        ("calibrate_bac", ["task=juggle"], "task: expected one of Lift, "),
+        ("evaluate_policy", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
         ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
