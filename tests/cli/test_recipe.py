@@ -50,8 +50,16 @@ def fail(monkeypatch, capsys):
         ),
         ("convert_robomimic", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
         ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
-        ("benchmark_vla", ["policy=nope/vla"], "policy: expected a folder that holds config.json, or a .ckpt"),
-        ("benchmark_vla", ["policy=assets/lift"], "assets/lift/config.json: format: expected 'torchrl_sparse.vla"),
+        (
+            "benchmark_vla",
+            ["policy=nope/vla"],
+            "policy: expected a folder that holds config.json, or a .ckpt",
+        ),
+        (
+            "benchmark_vla",
+            ["policy=assets/lift"],
+            "assets/lift/config.json: format: expected 'torchrl_sparse.vla",
+        ),
         ("calibrate_bac", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
         ("calibrate_bac", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["task=juggle"], "task: expected one of Lift, "),
