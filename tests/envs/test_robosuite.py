@@ -203,12 +203,14 @@ def test_bad_input_is_named(lift):
 
 
 def test_a_size_of_images_without_a_camera_is_refused():
-    with pytest.raises(ValueError, match="image_size: expected a camera or wrist_camera with it, .* got 84 alone"):
+    with pytest.raises(
+        ValueError, match=r"image_size: expected a camera or wrist_camera with it, .* got 84 alone"
+    ):
         make_env("LiftNamed", image_size=84)
 
 
 def test_a_ready_made_environment_is_made_anew_where_it_is_sent():
-    """`MultiSyncCollector` sends one that it is given instead of a function; without this it fails, and takes the policy along."""
+    """`MultiSyncCollector` sends one that it is given instead of a function."""
     env = make_env("Lift", seeds=[7, 8])
     first = env.reset()
     copy = pickle.loads(pickle.dumps(env))

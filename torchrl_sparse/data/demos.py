@@ -22,7 +22,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.demo_workers import in_order
-from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, split_episodes, write_episode
+from torchrl_sparse.data.hdf5_writer import (
+    Episode,
+    episode_length,
+    merge_episodes,
+    split_episodes,
+    write_episode,
+)
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState

@@ -206,7 +206,7 @@ class RobosuiteEnv(SeededEnv):
 
     @property
     def recorded_keys(self) -> tuple[str, ...]:
-        """What demonstrations record: the task's state, and the rotation of the hands' bodies, which published policies observe."""
+        """What demonstrations record: the task's state, and the hands' rotation that published policies observe."""
         return (*self.task.state_keys, *(f"robot{arm}_eef_quat" for arm in range(self.task.arms)))
 
     def raw_observation(self, state_keys: Sequence[str] | None = None) -> Mapping[str, np.ndarray]:

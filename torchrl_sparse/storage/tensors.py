@@ -13,7 +13,15 @@ from torch import Tensor
 
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["check_folder", "check_finite", "check_shapes", "read_tensors", "shapes_of", "take", "write_tensors"]
+__all__ = [
+    "check_folder",
+    "check_finite",
+    "check_shapes",
+    "read_tensors",
+    "shapes_of",
+    "take",
+    "write_tensors",
+]
 
 T = TypeVar("T")
 # safetensors' names of the types that weights are kept in, and flags

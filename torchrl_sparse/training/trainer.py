@@ -21,7 +21,7 @@ from torchrl_sparse.storage.training_state import read_checkpoint, write_checkpo
 __all__ = ["StepConfig", "Trainer", "batch_indices", "checksum", "step_seed"]
 
 UNLOGGED = "unlogged"  # of a checkpoint's fields; earlier ones lack it
-LENGTH = frozenset({"max_steps", "epochs", "max_updates"})  # of a header's keys: a longer training extends a shorter one
+LENGTH = frozenset({"max_steps", "epochs", "max_updates"})  # of a header's keys: these may differ
 
 
 class StepConfig(Protocol):

@@ -75,7 +75,9 @@ def test_another_sweep_in_the_folder_is_refused_once_a_trial_of_it_is_through(tm
     other.results_file(trial).parent.mkdir()
     other.results_file(trial).touch()
     other.finish(trial)
-    with pytest.raises(ValueError, match=r"sweep.json: holds another sweep: method is 'bayes' here and 'random'"):
+    with pytest.raises(
+        ValueError, match=r"sweep.json: holds another sweep: method is 'bayes' here and 'random'"
+    ):
         LocalSweep(BAYES, tmp_path, count=2)
 
 

@@ -106,9 +106,9 @@ def test_a_plan_that_does_not_fit_leaves_the_policy_as_it_was(policy):
         policy.sampler = Sampler("ddim", 4)
     with pytest.raises(ValueError, match="made for policy fingerprint 'another'"):
         policy.plan = SchedulePlanner(CacheSchedule("mine", "another", 8, layers, steps))
-    with pytest.raises(ValueError, match="^plan: expected a Planner, got str 'bac'$"):
+    with pytest.raises(ValueError, match=r"^plan: expected a Planner, got str 'bac'$"):
         policy.plan = "bac"
-    with pytest.raises(ValueError, match="^sampler: expected a Sampler, got the class Sampler$"):
+    with pytest.raises(ValueError, match=r"^sampler: expected a Sampler, got the class Sampler$"):
         policy.sampler = Sampler
     assert policy.num_inference_steps == 8
     assert torch.equal(policy(request(1))[keys.CHUNK], before)

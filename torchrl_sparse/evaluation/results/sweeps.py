@@ -178,7 +178,12 @@ def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
     from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
     arguments = create_sweep_command_args({"args": {k: {"value": v} for k, v in trial.parameters.items()}})
-    macros = {"program": [str(find_program(config["program"]))], "interpreter": ["python"], "env": ["/usr/bin/env"], **arguments}
+    macros = {
+        "program": [str(find_program(config["program"]))],
+        "interpreter": ["python"],
+        "env": ["/usr/bin/env"],
+        **arguments,
+    }
     return [
         str(word)
         for chunk in create_sweep_command(list(config["command"]))
@@ -192,8 +197,13 @@ def find_program(name: str) -> Path:
     >>> find_program("recipes/benchmark.py").name
     'benchmark.py'
     """
-    package = Path(__file__).parents[2]  # a wheel brings the recipes within it, a repository has them beside it
-    return next((folder / name for folder in (Path(), package, package.parent) if (folder / name).is_file()), Path(name))
+    package = Path(__file__).parents[
+        2
+    ]  # a wheel brings the recipes within it, a repository has them beside it
+    return next(
+        (folder / name for folder in (Path(), package, package.parent) if (folder / name).is_file()),
+        Path(name),
+    )
 
 
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:

@@ -20,5 +20,7 @@ def check_kinds(**parts: tuple[Any, type]) -> None:
     """
     for name, (part, kind) in parts.items():
         if not isinstance(part, kind):
-            got = f"the class {part.__name__}" if isinstance(part, type) else f"{type(part).__name__} {part!r}"
+            got = (
+                f"the class {part.__name__}" if isinstance(part, type) else f"{type(part).__name__} {part!r}"
+            )
             raise ValueError(f"{name}: expected a {kind.__name__}, got {got}")

@@ -226,7 +226,7 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
-        self.plan.train(self.plan.training)  # whenever its mode is set, a learned planner forgets what it keeps
+        self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
