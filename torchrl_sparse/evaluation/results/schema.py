@@ -98,8 +98,8 @@ class MethodEntry(MethodEntry1):
         correlation_with_dense: Pearson's, of times over the seeds; None also where times never differ.
         p_values: of the two verdicts.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement.
-        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, and where methods are not asked
-            equally often.
+        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, or where methods are asked
+            unequally often.
     """
 
     restricted_mean_time: float | None = None
