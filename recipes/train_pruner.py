@@ -10,6 +10,7 @@ ablation; ``out/l2c.json`` and ``out/l2c_noise.json`` are for `SchedulePlanner`;
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -43,12 +44,8 @@ def main(config: DictConfig) -> None:
     trainer = make_trainer(config)
     if not (out / CHECKPOINT).exists():
         begin(trainer, config)
-    made = {
-        "init": initial_schedules(config),
-        "spread": config.spread,
-        "targets": settings["targets"],
-        "rollouts": config.rollouts,
-    }
+    made = {"init": initial_schedules(config), "targets": settings["targets"]}
+    made |= {name: settings[name] for name in ("spread", "rollouts")}
     train(trainer, settings, export=partial(export_planner, trainer, out, made))
     if config.logger == "csv" and trainer.step >= config.log_every:
         plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
@@ -72,9 +69,9 @@ def initial_schedules(config: DictConfig) -> list[str]:
 
 
 def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
-    """Return observations and targets, from ``out/targets.safetensors`` if they were made before.
+    """Return observations and targets, read where an earlier run made them.
 
-    Targets of other settings, that a run left which failed before it had trained anything, are made anew.
+    Those of other settings are made anew, or refused once something was trained on them.
     """
     path = Path(config.out) / "targets.safetensors"
     made_for = {
@@ -84,12 +81,9 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
         **config.targets,
         "rollouts": [config.rollouts, *initial_schedules(config)[:1]] if config.rollouts else [],
     }
-    if path.exists():
-        try:
-            return load_targets(path, made_for)
-        except ValueError:
-            if (path.parent / CHECKPOINT).exists():
-                raise
+    stale = () if path.with_name(CHECKPOINT).exists() else (ValueError,)
+    with suppress(FileNotFoundError, *stale):
+        return load_targets(path, made_for)
     task = find_task(config.task)
     seen, poses = observed_keys(task.name, policy), task.acts_in_poses
     demos = read_demos(config.demos, seen, poses=poses, task=task.name)

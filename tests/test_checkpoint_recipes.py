@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import h5py
 import pytest
 
 from tests.recipe_modules import ENVIRONMENT, run, run_alone
@@ -31,18 +30,10 @@ def test_a_checkpoint_of_another_task_is_refused_with_both_named(checkpoint, tmp
     assert not (tmp_path / "none").exists()
 
 
-def robomimic_demos(path):
-    """Collect two, with the hand's rotation under the name that published policies observe."""
-    run("collect_demos", "task=lift", "episodes=2", f"out={path}")
-    with h5py.File(path, "a") as file:
-        for demo in file["data"].values():
-            demo.move("obs/robot0_eef_quat_site", "obs/robot0_eef_quat")
-    return path
-
-
 def test_a_checkpoint_is_accelerated_offline_and_then_played(checkpoint, tmp_path):
     """The first without a simulator; the second goes on from what the first left."""
-    demos, out = robomimic_demos(tmp_path / "demos.h5"), tmp_path / "fast"
+    demos, out = tmp_path / "demos.h5", tmp_path / "fast"
+    run("collect_demos", "task=lift", "episodes=2", f"out={demos}")
     options = (
         f"policy={checkpoint}", f"demos={demos}", f"out={out}", "windows=4", "latency_repeats=2", "finalists=1",
         "candidates={samplers: [ddpm4], searched: [ddim2], cached: [], updates: [7], intervals: [2], strides: [40]}",
