@@ -46,6 +46,7 @@ OPTIONS: dict[str, Any] = {
     "policy": Word,
     "benchmark_engine.policy": Word | None,
     "libero_smoke.policy": Word | None,
+    "libero_smoke.heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
     "planners": Word,
     "demos": Word | None,
     "out": Word,
