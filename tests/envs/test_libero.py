@@ -6,6 +6,7 @@ import hydra
 import imageio.v3 as iio
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
@@ -14,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from tests.recipe_modules import RECIPES, load_recipe
 from tests.storage.published import openvla
 from torchrl_sparse import keys
+from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
 from torchrl_sparse.envs.release_images import ReleaseImages, as_released
 
@@ -68,7 +70,7 @@ class StillScene(EnvBase):
 
     def __init__(self, image_size):
         super().__init__(batch_size=[])
-        image = Bounded(0, 255, (3, image_size, image_size), dtype=torch.uint8)
+        image = Unbounded((3, image_size, image_size), dtype=torch.uint8)
         observation = {
             "image": image,
             "wrist_image": image.clone(),
@@ -134,6 +136,7 @@ def test_a_published_folder_is_played_on_its_images(tmp_path, monkeypatch, capsy
     options = [f"policy={tmp_path}/published", "suites=[libero_spatial]", "heads=[4,2,4]", "steps=5"]
     with hydra.initialize_config_dir(str(RECIPES), version_base=None):
         config = hydra.compose("libero_smoke", [*options, "n_action_steps=4", "alpha=0.1", f"out={tmp_path}"])
+    check_options("libero_smoke", OmegaConf.to_container(config))
     recipe.main.__wrapped__(config)
     assert asked == [("libero_spatial", 28, True)]
     assert "libero_spatial, 'wait': 5 steps, 2 queries" in capsys.readouterr().out

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import Unbounded
 from torchrl.envs.transforms import Transform
 
 __all__ = ["RENDERED_SIZE", "ReleaseImages", "as_released"]
@@ -62,6 +63,6 @@ class ReleaseImages(Transform):
     def transform_observation_spec(self, observation_spec):
         for key in self.in_keys:
             spec = observation_spec[key]
-            space = {"low": 0, "high": 255, "shape": (*spec.shape[:-2], self.size, self.size)}
-            observation_spec[key] = type(spec)(**space, dtype=spec.dtype, device=spec.device)
+            shape = (*spec.shape[:-2], self.size, self.size)
+            observation_spec[key] = Unbounded(shape, dtype=spec.dtype, device=spec.device)
         return observation_spec
