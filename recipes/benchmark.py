@@ -20,6 +20,7 @@ from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import (
+    default_methods,
     draw_methods,
     make_methods,
     measure_methods,
@@ -48,6 +49,9 @@ from torchrl_sparse.training.diffusion.published import executed_steps
 @recipe("benchmark")
 def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_task(config.task), Path(config.planners)
+    if config.methods is None:
+        config.methods = default_methods(planners)
+        print(f"methods: {', '.join(config.methods)}")
     check_names(config, partial(check_method, planners=planners))
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
     config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)

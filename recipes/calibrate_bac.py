@@ -18,6 +18,7 @@ from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import tuning_seeds
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
@@ -25,11 +26,12 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
 @recipe("calibrate_bac")
 def main(config: DictConfig) -> None:
+    task = find_task(config.task).name
     policy = DiffusionPolicy.from_pretrained(config.policy)
     if config.sampler is not None:
         train_steps = policy.sampler.num_train_timesteps
         policy.sampler = Sampler.from_name(config.sampler, num_train_timesteps=train_steps)
-    environment = diffusion_env(config.task, policy)
+    environment = diffusion_env(task, policy)
     seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)
     dense = query_flops(policy.network, Dense().mask(policy.plan.spec))

@@ -33,8 +33,9 @@ from torchrl_sparse.training.diffusion.published import executed_steps
 @recipe("evaluate_policy")
 def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
+    find_task(config.task)  # before a policy is looked for under its name
     demonstrated = demonstrated_ways(config)
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     if config.sampler is not None:
         policy.sampler = Sampler(**config.sampler)
     episodes = play(policy, config)
@@ -55,6 +56,7 @@ def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
         diffusion_env(task.name, policy, config.horizon),
         tuning_seeds(first, config.episodes),
         num_envs=config.num_envs,
+        policy_device=config.device,
         log=episode_log(config.out, "dense"),
         identity=played | method_identity("dense", policy),
     )

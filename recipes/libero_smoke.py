@@ -2,6 +2,7 @@
 
     python recipes/libero_smoke.py                         # random weights: does everything fit together?
     python recipes/libero_smoke.py policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
+    python recipes/libero_smoke.py policy=PATH suites=[libero_spatial] steps=220   # a published folder of OpenVLA-OFT
 
 Needs the extra libero, see `torchrl_sparse.envs.libero`, and a GL library. Writes OUT/<suite>.png.
 """
@@ -26,6 +27,7 @@ from torchrl_sparse.evaluation.figures.tokens import draw_tokens, plot_token_str
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft
 from torchrl_sparse.tokens.specprune import SpecPrune
 
 _SHOWN = 6
@@ -33,31 +35,41 @@ _SHOWN = 6
 
 @recipe("libero_smoke")
 def main(config: DictConfig) -> None:
-    policy = make_policy(config)
     for suite in config.suites or SUITES:
-        steps = rollout(policy, suite, config)
-        queries = steps[steps[keys.QUERIED].squeeze(-1)]
-        path = draw(policy, queries, Path(config.out) / f"{suite}.png")
-        print(
-            f"{suite}, {steps[keys.INSTRUCTION][0]!r}: {len(steps)} steps, {len(queries)} queries, "
-            f"{queries[keys.KEPT].mean():.0f} visual tokens, success {steps['next', keys.SUCCESS].any().item()}; {path}"
-        )
+        print(play(suite, config))
+
+
+def play(suite: str, config: DictConfig) -> str:
+    """Step and draw one suite, and tell what happened; a policy is loaded for each, and none while another is in memory."""
+    published = config.policy is not None and is_openvla_oft(config.policy)
+    policy = load_published(suite, config) if published else make_policy(config)
+    policy.pruner = SpecPrune(config.preset, alpha=config.alpha)
+    steps = rollout(policy.to(config.device), suite, config, as_released=published)
+    queries = steps[steps[keys.QUERIED].squeeze(-1)]
+    path = draw(policy, queries, Path(config.out) / f"{suite}.png")
+    return (
+        f"{suite}, {steps[keys.INSTRUCTION][0]!r}: {len(steps)} steps, {len(queries)} queries, "
+        f"{queries[keys.KEPT].mean():.0f} visual tokens, success {steps['next', keys.SUCCESS].any().item()}; {path}"
+    )
+
+
+def load_published(suite: str, config: DictConfig) -> VLAPolicy:
+    """Load a folder of OpenVLA-OFT with the suite's own range of actions."""
+    return VLAPolicy.from_openvla_oft(config.policy, unnorm_key=suite, heads=tuple(config.heads))
 
 
 def make_policy(config: DictConfig) -> VLAPolicy:
     """Load the policy in a folder, or make a small one with random weights."""
     if config.policy is not None:
-        policy = VLAPolicy.from_pretrained(config.policy)
-    else:
-        torch.manual_seed(0)
-        policy = VLAPolicy(VLANetwork(VLAConfig.small()))
-    policy.pruner = SpecPrune(config.preset, alpha=config.alpha)
-    return policy.to(config.device)
+        return VLAPolicy.from_pretrained(config.policy)
+    torch.manual_seed(0)
+    return VLAPolicy(VLANetwork(VLAConfig.small()))
 
 
-def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase:
+def rollout(policy: VLAPolicy, suite: str, config: DictConfig, *, as_released: bool) -> TensorDictBase:
     """Run ``steps`` steps of the suite's task, [T]."""
-    env = make_libero_env(suite, config.task_id, image_size=policy.network.config.image_size)
+    size = policy.network.config.image_size
+    env = make_libero_env(suite, config.task_id, image_size=size, as_released=as_released)
     actor = ChunkExecutor(policy, config.n_action_steps, ActionAwareController())
     collector = Collector(
         env,

@@ -21,6 +21,7 @@ from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
+    find_program,
     merge_trials,
     read_sweep,
     run_trial,
@@ -65,6 +66,7 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     import wandb
 
     note = out / "sweep_id"
+    sweep = sweep | {"program": str(find_program(sweep["program"]))}
     if not note.exists():
         with atomic_path(note) as temporary:
             temporary.write_text(wandb.sweep(sweep, project=config.project))
@@ -78,7 +80,13 @@ def summarise(sweep: LocalSweep) -> None:
     save_results(results, sweep.out / "results.json")
     plot_pareto(results, sweep.out / "pareto.png")
     write_trials(trials, sweep.out / "trials.csv")
-    print(f"\n{format_table(results)}\n\n{len(trials)} trials; files are in {sweep.out}")
+    print(f"\n{format_table(results)}\n\n{CAPTION}\n{len(trials)} trials; files are in {sweep.out}")
+
+
+CAPTION = (
+    "Each method was timed in the process of its own trial, interleaved with that trial's dense, which its speed-up is "
+    "relative to; between trials nothing was interleaved. Dense is that of the first trial."
+)
 
 
 if __name__ == "__main__":

@@ -72,7 +72,10 @@ def initial_schedules(config: DictConfig) -> list[str]:
 
 
 def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
-    """Return observations and targets, from ``out/targets.safetensors`` if they were made before."""
+    """Return observations and targets, from ``out/targets.safetensors`` if they were made before.
+
+    Targets of other settings, that a run left which failed before it had trained anything, are made anew.
+    """
     path = Path(config.out) / "targets.safetensors"
     made_for = {
         "policy": policy.fingerprint,
@@ -82,7 +85,11 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
         "rollouts": [config.rollouts, *initial_schedules(config)[:1]] if config.rollouts else [],
     }
     if path.exists():
-        return load_targets(path, made_for)
+        try:
+            return load_targets(path, made_for)
+        except ValueError:
+            if (path.parent / CHECKPOINT).exists():
+                raise
     task = find_task(config.task)
     seen, poses = observed_keys(task.name, policy), task.acts_in_poses
     demos = read_demos(config.demos, seen, poses=poses, task=task.name)

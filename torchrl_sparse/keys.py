@@ -37,6 +37,8 @@ constant                          shape, dtype           meaning
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
 ``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
 ``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, as the network saw them
+``TOKEN_PAST_FRAMES``             u8 [*B, R, V, 3, h, w] those of the R queries before it, the latest first, 0 before the
+                                                         episode began; where a pruner looks further back
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
@@ -93,6 +95,7 @@ TOKEN_DEPTH = ("tokens", "depth")
 KEPT = ("tokens", "kept")
 TOKEN_SCORE = ("tokens", "score")
 TOKEN_FRAMES = ("tokens", "frames")
+TOKEN_PAST_FRAMES = ("tokens", "past_frames")
 TOKEN_BUDGET = ("tokens", "budget")
 
 CHUNK = ("vla_action", "chunk")

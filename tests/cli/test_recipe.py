@@ -40,7 +40,7 @@ def fail(monkeypatch, capsys):
         (
             "benchmark",
             ["policy=lerobot/diffusion_pusht"],
-            "expected a file lerobot/diffusion_pusht/config.json, got none",
+            "policy: expected a folder that holds config.json, or a .ckpt file, got lerobot/diffusion_pusht; names of",
         ),
         ("collect_demos", ["task=kitchen"], "task: expected one with an expert"),
         (
@@ -50,6 +50,22 @@ def fail(monkeypatch, capsys):
         ),
         ("convert_robomimic", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
         ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
+        (
+            "benchmark_vla",
+            ["policy=nope/vla"],
+            "policy: expected a folder that holds config.json, or a .ckpt",
+        ),
+        (
+            "benchmark_vla",
+            ["policy=assets/lift"],
+            "assets/lift/config.json: format: expected 'torchrl_sparse.vla",
+        ),
+        ("calibrate_bac", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
+        ("calibrate_bac", ["task=juggle"], "task: expected one of Lift, "),
+        ("evaluate_policy", ["task=juggle"], "task: expected one of Lift, "),
+        ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
+        ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
+        ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
         ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
     ],

@@ -95,7 +95,8 @@ def test_layout_is_the_documented_one(collected):
             assert demo["actions"].shape == demo["executed_actions"].shape == (steps, 7)
             assert demo["states"].shape == (steps, 32)
             assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == [0] * (steps - 1) + [1]
-            assert set(demo["obs"]) == set(find_robosuite_task("Lift").state_keys)
+            published = {"robot0_eef_quat"}  # which no policy of ours observes
+            assert set(demo["obs"]) == set(find_robosuite_task("Lift").state_keys) | published
     assert (summary.attempts, summary.successes, summary.kept) == (3, 3, 3)
     assert str(summary).startswith("successes/attempts 3/3, kept 3, mean length ")
 
@@ -211,6 +212,32 @@ def test_a_finished_file_is_reported_not_made_again(fake, tmp_path):
     fake.seeds.clear()
     assert collect(path, Collection("Lift", episodes=2)) == first
     assert fake.seeds == []
+
+
+def test_a_longer_collection_extends_a_shorter_one(fake, tmp_path):
+    whole, path = tmp_path / "whole.h5", tmp_path / "a.h5"
+    collect(whole, Collection("Lift", episodes=6))
+    shorter = collect(path, Collection("Lift", episodes=4))
+    fake.seeds.clear()
+
+    def interrupt(tally):
+        if tally.attempts == 6:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        collect(path, Collection("Lift", episodes=6), on_episode=interrupt)
+    summary = collect(path, Collection("Lift", episodes=6))
+    assert (shorter.kept, summary.kept) == (4, 6)
+    assert fake.seeds == [3, 5, 6, 7]  # what failed, of which no file tells, and what is new
+    assert path.read_bytes() == whole.read_bytes()
+    with pytest.raises(ValueError, match="episodes is 5 here and 6 there"):
+        collect(path, Collection("Lift", episodes=5))
+
+
+def test_settings_alone_hold_nobody_up(fake, tmp_path):
+    (tmp_path / "a.h5.parts").mkdir()
+    (tmp_path / "a.h5.parts" / "settings.json").write_text('{"quality": "mixed"}')
+    assert collect(tmp_path / "a.h5", Collection("Lift", episodes=1)).kept == 1
 
 
 def test_other_settings_never_mix(fake, tmp_path):

@@ -8,12 +8,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.recipe_modules import RECIPES, load_recipe
+from tests.storage.published import openvla
 from torchrl_sparse import keys
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
+from torchrl_sparse.envs.release_images import ReleaseImages, as_released
 
 needs_libero = pytest.mark.skipif(importlib.util.find_spec("libero") is None, reason="no LIBERO")
 
@@ -91,12 +93,59 @@ class StillScene(EnvBase):
         pass
 
 
+class Rendered(StillScene):
+    """The same with noise for pictures."""
+
+    def _reset(self, tensordict=None, **kwargs):
+        td = super()._reset()
+        generator = torch.Generator().manual_seed(0)
+        for camera in (keys.IMAGE, keys.WRIST_IMAGE):
+            shape = td[camera].shape
+            td[camera] = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+        return td
+
+
+def test_images_go_the_way_of_the_release():
+    """A wave that both sizes can show stays; one pixel wide stripes do not pass the filter."""
+    ramp = torch.linspace(40, 200, 256).round().byte().expand(3, 256, 256)
+    expected = torch.linspace(40, 200, 224).expand(3, 224, 224)
+    assert (as_released(ramp, 224).float() - expected)[..., 4:-4].abs().max() < 3
+    stripes = (torch.arange(256) % 2 * 200).byte().expand(3, 256, 256)
+    assert as_released(stripes, 56).float()[..., 4:-4].std() < 3  # aliased, they would be 0 or 200
+    env = TransformedEnv(Rendered(256), ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], 28))
+    check_env_specs(env)
+    steps, raw = env.rollout(2), Rendered(256).reset()
+    for camera in (keys.IMAGE, keys.WRIST_IMAGE):
+        assert torch.equal(steps[camera][0], as_released(raw[camera], 28))
+
+
+def test_a_published_folder_is_played_on_its_images(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("transformers")
+    (tmp_path / "published").mkdir()
+    openvla.write(tmp_path / "published", openvla.make_tensors(), *openvla.make_heads())
+    recipe, asked = load_recipe("libero_smoke"), []
+
+    def make(suite, task_id, image_size, as_released):
+        asked.append((suite, image_size, as_released))
+        images = ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], image_size)
+        return TransformedEnv(Rendered(256), Compose(InitTracker(), images))
+
+    monkeypatch.setattr(recipe, "make_libero_env", make)
+    options = [f"policy={tmp_path}/published", "suites=[libero_spatial]", "heads=[4,2,4]", "steps=5"]
+    with hydra.initialize_config_dir(str(RECIPES), version_base=None):
+        config = hydra.compose("libero_smoke", [*options, "n_action_steps=4", "alpha=0.1", f"out={tmp_path}"])
+    recipe.main.__wrapped__(config)
+    assert asked == [("libero_spatial", 28, True)]
+    assert "libero_spatial, 'wait': 5 steps, 2 queries" in capsys.readouterr().out
+
+
 def test_the_smoke_recipe_steps_and_draws_every_suite(tmp_path, monkeypatch, capsys):
     pytest.importorskip("transformers")
     recipe = load_recipe("libero_smoke")
     asked = []
 
-    def make(suite, task_id, image_size):
+    def make(suite, task_id, image_size, as_released):
+        assert not as_released
         asked.append((suite, task_id))
         return TransformedEnv(StillScene(image_size), InitTracker())
 

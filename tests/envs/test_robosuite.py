@@ -1,5 +1,6 @@
 """Real robosuite environments, state only."""
 
+import pickle
 from functools import partial
 
 import numpy as np
@@ -199,3 +200,19 @@ def test_bad_input_is_named(lift):
         lift._step(lift.reset().set("action", torch.zeros(10)))
     with pytest.raises(ValueError, match="action: expected finite numbers"):
         lift._step(lift.reset().set("action", torch.full((7,), float("nan"))))
+
+
+def test_a_size_of_images_without_a_camera_is_refused():
+    with pytest.raises(
+        ValueError, match=r"image_size: expected a camera or wrist_camera with it, .* got 84 alone"
+    ):
+        make_env("LiftNamed", image_size=84)
+
+
+def test_a_ready_made_environment_is_made_anew_where_it_is_sent():
+    """`MultiSyncCollector` sends one that it is given instead of a function."""
+    env = make_env("Lift", seeds=[7, 8])
+    first = env.reset()
+    copy = pickle.loads(pickle.dumps(env))
+    assert copy.base_env.sim_env is not env.base_env.sim_env
+    assert (copy.reset() == first).all()

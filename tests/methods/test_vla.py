@@ -19,10 +19,11 @@ def test_names_make_pruners():
     assert make_pruner("fastv@specprune", number=0.125).share == 0.125
 
 
-def test_specprune_runs_with_a_controller_and_so_do_those_that_lack_one_of_its_sets():
+def test_specprune_runs_with_a_controller_and_so_do_its_variants():
     controlled = [name for name in TOKEN_METHODS if make_controller(name) is not None]
     lacking = {f"specprune_no_{name}": name for name in ("carry", "changed", "local")}
-    assert controlled == ["specprune", *lacking]
+    assert controlled == ["specprune", "specprune_look_back", *lacking]
+    assert make_pruner("specprune_look_back").options.look_back == 4
     assert make_controller("specprune", {"controller": {"coarse": 9}}).budgets == (9, 40)
     for name, ingredient in lacking.items():
         options = make_pruner(f"{name}@0.3").options

@@ -35,6 +35,7 @@ PRUNERS = {
     "random_dense_first": lambda: DenseFirst(RandomPruner()),
     "sparsevlm_dense_first": lambda: DenseFirst(SparseVLMPruner(raters="embeddings")),
     "no_local": lambda: SpecPrune(budget=4, local=False),
+    "look_back": lambda: SpecPrune(budget=4, look_back=3),
     "random": RandomPruner,
     "frame_difference": FrameDifferencePruner,
 }
@@ -51,6 +52,7 @@ KEEP_ALL = {
     "random_dense_first": lambda: DenseFirst(RandomPruner(share=1.0)),
     "sparsevlm_dense_first": lambda: DenseFirst(SparseVLMPruner(scale=1e-6, raters="embeddings")),
     "no_local": lambda: SpecPrune(budget=PER_CAMERA, keep_share=1.0, local=False, threshold=2.0),
+    "look_back": lambda: SpecPrune(budget=PER_CAMERA, keep_share=1.0, look_back=3),
     "random": lambda: RandomPruner(share=1.0),
     "frame_difference": lambda: FrameDifferencePruner(share=1.0),
 }
@@ -71,6 +73,7 @@ def query(batch=3, seed=0):
     for camera in SPEC.cameras:
         td[camera] = torch.randint(0, 256, (batch, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
     td[keys.STATE] = torch.randn(batch, CONFIG.state_dim, generator=generator)
+    td[keys.EEF_VEL] = torch.zeros(batch, 6)
     td[keys.IS_INIT] = torch.ones(batch, 1, dtype=torch.bool)
     td[keys.EPISODE_SEED] = torch.arange(batch)[:, None] + 10
     td[keys.EPISODE_STEP] = torch.zeros(batch, 1, dtype=torch.int64)

@@ -77,7 +77,7 @@ def test_a_row_of_a_batch_is_the_row_alone(name):
     policy = make_policy(PRUNERS[name]())
     first = policy(query(4))
     second = policy(later(first))
-    if name in ("specprune", "release", "no_local", "sparsevlm"):
+    if name in ("specprune", "release", "no_local", "look_back", "sparsevlm"):
         assert len(set(second[keys.KEPT].flatten().tolist())) > 1  # rows of different lengths
     for before, after in ((query(4), first), (later(first), second)):
         for row in range(4):
@@ -100,7 +100,7 @@ def test_a_new_episode_forgets_the_last(name):
         torch.testing.assert_close(got[keys.CHUNK][row], expected[keys.CHUNK][row], atol=1e-5, rtol=0)
     # The one that goes on remembers, where there is something to remember.
     remembers = (got[keys.TOKEN_DEPTH][1] != expected[keys.TOKEN_DEPTH][1]).any()
-    assert remembers == (name in ("specprune", "release", "no_local", "frame_difference"))
+    assert remembers == (name in ("specprune", "release", "no_local", "look_back", "frame_difference"))
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -112,7 +112,7 @@ def test_everything_that_is_written_is_declared_and_the_other_way_round(name):
     assert written == set(policy.out_keys)
     carried = written & set(policy.in_keys)
     assert (keys.TOKEN_FRAMES in carried) == (
-        name in ("specprune", "release", "no_local", "vla_cache", "frame_difference")
+        name in ("specprune", "release", "no_local", "look_back", "vla_cache", "frame_difference")
     )
 
 

@@ -13,6 +13,7 @@ from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
 from torchrl_sparse.tokens.frames import compare_frames, patches, similarity
+from torchrl_sparse.tokens.specprune import SpecPrune
 
 
 def test_patches_are_cut_row_by_row_and_camera_by_camera():
@@ -72,6 +73,52 @@ def test_without_a_history_there_is_nothing_to_compare_with():
     assert compare_frames(td, SPEC)[1].all()
     with pytest.raises(KeyError, match="is_init"):
         compare_frames(query().exclude(keys.IS_INIT), SPEC)
+
+
+def unlike(td, furthest=3):
+    """Patches that changed, of each row, as the comparison sees it."""
+    alike, first = compare_frames(td, SPEC, furthest, swift=0.3)
+    return [
+        None if new else (row < 0.99).nonzero().flatten().tolist()
+        for row, new in zip(alike, first, strict=True)
+    ]
+
+
+def test_the_slower_the_hand_the_further_back_is_the_frame():
+    """Patch 1 changes at the second query, 2 at the third and so on; three hands at rest, slow and swift."""
+    td, speeds = query(), torch.tensor([0.0, 0.15, 0.3])
+    td[keys.EEF_VEL][:, 2] = -speeds
+    seen = [unlike(td)]
+    for number in range(1, 5):
+        td = later(td, [(0, number)], seed=number)
+        seen.append(unlike(td))
+    assert seen[0] == [None] * 3
+    assert seen[1] == [[1]] * 3  # there is one frame only
+    assert seen[2] == [[1, 2], [1, 2], [2]]
+    assert seen[3] == [[1, 2, 3], [2, 3], [3]]
+    assert seen[4] == [[2, 3, 4], [3, 4], [4]]  # three back, and no further
+    td = later(td, [(0, 5)])
+    td[keys.IS_INIT] = torch.tensor([[False], [True], [True]])
+    assert unlike(td) == [[3, 4, 5], None, None]
+    assert unlike(later(td, [(0, 6)])) == [[4, 5, 6], [6], [6]]  # nothing is left of the last episode
+
+
+def test_of_two_arms_the_slower_decides():
+    td = query()
+    td[keys.EEF_VEL] = torch.zeros(3, 12).index_fill_(1, torch.tensor([0]), 9.0)
+    unlike(td)
+    td = later(td, [(0, 1)])
+    unlike(td)
+    assert unlike(later(td, [(0, 2)], seed=2)) == [[1, 2]] * 3
+
+
+def test_looking_back_takes_a_query_and_the_speed():
+    with pytest.raises(ValueError, match="look_back: expected at least 1 query, got 0"):
+        SpecPrune(look_back=0)
+    td = query()
+    unlike(td)
+    with pytest.raises(KeyError, match="eef_vel"):
+        unlike(later(td).exclude(keys.EEF_VEL))
 
 
 def test_patches_are_those_of_the_crop_that_the_network_sees():

@@ -19,7 +19,8 @@ class Config:
 class Regression(Trainer):
     """Fits one number to eight samples; `at_step` is called before each step."""
 
-    def __init__(self, total=6, at_step=lambda step: None):
+    def __init__(self, total=6, at_step=lambda step: None, scale=3):
+        self.scale = scale
         module = nn.Linear(1, 1, bias=False)
         nn.init.zeros_(module.weight)
         self.samples, self.at_step = torch.arange(8.0)[:, None], at_step
@@ -28,14 +29,14 @@ class Regression(Trainer):
 
     def batch_losses(self, index):
         self.at_step(self.step)
-        error = self.module(self.samples[index]) - 3 * self.samples[index]
+        error = self.module(self.samples[index]) - self.scale * self.samples[index]
         return {"loss": error.square().mean(), "bias": error.mean()}
 
     def validate(self):
         return {"error": abs(self.module.weight.item() - 3)}
 
     def header(self):
-        return {"config": {"total": self.total}}
+        return {"config": {"max_steps": self.total, "scale": self.scale}}
 
 
 @pytest.fixture
@@ -111,8 +112,18 @@ def test_a_checkpoint_from_before_it_held_unlogged_steps_is_resumed(tmp_path):
 def test_a_checkpoint_of_another_training_is_refused(run):
     run(Regression())
     with pytest.raises(
-        ValueError, match=r"checkpoint.pt: made with another config: total is 7 here and 6 there"
+        ValueError, match=r"checkpoint.pt: made with another config: scale is 2 here and 3 there; choose"
     ):
+        run(Regression(total=7, scale=2))
+
+
+def test_a_longer_training_extends_a_shorter_one_and_none_is_cut_short(run, tmp_path):
+    run(Regression())
+    longer = Regression(total=8)
+    assert run(longer)[-1] == longer.step == 8
+    assert read_scalars(tmp_path / "log")["train/lr"][:, 0].tolist() == [2, 4, 6, 8]
+    assert longer.lr == 0
+    with pytest.raises(ValueError, match=r"checkpoint.pt: expected at most 7 steps, as asked for, got 8"):
         run(Regression(total=7))
 
 

@@ -26,6 +26,7 @@ from .sag import (
 from .saved import (
     PLANNERS as PLANNERS,
     load_planner as load_planner,
+    saved_planners as saved_planners,
 )
 from .schedule import (
     CacheSchedule as CacheSchedule,

@@ -47,6 +47,8 @@ class PlanSpec:
     def check_is(self, asked: PlanSpec, who: str) -> None:
         """Raise ValueError, in the name of ``who`` was made for this, unless ``asked`` is the same.
 
+        Where another sampler is asked for, the message says in which order plan and sampler are assigned.
+
         >>> PlanSpec(100, 8, "a policy").check_is(PlanSpec(100, 8, "another"), "BAC")
         Traceback (most recent call last):
         ...
@@ -54,8 +56,12 @@ class PlanSpec:
         """
         for name in (field.name for field in fields(self)):
             if (made_for := getattr(self, name)) != (got := getattr(asked, name)):
-                label = "policy fingerprint" if name == "policy" else name
-                raise ValueError(f"{who}: made for {label} {made_for!r}, got {got!r}")
+                label, remedy = name, ""
+                if name == "policy":
+                    label = "policy fingerprint"
+                elif name != "num_layers":
+                    remedy = "; assign plan = None, then the sampler, then a plan that was made for it"
+                raise ValueError(f"{who}: made for {label} {made_for!r}, got {got!r}{remedy}")
 
 
 class Planner(TensorDictModuleBase):

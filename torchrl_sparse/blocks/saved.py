@@ -16,7 +16,7 @@ from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanne
 from torchrl_sparse.blocks.sag import planner as sag
 from torchrl_sparse.storage.json import read_json
 
-__all__ = ["PLANNERS", "load_planner", "save_beside"]
+__all__ = ["PLANNERS", "load_planner", "save_beside", "saved_planners"]
 
 PLANNERS: dict[str, type[Planner]] = {
     schedule.FORMAT: schedule.SchedulePlanner,
@@ -53,6 +53,26 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
     return planner
+
+
+def saved_planners(folder: str | os.PathLike) -> list[str]:
+    """Return the names of the planners in a folder, sorted: ``NAME.json`` or ``NAME/`` of a format in :data:`PLANNERS`.
+
+    >>> saved_planners("assets/lift")
+    ['bac', 'bac_blockwise', 'bac_m6', 'bac_unified', 'l2c', 'sag', 'sag_fixed']
+    """
+    files = {path.stem: path for path in Path(folder).glob("*.json")}
+    files |= {path.parent.name: path for path in Path(folder).glob("*/config.json")}
+    return sorted(name for name, file in files.items() if _format(file) in PLANNERS)
+
+
+def _format(file: Path) -> str | None:
+    """Return the format that a file names; None if it is no JSON object that names one."""
+    try:
+        found = read_json(file, dict[str, Any]).get("format")
+    except ValueError:
+        return None
+    return found if isinstance(found, str) else None
 
 
 def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] | None:

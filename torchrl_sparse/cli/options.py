@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
+from torchrl_sparse.runtime.devices import check_device
 from torchrl_sparse.storage.json import check_plain
 
 _PACKAGE = Path(__file__).parents[1]
@@ -44,8 +45,7 @@ OPTIONS: dict[str, Any] = {
     # what is done, on what, where to
     "task": Word,
     "policy": Word,
-    "benchmark_engine.policy": Word | None,
-    "libero_smoke.policy": Word | None,
+    **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy"), Word | None),
     "planners": Word,
     "demos": Word | None,
     "out": Word,
@@ -68,6 +68,7 @@ OPTIONS: dict[str, Any] = {
     # methods
     "method": Word,
     "methods": Words,
+    "benchmark.methods": Words | None,
     "benchmark_vla.methods": list[Word],  # none: dense alone
     "calibrate_bac.methods": Annotated[
         list[Literal["bac", "bac_blockwise", "bac_unified"]], Field(min_length=1)
@@ -141,8 +142,7 @@ OPTIONS: dict[str, Any] = {
     "warmup": Whole,
     **dict.fromkeys(("quick", "compile", "calibrated"), bool),
     "batch": Count,
-    "cases": Annotated[list[Section], Field(min_length=1)],
-    "gpu_cases": Annotated[list[Section], Field(min_length=1)],
+    **dict.fromkeys(("cases", "gpu_cases"), Annotated[list[Section], Field(min_length=1)]),
     "shape": Word,
     "threads": Count | None,
     "thread_counts": Annotated[list[Annotated[int, Field(ge=1, le=64)]], Field(min_length=1)],
@@ -151,7 +151,7 @@ OPTIONS: dict[str, Any] = {
     "busy": Whole,
     "library": Word | None,
     "engine": Word,
-    "device": Word,
+    "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"],
     # cameras
     "cameras": Section,

@@ -124,7 +124,7 @@ class AbsoluteActions:
 
         Returns:
             ``"actions"`` f64 [T, 7 * arms] (position in m, rotation vector in rad, both in the world frame; gripper), and
-            ``"obs/<key>"`` f64 [T, n] for each of the task's ``state_keys``.
+            ``"obs/<key>"`` f64 [T, n] for each of the environment's ``recorded_keys``.
 
         Raises:
             ValueError: if the sizes are not those of the task.
@@ -133,12 +133,12 @@ class AbsoluteActions:
         self._check(states, actions)
         deltas = self.control.are_deltas(actions)
         goals = actions.copy()
-        observed: dict[str, list[np.ndarray]] = {f"obs/{key}": [] for key in self.env.task.state_keys}
+        observed: dict[str, list[np.ndarray]] = {f"obs/{key}": [] for key in self.env.recorded_keys}
         rotations: list[np.ndarray | None] = [None] * len(self._controllers)
         for state, goal in zip(states, goals.reshape(len(goals), -1, POSE_DIM), strict=True):
             sim.set_state_from_flattened(state)
             sim.forward()
-            for key, value in self.env.raw_observation().items():
+            for key, value in self.env.raw_observation(self.env.recorded_keys).items():
                 observed[f"obs/{key}"].append(value)
             for arm, osc in enumerate(self._controllers if deltas else ()):
                 position, rotations[arm] = self._goal(osc, goal[arm, :6], rotations[arm])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -22,7 +22,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.demo_workers import in_order
-from torchrl_sparse.data.hdf5_writer import Episode, episode_length, merge_episodes, write_episode
+from torchrl_sparse.data.hdf5_writer import (
+    Episode,
+    episode_length,
+    merge_episodes,
+    split_episodes,
+    write_episode,
+)
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
@@ -139,7 +145,11 @@ def demonstrate(task: Task, env: EnvBase, seed: int, quality: str = "proficient"
         executed_actions=arrays["executed"],
         rewards=arrays["success"].astype(np.float64),
         dones=arrays["success"].astype(np.int64),
-        observations={key: arrays[_OBSERVED + key] for key in task.state_keys},
+        observations={
+            name.removeprefix(_OBSERVED): array
+            for name, array in arrays.items()
+            if name.startswith(_OBSERVED)
+        },
     )
 
 
@@ -155,7 +165,7 @@ def collect(
     """Collect demonstrations into ``path``, resuming where a killed run stopped.
 
     Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the
-    end. Calling again after that only reports.
+    end. Calling again after that only reports or, for more episodes, goes on from those of the file.
 
     Args:
         path: the HDF5 file to make; layout in `torchrl_sparse.data.hdf5_writer`.
@@ -172,10 +182,18 @@ def collect(
     path = Path(path)
     check_backend(backend, workers)
     settings = asdict(collection)
+    extendable = {name: value for name, value in settings.items() if name != "episodes"}
+    shorter = False
     if path.exists():
-        shutil.rmtree(parts_of(path), ignore_errors=True)  # a kill between the two last steps leaves them
-        return _finished(path, settings)
-    parts = claim_parts(path, settings).absolute()  # workers may run in another folder
+        made = _read_finished(path)
+        shorter = made.episodes < collection.episodes
+        check_same(path, asdict(made), extendable if shorter else settings)
+        if not shorter:
+            shutil.rmtree(parts_of(path), ignore_errors=True)  # a kill between the two last steps leaves them
+            return made.summary
+    parts = claim_parts(path, extendable).absolute()  # workers may run in another folder
+    if shorter:
+        split_episodes(path, partial(_part, parts))
     kept: list[Path] = []
     tally = Summary(0, 0, 0, 0.0)
     with closing(_seeds_made(parts, collection, env, workers, backend)) as seeds:
@@ -245,11 +263,9 @@ def _check_yield(tally: Summary) -> None:
         raise RunFailed(f"the expert fails: {tally}; keep_failures=true collects its episodes")
 
 
-def _finished(path: Path, settings: Mapping[str, Any]) -> Summary:
+def _read_finished(path: Path) -> _Finished:
     with h5py.File(path, "r") as file:
-        made = parse_json(file["data"].attrs.get("collection", "{}"), _Finished, f"{path}: collection")
-    check_same(path, asdict(made), settings)
-    return made.summary
+        return parse_json(file["data"].attrs.get("collection", "{}"), _Finished, f"{path}: collection")
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:

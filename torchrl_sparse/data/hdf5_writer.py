@@ -14,14 +14,15 @@ in the file                   shape, type            meaning
                                                      rotation vector, rad; gripper, -1 open to 1 closed
 ``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
 ``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
-``obs/<key>``                 f64 [T, n]             observations before each action
+``obs/<key>``                 f64 [T, n]             observations before each action: the task's state and, of robosuite's
+                                                     tasks, ``robot<i>_eef_quat``, which published policies observe
 ============================  =====================  =========================================================
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,15 @@ def merge_episodes(
                 copy_attributes(source["demo"], data[name])
                 for child in source["demo"]:
                     source.copy(f"demo/{child}", data[name])
+
+
+def split_episodes(path: Path, part: Callable[[int], Path]) -> None:
+    """Undo `merge_episodes`: write each demonstration as the file ``part(seed)``, unless that is there."""
+    with h5py.File(path, "r") as source:
+        for demo in source["data"].values():
+            if not (episode := part(int(demo.attrs["seed"]))).exists():
+                with new_hdf5(episode) as file:
+                    source.copy(demo, file, "demo")
 
 
 def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 
 import h5py
@@ -44,6 +45,7 @@ def read_images(
             size than those before.
     """
     episodes = _episodes(path, data, lengths, key)
+    episodes = chain([next(episodes)], episodes)  # what is missing is found before anything is written
     if folder is None:
         return torch.cat([torch.from_numpy(episode) for episode in episodes])
     filename = Path(folder) / f"{key}.memmap"

@@ -21,7 +21,7 @@ def parts_of(path: Path) -> Path:
 
 
 def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
-    """Make the folder of parts of ``path``, or find it again for the same settings.
+    """Make the folder of parts of ``path``, or find it again for the same settings; without a part it is anybody's.
 
     Raises:
         ValueError: if it holds parts that were made with other settings.
@@ -29,7 +29,7 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
     parts = parts_of(path)
     parts.mkdir(parents=True, exist_ok=True)
     note = parts / "settings.json"
-    if not note.exists():
+    if not any(parts.glob("[!.]*.h5")):
         write_json(note, settings)
     check_same(note, read_json(note, dict[str, Any]), settings)
     return parts

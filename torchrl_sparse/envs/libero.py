@@ -20,6 +20,7 @@ from torchrl.envs import Compose, InitTracker, LiberoEnv, RenameTransform, Trans
 from torchrl.envs.transforms import Transform
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.release_images import RENDERED_SIZE, ReleaseImages
 from torchrl_sparse.envs.simulator import import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask
 from torchrl_sparse.envs.transforms import EndEffectorVelocity
@@ -40,6 +41,7 @@ def make_libero_env(
     task_id: int,
     *,
     image_size: int = 224,
+    as_released: bool = False,
     max_episode_steps: int | None = None,
     init_state_mode: str = "cycle",
     **kwargs: Any,
@@ -50,6 +52,8 @@ def make_libero_env(
         suite: one of `SUITES`.
         task_id: of the suite's ten tasks.
         image_size: height and width of the images in pixels.
+        as_released: render, compress and scale images as OpenVLA-OFT's evaluation does, see `envs.release_images`; published
+            checkpoints expect that. Else they are rendered at ``image_size``.
         max_episode_steps: steps until truncation; the suite's own by default.
         init_state_mode: how the benchmark's 50 initial states are gone through, see `LiberoEnv`, as are ``kwargs``.
 
@@ -64,9 +68,10 @@ def make_libero_env(
     """
     if suite not in SUITES:
         raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    rendered = RENDERED_SIZE if as_released else image_size
     options = {
-        "camera_height": image_size,
-        "camera_width": image_size,
+        "camera_height": rendered,
+        "camera_width": rendered,
         "wrist_camera": "robot0_eye_in_hand",
         "max_episode_steps": SUITES[suite] if max_episode_steps is None else max_episode_steps,
         "init_state_mode": init_state_mode,
@@ -79,9 +84,9 @@ def make_libero_env(
             f"LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]': {error}"
         ) from error
     pose = RenameTransform([keys.STATE], [_POSE])
-    return TransformedEnv(
-        env, Compose(InitTracker(), pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState())
-    )
+    images = [ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], image_size)] if as_released else []
+    state = [pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState()]
+    return TransformedEnv(env, Compose(InitTracker(), *images, *state))
 
 
 class _MountedLibero(LiberoEnv):

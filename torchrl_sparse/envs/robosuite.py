@@ -50,7 +50,7 @@ class RobosuiteEnv(SeededEnv):
         seeds: seeds of successive episodes, repeated when used up. For paired evaluations.
         camera: camera of ``("observation", "image")``, e.g. "agentview"; none by default.
         wrist_camera: camera of ``("observation", "wrist_image")``, e.g. "robot0_eye_in_hand".
-        image_size: height and width of the images, pixels.
+        image_size: height and width of the images, pixels, 84 by default; only with a camera.
         object_state: False leaves the objects out of the state, as in image tasks: cameras show them.
         state_keys: robosuite's names of the observations that make up the state, in order; None for the task's.
         convention: the version of robosuite whose meaning the objects' state has, see `torchrl_sparse.envs.conventions`.
@@ -60,7 +60,8 @@ class RobosuiteEnv(SeededEnv):
         reward_shaping: robosuite's dense reward instead of 1 on success.
 
     Raises:
-        ValueError: for an unknown task, action mode or instruction, or an action of a wrong size or that is not finite.
+        ValueError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, or an action of a
+            wrong size or that is not finite.
 
     Examples:
         >>> env = RobosuiteEnv("Lift", seeds=[7])
@@ -79,7 +80,7 @@ class RobosuiteEnv(SeededEnv):
         seeds: Sequence[int] | None = None,
         camera: str | None = None,
         wrist_camera: str | None = None,
-        image_size: int = 84,
+        image_size: int | None = None,
         object_state: bool = True,
         state_keys: Sequence[str] | None = None,
         convention: Convention = "1.5",
@@ -96,7 +97,11 @@ class RobosuiteEnv(SeededEnv):
         self.action_mode = action_mode
         self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
-        self._image_size = image_size
+        if image_size is not None and not self._cameras:
+            raise ValueError(
+                f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
+            )
+        self._image_size = 84 if image_size is None else image_size
         own_keys = self.task.state_keys if object_state else self.task.proprioception_keys
         self._state_keys = own_keys if state_keys is None else tuple(state_keys)
         self._state_size = self.task.state_size(self._state_keys)
@@ -198,6 +203,11 @@ class RobosuiteEnv(SeededEnv):
         return self.sim_env.way
 
     # -- observations --------------------------------------------------------------------------------------------------
+
+    @property
+    def recorded_keys(self) -> tuple[str, ...]:
+        """What demonstrations record: the task's state, and the hands' rotation that published policies observe."""
+        return (*self.task.state_keys, *(f"robot{arm}_eef_quat" for arm in range(self.task.arms)))
 
     def raw_observation(self, state_keys: Sequence[str] | None = None) -> Mapping[str, np.ndarray]:
         """Return the parts of the task's state, or those of ``state_keys``, by robosuite's names, f64, in that order."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +29,9 @@ class SeededEnv(EnvBase):
     An episode is *terminated* on success and *truncated* at the horizon, never both. Its integer, reported under
     ``("episode", "seed")``, is the next of ``seeds``, or one more than the last after `set_seed`.
 
+    Copied or sent to another process, as `MultiSyncCollector` does with one that is ready-made, it is made anew from the
+    arguments that it was made from, and begins with the first of ``seeds``: no simulator can be sent.
+
     A subclass makes its specs with `_make_specs` and says how an episode starts (`_start`), goes on (`_advance`), looks
     (`_observe_state`) and whether the task is done (`_is_solved`).
 
@@ -46,6 +50,14 @@ class SeededEnv(EnvBase):
     """
 
     action_mode: str = "absolute"
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> SeededEnv:
+        env = super().__new__(cls, *args, **kwargs)
+        env.__dict__["_made_from"] = args, kwargs
+        return env
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _make_anew, (type(self), *self._made_from)
 
     def __init__(
         self,
@@ -174,3 +186,7 @@ class SeededEnv(EnvBase):
         if self._tells_way:
             out[keys.EPISODE_WAY] = torch.tensor([self._way()])
         return out
+
+
+def _make_anew(kind: type[SeededEnv], args: Sequence[Any], kwargs: Mapping[str, Any]) -> SeededEnv:
+    return kind(*args, **kwargs)

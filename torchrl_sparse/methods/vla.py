@@ -68,19 +68,18 @@ def _dense() -> None:
     return None
 
 
-def _without(ingredient: str, **options: Any) -> SpecPrune:
-    """Return `SpecPrune` without one of its ingredients, an option that is True or False."""
-    return SpecPrune(**{**options, ingredient: False})
+def _specprune(fixed: dict[str, Any], **options: Any) -> SpecPrune:
+    return SpecPrune(**options | fixed)
 
 
 def _dense_first(make: Callable[..., TokenPruner], share: float = 0.5) -> DenseFirst:
     return DenseFirst(make(share))
 
 
-def _ablation(ingredient: str, color: str) -> TokenMethod:
-    """Return SpecPrune, with its controller, without one of the three sets of Eq. 6."""
+def _variant(color: str, **fixed: Any) -> TokenMethod:
+    """Return SpecPrune with its controller, and with these options whatever the settings say."""
     return TokenMethod(
-        partial(_without, ingredient),
+        partial(_specprune, fixed),
         "alpha",
         matches=True,
         settings="specprune",
@@ -100,11 +99,12 @@ TOKEN_METHODS: dict[str, TokenMethod] = {
     ),
     "specprune_uncontrolled": TokenMethod(SpecPrune, "alpha", settings="specprune", color="#8C6BB1"),
     "specprune_static": TokenMethod(
-        partial(_without, "dynamic"), "alpha", settings="specprune", color="#A6761D"
+        partial(_specprune, {"dynamic": False}), "alpha", settings="specprune", color="#A6761D"
     ),
-    "specprune_no_carry": _ablation("carry", "#74A9CF"),
-    "specprune_no_changed": _ablation("changed", "#F46D43"),
-    "specprune_no_local": _ablation("local", "#3F2A8C"),
+    "specprune_look_back": _variant("#B3CDE3", look_back=4),
+    "specprune_no_carry": _variant("#74A9CF", carry=False),
+    "specprune_no_changed": _variant("#F46D43", changed=False),
+    "specprune_no_local": _variant("#3F2A8C", local=False),
     "frame_difference": TokenMethod(FrameDifferencePruner, "share", matches=True, color="#B2182B"),
     "fastv": TokenMethod(FastVPruner, "share", matches=True, color="#4D4D4D"),
     "fastv_scaled": TokenMethod(partial(FastVPruner, depth=32), "share", matches=True, color="#9E9AC8"),
@@ -126,6 +126,7 @@ TOKEN_METHODS: dict[str, TokenMethod] = {
 }
 """Name -> method. ``specprune`` runs with the controller; ``specprune_uncontrolled`` (static and dynamic pruning) and
 ``specprune_static`` are its ablations, and so are, with the controller, those that lack one of the sets of Eq. 6.
+``specprune_look_back`` compares a slow hand's pictures with older ones.
 ``..._dense_first`` leaves an episode's first query dense, as SpecPrune and frame difference do. ``fastv`` prunes after two
 layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``efficientvla`` is its half that is about tokens,
 ``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the words that rate tokens in each layer,

@@ -28,7 +28,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import read_tensors, take, write_tensors
+from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
@@ -97,6 +97,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
         FileNotFoundError: if a file is not there.
         ValueError: naming the file, what was expected and what came.
     """
+    check_folder(path)
     config = read_json(path / "config.json", _Config)
     sampler = _make(path / "config.json", "schedule", Sampler, config.schedule)
     _check_warm_start(path / "config.json", config.warm_start, sampler)

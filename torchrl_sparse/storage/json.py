@@ -126,12 +126,14 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
 
 
 def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
-    """Name the keys in which plain values differ, with both; empty if they are equal.
+    """Name the keys in which plain values differ, with both, those within mappings after dots; empty if they are equal.
 
     >>> describe_differences({"seed": 1, "task": "lift"}, {"seed": 2, "task": "lift"})
     'seed is 2 here and 1 there'
+    >>> describe_differences({"train": {"lr": 1, "seed": 0}}, {"train": {"lr": 2, "seed": 0}})
+    'train.lr is 2 here and 1 there'
     """
-    nothing = object()
+    nothing, found, asked = object(), _flat(found), _flat(asked)
 
     def say(values: Mapping[str, Any], key: str) -> str:
         return _short(values[key]) if key in values else "missing"
@@ -155,6 +157,14 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [to_plain(entry) for entry in value]
     return value
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    for key, value in values.items():
+        nested = isinstance(value, Mapping) and value
+        entries |= _flat(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
+    return entries
 
 
 @cache

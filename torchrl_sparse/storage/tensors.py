@@ -13,7 +13,15 @@ from torch import Tensor
 
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["check_finite", "check_shapes", "read_tensors", "shapes_of", "take", "write_tensors"]
+__all__ = [
+    "check_folder",
+    "check_finite",
+    "check_shapes",
+    "read_tensors",
+    "shapes_of",
+    "take",
+    "write_tensors",
+]
 
 T = TypeVar("T")
 # safetensors' names of the types that weights are kept in, and flags
@@ -106,3 +114,11 @@ def check_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
     for name, value in tensors.items():
         if not value.isfinite().all():
             raise ValueError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
+
+
+def check_folder(path: Path) -> None:
+    """Raise FileNotFoundError unless a saved policy's folder is there."""
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"policy: expected a folder that holds config.json, or a .ckpt file, got {path}; names of a hub are not looked up"
+        )

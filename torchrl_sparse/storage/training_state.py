@@ -26,6 +26,7 @@ def read_checkpoint(
     header: Mapping[str, Mapping[str, Any]],
     *,
     optional: Set[str] = frozenset(),
+    free: Set[str] = frozenset(),
 ) -> dict[str, Any]:
     """Read a checkpoint. Nothing in the file is executed.
 
@@ -34,6 +35,7 @@ def read_checkpoint(
         fields: names of everything that it may hold.
         header: the fields that must be equal: how the training was set up.
         optional: the fields that may be missing.
+        free: keys within ``header``'s fields that may differ.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -55,9 +57,13 @@ def read_checkpoint(
             f"move it away to begin anew"
         )
     for name, expected in header.items():
-        if state[name] != expected:
-            differing = describe_differences(state[name], expected)
+        found, asked = (_without(free, values) for values in (state[name], expected))
+        if differing := describe_differences(found, asked):
             raise ValueError(
                 f"{path}: made with another {name}: {differing}; choose another out or move it away"
             )
     return state
+
+
+def _without(keys: Set[str], values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if key not in keys}

@@ -24,7 +24,7 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
 from torchrl_sparse.storage.json import read_json, write_json
-from torchrl_sparse.storage.tensors import read_tensors, take, write_tensors
+from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
 __all__ = ["StoredVLA", "read_vla", "write_vla"]
 
@@ -78,6 +78,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
         ValueError: naming the file, what was expected and what came.
     """
     where = path / "config.json"
+    check_folder(path)
     stored = read_json(where, _Config)
     try:
         config = VLAConfig.from_dict(stored.network)

@@ -1,18 +1,29 @@
-"""Changes in the cameras' images since the last query, patch by patch."""
+"""Changes in the cameras' images since the last query, or since one further back while the hand is slow, patch by patch."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 
-__all__ = ["FRAME_KEYS", "compare_frames", "patches", "similarity"]
+__all__ = ["FRAME_KEYS", "compare_frames", "look_back", "past_frame_keys", "patches", "similarity"]
 
 FRAME_KEYS = [keys.TOKEN_FRAMES, keys.IS_INIT]
 """Keys that `compare_frames` reads beside the images."""
+
+
+def past_frame_keys(furthest: int) -> list[NestedKey]:
+    """Return what `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` queries back; the first it writes as well.
+
+    Raises:
+        ValueError: if that is less than one query.
+    """
+    if furthest < 1:
+        raise ValueError(f"look_back: expected at least 1 query, got {furthest}")
+    return [keys.TOKEN_PAST_FRAMES, keys.EEF_VEL] if furthest > 1 else []
 
 
 def patches(frames: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -58,11 +69,34 @@ def similarity(previous: Tensor, current: Tensor) -> Tensor:
     return torch.where((before == 0) & (after == 0), 1.0, cosine).float()
 
 
-def compare_frames(td: TensorDictBase, spec: VisualSpec) -> tuple[Tensor, Tensor]:
-    """Compare the images of this query with those of the last, and remember these.
+def look_back(speed: Tensor, furthest: int, swift: float) -> Tensor:
+    """Return how many queries ago the frame to compare with was taken, i64 [...], from 1 to ``furthest``.
+
+    A slow hand changes little from one query to the next, and what it changes would pass for standing still. So the slower,
+    the further back, and linearly, as in the release of SpecPrune-VLA (arXiv:2509.05614). That counts environment steps, 6 for
+    a hand at rest, and reads commanded actions; here it is queries and the measured speed, since a pruner sees no other frames.
 
     Args:
-        td: a query [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced.
+        speed: of the hand, m/s.
+        furthest: queries for a hand at rest.
+        swift: m/s, at and above which the last query's frame is taken.
+
+    Examples:
+        >>> look_back(torch.tensor([0.0, 0.1, 0.2, 0.3, 9.0]), furthest=4, swift=0.3).tolist()
+        [4, 3, 2, 1, 1]
+    """
+    return 1 + ((furthest - 1) * (1 - speed / swift).clamp(min=0)).round().long()
+
+
+def compare_frames(
+    td: TensorDictBase, spec: VisualSpec, furthest: int = 1, swift: float = 0.3
+) -> tuple[Tensor, Tensor]:
+    """Compare the images of this query with those of an earlier one, and remember these.
+
+    Args:
+        td: a query [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced, and where
+            ``furthest`` is above 1 ``("tokens", "past_frames")`` too, for which ``("observation", "eef_vel")`` is read.
+        furthest, swift: see `look_back`; by default it is always the last query.
 
     Returns:
         f32 [B, N] similarity of each patch, and bool [B, 1] whether there was nothing to compare with: an episode's first
@@ -71,6 +105,25 @@ def compare_frames(td: TensorDictBase, spec: VisualSpec) -> tuple[Tensor, Tensor
     frames = torch.stack([keys.read(td, camera) for camera in spec.cameras], 1)
     previous = keys.recall(td, keys.TOKEN_FRAMES, frames.shape[1:], 0, frames.dtype)
     first = keys.read(td, keys.IS_INIT) | (previous.flatten(1).amax(-1, keepdim=True) == 0)
+    if furthest > 1:
+        previous = _earlier_frames(td, previous, first, furthest, swift)
     alike = similarity(patches(previous, spec.grid), patches(frames, spec.grid))
     td.set(keys.TOKEN_FRAMES, frames)
     return alike, first
+
+
+def _earlier_frames(td: TensorDictBase, last: Tensor, first: Tensor, furthest: int, swift: float) -> Tensor:
+    """Return the frames to compare with, u8 [B, V, 3, h, w]: the oldest of the episode where it has not been so many."""
+    shape = (furthest - 1, *last.shape[1:])
+    past = torch.cat([last[:, None], keys.recall(td, keys.TOKEN_PAST_FRAMES, shape, 0, last.dtype)], 1)
+    past = past.masked_fill(first[(...,) + (None,) * (past.ndim - 2)], 0)  # another episode's
+    td.set(keys.TOKEN_PAST_FRAMES, past[:, :-1])
+    taken = past.flatten(2).amax(-1).ne(0).sum(-1).clamp(min=1)
+    ago = look_back(_slowest_hand(td), furthest, swift).minimum(taken)
+    return past[torch.arange(len(past), device=past.device), ago - 1]
+
+
+def _slowest_hand(td: TensorDictBase) -> Tensor:
+    """Return the speed of the arm that moves least, f32 [B] in m/s."""
+    velocity = keys.read(td, keys.EEF_VEL).unflatten(-1, (-1, 6))
+    return torch.linalg.vector_norm(velocity[..., :3], dim=-1).amin(-1)

@@ -41,7 +41,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
-from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
+from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames, past_frame_keys
 from torchrl_sparse.tokens.selection import (
     best,
     best_per_camera,
@@ -120,6 +120,7 @@ class SpecPruneOptions:
         budget: tokens per camera where no controller grants them.
         wrist_share: share of the budget for each camera but the first.
         threshold: patches less similar than this (Eq. 2) have changed.
+        look_back: since when: so many queries for a hand at rest, one for a swift one, see `tokens.frames.look_back`.
         static_share: None: what changed joins in up to the budget (Eq. 3). Else the release's rule: everything stays but the
             most similar patches, up to this share of a camera in coarse and in fine mode.
         carry: use the last query's scores (the set V_global of Eq. 6).
@@ -136,6 +137,7 @@ class SpecPruneOptions:
     budget: float = 24.0
     wrist_share: float = 1.0
     threshold: float = 0.986
+    look_back: int = 1
     static_share: tuple[float, float] | None = None
     carry: bool = True
     changed: bool = True
@@ -202,13 +204,12 @@ class SpecPrune(TokenPruner):
         for name in ("keep_share", "wrist_share", "beta"):
             check_share(name, getattr(self.options, name))
         if not (self.options.carry or self.options.changed or self.options.local):
-            raise ValueError(
-                "expected one of carry, changed and local, got none of them, which would keep nothing"
-            )
-        self.in_keys = [*FRAME_KEYS, keys.TOKEN_BUDGET]
+            raise ValueError("expected one of carry, changed and local, got none of them: nothing would stay")
+        past = past_frame_keys(self.options.look_back)
+        self.in_keys = [*FRAME_KEYS, *past, keys.TOKEN_BUDGET]
         self.in_keys += [keys.FINE] if self.options.static_share else []
         self.in_keys += [keys.TOKEN_SCORE] if self.options.carry else []
-        self.out_keys = [keys.TOKEN_FRAMES, *([keys.TOKEN_SCORE] if self.options.carry else [])]
+        self.out_keys = [keys.TOKEN_FRAMES, *past[:1], *([keys.TOKEN_SCORE] if self.options.carry else [])]
 
     def bind(self, spec: VisualSpec) -> None:
         if spec.num_layers <= _SPECULATION:
@@ -226,7 +227,7 @@ class SpecPrune(TokenPruner):
 
     def begin(self, td: TensorDictBase) -> None:
         """Compute everything that is known before the decoder runs: the budgets, the carried set, and the changed set."""
-        alike, first = compare_frames(td, self.spec)
+        alike, first = compare_frames(td, self.spec, self.options.look_back)
         counts = self._counts(td)
         td.set(_COUNTS, torch.cat(counts, -1))
         td.set(_CARRIED, self._carried_set(td, counts))

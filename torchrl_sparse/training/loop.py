@@ -31,6 +31,8 @@ def train(
 ) -> None:
     """Train until ``trainer.total`` or a signal to stop, from ``out/checkpoint.pt`` if it is there; save at the end.
 
+    A training that had ended is extended by one that asks for more steps, see `Trainer.load`.
+
     Args:
         trainer: what to train.
         settings: of the recipe, all of which W&B is given. Read here: ``out``, the folder; ``logger``, "csv",

@@ -21,6 +21,7 @@ from torchrl_sparse.storage.training_state import read_checkpoint, write_checkpo
 __all__ = ["StepConfig", "Trainer", "batch_indices", "checksum", "step_seed"]
 
 UNLOGGED = "unlogged"  # of a checkpoint's fields; earlier ones lack it
+LENGTH = frozenset({"max_steps", "epochs", "max_updates"})  # of a header's keys: these may differ
 
 
 class StepConfig(Protocol):
@@ -154,15 +155,23 @@ class Trainer(ABC):
         write_checkpoint(path, self.header() | self.state())
 
     def load(self, path: str | Path) -> None:
-        """Resume from a checkpoint. Nothing in the file is executed.
+        """Resume from a checkpoint, be it of a training of another length. Nothing in the file is executed.
+
+        The learning rate goes on along the cosine that ends at `total`: one that is extended ends otherwise than one that was
+        as long from its first step.
 
         Raises:
             FileNotFoundError: if there is none.
-            ValueError: if it is no checkpoint of this class, or its header is another.
+            ValueError: if it is no checkpoint of this class, its header is another but for the length, or it is past `total`.
         """
         header = self.header()
         fields = header.keys() | self.state().keys()
-        self.load_state(read_checkpoint(path, fields, header, optional={UNLOGGED}))
+        state = read_checkpoint(path, fields, header, optional={UNLOGGED}, free=LENGTH)
+        if (taken := state["step"]) > self.total:
+            raise ValueError(
+                f"{path}: expected at most {self.total} steps, as asked for, got {taken}; ask for more or choose another out"
+            )
+        self.load_state(state)
 
 
 def checksum(values: Tensor) -> float:

@@ -1,16 +1,12 @@
 """The latency benchmark of vision-language-action models at toy size: what it runs, what it writes, what it draws."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import imageio.v3 as iio
 import pytest
 import torch
 
 pytest.importorskip("transformers")
 
+from tests.recipe_modules import run
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.latency.measure import describe_machine
@@ -19,7 +15,6 @@ from torchrl_sparse.evaluation.results.vla_report import load_vla_results
 from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops
 from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
 
-RECIPE = Path(__file__).parents[3] / "recipes" / "profile_vla.py"
 SPEC = SHAPES["toy"].visual_spec
 
 
@@ -95,23 +90,13 @@ def test_numbers_are_those_of_the_medians(case):
 
 
 def test_the_recipe_leaves_json_table_and_chart(tmp_path):
-    command = [
-        sys.executable,
-        str(RECIPE),
-        "shape=toy",
-        "repeats=1",
-        "warmup=0",
-        "alphas=[1]",
-        "shares=[0.5]",
-        f"out={tmp_path}",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    assert done.returncode == 0, done.stderr[-3000:]
+    options = ("shape=toy", "repeats=1", "warmup=0", "alphas=[1]", "shares=[0.5]")
+    printed = run("profile_vla", *options, f"out={tmp_path}")
     results = load_vla_results(tmp_path / "vla_latency.json")
     assert results.machine.threads == 1
     assert results.shape.name == "toy"
     assert list(results.methods) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
-    assert all(f"| {name} " in done.stdout for name in [*results.methods, *results.parts])
+    assert all(f"| {name} " in printed for name in [*results.methods, *results.parts])
     assert iio.imread(tmp_path / "vla_latency.png").std() > 5
 
 

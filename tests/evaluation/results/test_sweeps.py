@@ -33,13 +33,14 @@ def finish(sweep, trial):
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
-def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials(path, tmp_path):
+def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials_in_any_folder(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     sweep = LocalSweep(read_sweep(path), tmp_path / path.stem)
     seen = set()
     while trial := sweep.next_trial():
         command = trial_command(sweep.config, trial)
         assert command[:2] == ["/usr/bin/env", "python"]
-        assert (path.parents[2] / command[2]).is_file()
+        assert Path(command[2]).is_file()
         assert not any(word.startswith("${") for word in command)
         options = dict(word.split("=", 1) for word in command if "=" in word)
         assert evaluation_seeds(options["split"], int(options["seed"]), 1)[0] == DEVELOPMENT_SEED
@@ -66,10 +67,18 @@ def test_a_trial_is_on_disk_before_it_runs_and_runs_again_after_a_kill(tmp_path)
         again.finish(trial)
 
 
-def test_another_sweep_in_the_folder_is_refused(tmp_path):
-    LocalSweep(BAYES, tmp_path, count=2).next_trial()
-    with pytest.raises(ValueError, match=r"sweep.json: holds another sweep"):
-        LocalSweep({**BAYES, "method": "random"}, tmp_path, count=2)
+def test_another_sweep_in_the_folder_is_refused_once_a_trial_of_it_is_through(tmp_path):
+    failed = LocalSweep(BAYES, tmp_path, count=2).next_trial()
+    other = LocalSweep({**BAYES, "method": "random"}, tmp_path, count=2)
+    trial = other.next_trial()
+    assert other.trials == [trial] != [failed]
+    other.results_file(trial).parent.mkdir()
+    other.results_file(trial).touch()
+    other.finish(trial)
+    with pytest.raises(
+        ValueError, match=r"sweep.json: holds another sweep: method is 'bayes' here and 'random'"
+    ):
+        LocalSweep(BAYES, tmp_path, count=2)
 
 
 def test_what_wandb_would_refuse_is_named(tmp_path):

@@ -64,6 +64,14 @@ def test_another_identity_is_refused_and_the_file_left_alone(path):
     assert path.read_bytes() == before
 
 
+def test_a_log_without_an_episode_is_anybodys(path):
+    EpisodeLog(path, {"method": "bac"})  # and then the run failed
+    EpisodeLog(path, {"method": "sag"}).append(episode(0))
+    assert list(EpisodeLog(path, {"method": "sag"}).episodes) == [0]
+    with pytest.raises(ValueError, match="method is 'bac' here and 'sag' there"):
+        EpisodeLog(path, {"method": "bac"})
+
+
 @pytest.mark.parametrize(
     "content", [b"my only copy of a poem", b"first line\nsecond line", b'{"schema": 1}\n', b"[1]\n"]
 )

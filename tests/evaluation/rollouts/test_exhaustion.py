@@ -40,7 +40,10 @@ def write(tmp_path):
         (HEADER + fill('{"a":[]},'), None),
         (HEADER + "{" * 250_000 + "\n", "dense.jsonl:2: expected a complete JSON file"),
         (HEADER + episode(kept="x" * 9_000_000), "dense.jsonl:2: kept: expected"),
-        (json.dumps({"episode_log": 1, "identity": {"a": "x" * 9_000_000}}) + "\n", "holds other episodes"),
+        (
+            json.dumps({"episode_log": 1, "identity": {"a": "x" * 9_000_000}}) + "\n" + episode(),
+            "holds other episodes",
+        ),
         (fill("x"), "dense.jsonl:1: expected a complete JSON file"),
     ],
     ids=["many", "long", "blank", "huge number", "deep", "torn", "objects", "text", "identity", "noise"],

@@ -102,12 +102,19 @@ def test_a_plan_that_does_not_fit_leaves_the_policy_as_it_was(policy):
     layers = policy.network.n_layer
     policy.plan = SchedulePlanner(CacheSchedule("mine", policy.fingerprint, 8, layers, steps))
     before = policy(request(1))[keys.CHUNK]
-    with pytest.raises(ValueError, match="made for num_inference_steps 8, got 4"):
+    with pytest.raises(ValueError, match="made for num_inference_steps 8, got 4; assign plan = None, then"):
         policy.sampler = Sampler("ddim", 4)
     with pytest.raises(ValueError, match="made for policy fingerprint 'another'"):
         policy.plan = SchedulePlanner(CacheSchedule("mine", "another", 8, layers, steps))
+    with pytest.raises(ValueError, match=r"^plan: expected a Planner, got str 'bac'$"):
+        policy.plan = "bac"
+    with pytest.raises(ValueError, match=r"^sampler: expected a Sampler, got the class Sampler$"):
+        policy.sampler = Sampler
     assert policy.num_inference_steps == 8
     assert torch.equal(policy(request(1))[keys.CHUNK], before)
+    policy.plan = None
+    policy.sampler = Sampler("ddim", 4)
+    assert policy.num_inference_steps == 4
 
 
 def test_keys_are_declared(policy):

@@ -1,10 +1,5 @@
 """Measuring SpecPrune's budget: replayed queries are those of a rollout, and errors those of the executed actions."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import imageio.v3 as iio
 import pytest
 import torch
@@ -12,6 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs import InitTracker, StepCounter, TransformedEnv
 from torchrl.envs.custom import ToyVLAEnv
 
+from tests.recipe_modules import run
 from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, later, make_policy, query
 from tests.training.vla.rendered import write_demos
 from torchrl_sparse import ChunkExecutor, keys
@@ -30,8 +26,6 @@ from torchrl_sparse.training.vla.token_budget import (
     replay,
 )
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
-
-RECIPE = Path(__file__).parents[3] / "recipes" / "calibrate_tokens.py"
 
 
 def episode(steps=4):
@@ -138,9 +132,7 @@ def test_the_recipe_calibrates_from_a_demonstration_file(tmp_path):
         "n_action_steps=2",
         f"policy={tmp_path}/policy",
     )
-    command = [sys.executable, str(RECIPE), f"demos={demos}", *options]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    assert done.returncode == 0, done.stderr[-3000:]
+    run("calibrate_tokens", f"demos={demos}", *options)
     budget = TokenBudget.from_pretrained(tmp_path / "policy" / "specprune.json")
     assert budget.alpha == 0.1
     assert [point.alpha for point in budget.points] == [0.1, 0.3]

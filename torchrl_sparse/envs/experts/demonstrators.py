@@ -73,7 +73,7 @@ class RobosuiteDemonstrator:
 
     def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
         """See `Demonstrator.record`."""
-        observed = self._env.raw_observation()
+        observed = self._env.raw_observation(self._env.recorded_keys)
         return self._env.sim_env.sim.get_state().flatten(), observed
 
     def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,5 @@
 from .diffusion import (
+    default_methods as default_methods,
     draw_methods as draw_methods,
     make_methods as make_methods,
     measure_methods as measure_methods,

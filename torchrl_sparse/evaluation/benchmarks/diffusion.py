@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration
+from torchrl_sparse.blocks.saved import saved_planners
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
@@ -28,9 +29,19 @@ from torchrl_sparse.methods.diffusion import MethodName, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 
-__all__ = ["draw_methods", "make_methods", "measure_methods", "settle_rates"]
+__all__ = ["default_methods", "draw_methods", "make_methods", "measure_methods", "settle_rates"]
 
+_ALWAYS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 _SURGING = ("uniform", "bac_blockwise", "bac")  # whose errors BAC's third figure compares
+
+
+def default_methods(planners: Path) -> list[str]:
+    """Return the methods that need no file, and every planner that is saved in a folder.
+
+    >>> default_methods(Path("assets/lift"))[5:]
+    ['bac_blockwise', 'bac', 'bac_m6', 'l2c', 'sag', 'sag_fixed']
+    """
+    return list(dict.fromkeys([*_ALWAYS, *saved_planners(planners)]))
 
 
 def make_methods(

@@ -26,7 +26,8 @@ def plot_carried_noise(results: CarriedNoiseResults, path: str | os.PathLike) ->
     for name, chain in results.chains.items():
         marker = "." if len(chain.timesteps) > 20 else "o"
         left.plot(chain.timesteps, chain.correlation, f"{marker}-", color=colors[name], label=name)
-    left.set(xlim=(102, -3), ylim=(-0.1, 1.0), xlabel="timestep of the denoising step")
+    lowest = min(-0.1, *(min(chain.correlation) - 0.05 for chain in results.chains.values()))
+    left.set(xlim=(102, -3), ylim=(lowest, 1.0), xlabel="timestep of the denoising step")
     left.set_ylabel("correlation with the first noise")
     left.set_title(f"{results.task}: the clean prediction of every step", loc="left")
     left.legend(frameon=False, fontsize=9, ncols=2)

@@ -22,6 +22,7 @@ from torchrl_sparse.storage.json import describe_differences, read_json, to_plai
 __all__ = [
     "LocalSweep",
     "Trial",
+    "find_program",
     "merge_trials",
     "read_sweep",
     "run_trial",
@@ -99,7 +100,7 @@ class LocalSweep:
 
     Args:
         config: the sweep.
-        out: the folder; an earlier one of the same sweep is resumed.
+        out: the folder; an earlier one of the same sweep is resumed, another of which no trial finished is forgotten.
         count: trials in all; None runs until the engine has no more, as a grid does.
 
     Raises:
@@ -113,10 +114,12 @@ class LocalSweep:
             raise ValueError(f"count: expected a number of trials for method {config['method']!r}, got None")
         if self._file.exists():
             found = read_json(self._file, SavedSweep)
-            if found.config != to_plain(self.config):
-                differing = describe_differences(found.config, to_plain(self.config))
-                raise ValueError(f"{self._file}: holds another sweep: {differing}; choose another out")
-            self.trials = list(found.trials)
+            if not (differing := describe_differences(found.config, to_plain(self.config))):
+                self.trials = list(found.trials)
+            elif any(trial.finished for trial in found.trials):
+                raise ValueError(
+                    f"{self._file}: holds another sweep: {differing}; choose another out or move it away"
+                )
 
     @property
     def _file(self) -> Path:
@@ -175,12 +178,32 @@ def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
     from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
 
     arguments = create_sweep_command_args({"args": {k: {"value": v} for k, v in trial.parameters.items()}})
-    macros = {"program": [config["program"]], "interpreter": ["python"], "env": ["/usr/bin/env"], **arguments}
+    macros = {
+        "program": [str(find_program(config["program"]))],
+        "interpreter": ["python"],
+        "env": ["/usr/bin/env"],
+        **arguments,
+    }
     return [
         str(word)
         for chunk in create_sweep_command(list(config["command"]))
         for word in macros.get(chunk[2:-1] if chunk.startswith("${") else "", [chunk])
     ]
+
+
+def find_program(name: str) -> Path:
+    """Return the path of a sweep's program: from here or, for ours, where the recipes lie, so that any folder will do.
+
+    >>> find_program("recipes/benchmark.py").name
+    'benchmark.py'
+    """
+    package = Path(__file__).parents[
+        2
+    ]  # a wheel brings the recipes within it, a repository has them beside it
+    return next(
+        (folder / name for folder in (Path(), package, package.parent) if (folder / name).is_file()),
+        Path(name),
+    )
 
 
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:

@@ -134,7 +134,8 @@ class EpisodeLog:
     Args:
         path: the file; it and its folder are made if missing.
         identity: what the episodes belong to (method, task, policy fingerprint, ...), JSON values.
-            Reopening a log under another identity is refused, so that a resume never mixes two methods.
+            Reopening a log under another identity is refused, so that a resume never mixes two methods, unless it holds no
+            episode, as after a run that failed at once.
 
     Raises:
         ValueError: if the file is not such a log, has a damaged line before its last, or has another
@@ -162,7 +163,12 @@ class EpisodeLog:
         # What follows the last newline is torn; it is cut off only once the header has shown whose file this is.
         whole = content[: content.rfind(b"\n") + 1] or content
         first, *lines = whole.splitlines()
-        self._check_identity(parse_json(first, _Header, f"{self.path}:1"))
+        found = parse_json(first, _Header, f"{self.path}:1")
+        if not lines:
+            self.path.write_bytes(b"")
+            self._write(header)
+            return
+        self._check_identity(found)
         for number, line in enumerate(lines, start=2):
             episode = parse_json(line, EpisodeResult, f"{self.path}:{number}")
             self.episodes.setdefault(episode.seed, episode)

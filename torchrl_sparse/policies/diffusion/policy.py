@@ -30,6 +30,7 @@ from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, c
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
+from torchrl_sparse.policies.diffusion.kinds import check_kinds
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
@@ -45,8 +46,7 @@ class DiffusionPolicy(TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
-    Weights may change at any time: the next query sees it. Only after writing to a part of a tensor through ``.data``,
-    which PyTorch does not record, call `refresh`.
+    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then.
 
     Args:
         network: the denoiser.
@@ -136,6 +136,7 @@ class DiffusionPolicy(TensorDictSequential):
     def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
+        check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
         if recalls := keys.RECALL in plan.out_keys:
             check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
@@ -225,8 +226,7 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
-        # A learned planner forgets what it keeps whenever its mode is set.
-        self.plan.train(self.plan.training)
+        self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
         """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""

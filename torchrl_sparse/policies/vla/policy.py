@@ -238,8 +238,9 @@ class VLAPolicy(VLAWrapperBase):
         """Load a published OpenVLA-OFT checkpoint, a folder as on the Hugging Face hub. Nothing in its files is executed.
 
         The policy reads upright images of the published size and crops them itself. What the published evaluation did to
-        LIBERO's images before that belongs to the environment: a turn by 180 degrees, and JPEG and Lanczos on the way to 224
-        pixels. The state is position, axis-angle and both fingers of the gripper.
+        LIBERO's images before that belongs to the environment, ``make_libero_env(..., as_released=True)``: a turn by 180
+        degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers of the
+        gripper.
 
         Args:
             path: the folder, see `torchrl_sparse.storage.published.openvla_oft`.

@@ -29,7 +29,7 @@ from torchrl_sparse.storage.published.torch_archive import TorchArchive
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, shapes_of, take
 from torchrl_sparse.storage.vla import StoredVLA
 
-__all__ = ["read_openvla_oft"]
+__all__ = ["is_openvla_oft", "read_openvla_oft"]
 
 _DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 _LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
@@ -54,6 +54,16 @@ _SIGLIP_NAMES = {
     "norm2": "layer_norm2",
 }
 _HEAD_NAMES = {"mlp_resnet_blocks": "blocks", ".ffn.": ".", "model.": ""}
+
+
+def is_openvla_oft(path: str | Path) -> bool:
+    """Tell whether a folder is in the published layout, by its ``config.json``; not whether it is complete.
+
+    >>> is_openvla_oft("assets/vla")
+    False
+    """
+    config = Path(path) / "config.json"
+    return config.is_file() and read_json(config, dict[str, Any]).get("model_type") == "openvla"
 
 
 def read_openvla_oft(

@@ -1,0 +1,29 @@
+"""Devices by name."""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["check_device"]
+
+
+def check_device(name: str) -> str:
+    """Return the name of a device that this machine and PyTorch have.
+
+    Raises:
+        ValueError: if it has none of that name.
+
+    >>> check_device("cpu")
+    'cpu'
+    >>> check_device("abacus")
+    Traceback (most recent call last):
+    ...
+    ValueError: expected one that this machine and PyTorch have, such as 'cpu' or 'cuda', got 'abacus'
+    """
+    try:
+        torch.empty(0, device=name)
+    except (RuntimeError, AssertionError) as error:  # of a name that is none, and without CUDA compiled in
+        raise ValueError(
+            f"expected one that this machine and PyTorch have, such as 'cpu' or 'cuda', got {name!r}"
+        ) from error
+    return name
