@@ -43,7 +43,7 @@ def _maker(path: Path):
         "*/sweep_*/results.json": _sweep,
         "results*.json": _results,
         "realtime.json": _realtime,
-        "engine/*.json": _engine,
+        "engine/engine*.json": _engine,
         "vla_latency.json": _vla_latency,
         "episodes": _episodes,
     }
