@@ -23,7 +23,5 @@ def check_device(name: str) -> str:
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:  # of a name that is none, and without CUDA compiled in
-        raise ValueError(
-            f"expected one that this machine and PyTorch have, got {name!r}"
-        ) from error
+        raise ValueError(f"expected one that this machine and PyTorch have, got {name!r}") from error
     return name
