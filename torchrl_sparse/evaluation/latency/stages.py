@@ -54,9 +54,8 @@ def image_query(policy: DiffusionPolicy, batch: int) -> TensorDict:
 def stage_seconds(policy: DiffusionPolicy, query: TensorDictBase, repeats: int) -> dict[str, float]:
     """Measure the median seconds of ``"encode"``, ``"plan"`` and ``"denoise"`` within a query, after one that warms up."""
     device = policy.network.pos_emb.device
-    stages = {
-        name: stage for name, stage in policy.module.items() if stage.out_keys
-    }  # a cold start does nothing
+    # a cold start has no out_keys and does nothing
+    stages = {name: stage for name, stage in policy.module.items() if stage.out_keys}
     samples: dict[str, list[float]] = {name: [] for name in stages}
     for _ in range(repeats + 1):
         data = query.copy()

@@ -78,12 +78,9 @@ def _results(path: Path) -> dict[str, Table]:
     compared = {"pairs": _table(results.task, comparison_rows(pairs))} if pairs else {}
     if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
         return {"methods": methods} | compared
-    chosen = {"headline": headline_rows(results), "budgets": budget_rows(results)}
-    return (
-        {"methods": methods}
-        | compared
-        | {name: _table(results.task, of_one) for name, of_one in chosen.items()}
-    )
+    headline, budgets = headline_rows(results), budget_rows(results)
+    chosen = {"headline": _table(results.task, headline), "budgets": _table(results.task, budgets)}
+    return {"methods": methods} | compared | chosen
 
 
 def _more(results: AnyResults, name: str) -> Row:

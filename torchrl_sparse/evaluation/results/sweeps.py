@@ -197,13 +197,10 @@ def find_program(name: str) -> Path:
     >>> find_program("recipes/benchmark.py").name
     'benchmark.py'
     """
-    package = Path(__file__).parents[
-        2
-    ]  # a wheel brings the recipes within it, a repository has them beside it
-    return next(
-        (folder / name for folder in (Path(), package, package.parent) if (folder / name).is_file()),
-        Path(name),
-    )
+    package = Path(__file__).parents[2]
+    # a wheel has the recipes in the package, a repository beside it
+    folders = Path(), package, package.parent
+    return next((folder / name for folder in folders if (folder / name).is_file()), Path(name))
 
 
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
