@@ -16,6 +16,7 @@ from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results
+from torchrl_sparse.evaluation.results.offline import load_offline
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
@@ -101,6 +102,16 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert made["ddpm4"].flops.ratio_to_dense == made["ddim4_eta0.5"].flops.ratio_to_dense == 0.04
     assert 0.02 < made["bac_ddpm4"].flops.ratio_to_dense < 0.04
     assert made["uniform2_ddpm4"].flops.ratio_to_dense == pytest.approx(0.03, abs=0.002)
+    table = (f"results=[{work}/few/results.json]", f"planners={schedules}", "draws=3", "targets.share=0.1")
+    output = run("offline_errors", *options[:2], *table, f"out={work}/offline")
+    assert "results.json, 4 methods: success" in output
+    assert {path.suffix for path in (work / "offline").iterdir()} == {".json", ".png"}
+    assert [*load_offline(work / "offline" / "offline_errors_Lift.json").errors] == methods
+    refused = run(
+        "offline_errors", *options[:2], "results=[assets/can/results.json]", f"out={work}/no", expect=2
+    )
+    assert "results: assets/can/results.json: expected a table of Lift, got one of PickPlaceCan" in refused
+    assert not (work / "no").exists()
 
 
 def test_training_exports_a_policy(policy):

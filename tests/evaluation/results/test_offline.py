@@ -1,0 +1,59 @@
+"""Whether errors of answers say how episodes go."""
+
+import pytest
+
+from torchrl_sparse.evaluation.figures.offline import plot_offline
+from torchrl_sparse.evaluation.results.offline import (
+    OfflineResults,
+    Outcome,
+    agreement_rows,
+    error_rows,
+    load_offline,
+    outcomes,
+    rank_agreement,
+    save_offline,
+)
+from torchrl_sparse.evaluation.results.schema import load_results
+from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
+
+
+@pytest.fixture
+def results():
+    """Smaller errors come with shorter times; the energy score is the other way round."""
+    errors = {f"ddim{n}": OfflineErrors(n / 10, -float(n), 0.5 - n / 8, 0.1 * (n % 3)) for n in (2, 3, 4, 5)}
+    played = {name: Outcome(-entry.error, 1 + entry.error) for name, entry in errors.items()}
+    errors = {"dense": OfflineErrors(0.1, 0.1, 0.0, 0.2), **errors}
+    return OfflineResults(1, "Lift", "abc", 4, 8, 0, errors, {"a.json": played})
+
+
+def test_orders_that_agree_correlate(results):
+    assert rank_agreement(results, "a.json", "error") == pytest.approx(Outcome(1.0, 1.0))
+    assert rank_agreement(results, "a.json", "energy_score") == pytest.approx(Outcome(-1.0, -1.0))
+    rows = {row["measure"]: row for row in agreement_rows(results)}
+    assert rows["error"] == {
+        "measure": "error",
+        "a.json, 4 methods: success": "+1.00",
+        "a.json: time": "+1.00",
+    }
+    assert error_rows(results)[0] == {
+        "method": "dense",
+        "error": "0.100",
+        "energy score": "0.100",
+        "energy distance": "0.000",
+        "spread": "0.200",
+    }
+
+
+def test_outcomes_are_those_of_the_table():
+    found = outcomes(load_results("assets/can/test_split/results.json"))
+    assert {"dense", "dense_noise"}.isdisjoint(found)
+    assert found["sag"].success == pytest.approx((255 - 273) / 300)
+    assert found["sag"].time == pytest.approx(
+        load_results("assets/can/test_split/results.json").methods["sag"].time_vs_dense.ratio
+    )
+
+
+def test_they_are_kept_and_drawn(results, tmp_path):
+    path = save_offline(results, tmp_path / "offline_errors_Lift.json")
+    assert load_offline(path) == results
+    assert plot_offline(results, "a.json", tmp_path / "a.png").stat().st_size > 10_000

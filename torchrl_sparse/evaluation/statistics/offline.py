@@ -1,0 +1,97 @@
+"""How far a method's answers are from demonstrations and from dense's, measured without an episode.
+
+A policy's answer is a distribution, of which a query shows one draw. Errors of single answers reward a chain that averages over
+several good ones; the energy score does not: it is least, in the mean, for answers that are distributed as what was
+demonstrated (Gneiting and Raftery, "Strictly Proper Scoring Rules, Prediction, and Estimation", JASA 2007, Eq. 21).
+Which of these numbers says how episodes will go is measured by ``recipes/offline_errors.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse import keys
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.targets import planned_answers
+
+__all__ = ["OfflineErrors", "draw_answers", "offline_errors"]
+
+
+@dataclass(frozen=True)
+class OfflineErrors:
+    """Of the actions that are executed, normalised; means over queries and draws.
+
+    Attributes:
+        error: absolute difference to the demonstrated actions.
+        energy_score: ``E|X - y| - E|X - X'| / 2`` of answers X, X' and the demonstrated actions y of a query, Euclidean.
+        energy_distance: ``2 E|X - Y| - E|X - X'| - E|Y - Y'|`` to dense's answers Y; about 0 where both are distributed alike,
+            and slightly below it by chance.
+        spread: standard deviation of the answers to a query, root mean square.
+    """
+
+    error: float
+    energy_score: float
+    energy_distance: float
+    spread: float
+
+
+def draw_answers(
+    policy: DiffusionPolicy, queries, *, draws: int, n_action_steps: int, seed: int = 0
+) -> Tensor:
+    """Answer every query ``draws`` times, each with noise of its own.
+
+    Args:
+        policy: under the method's sampler and planner.
+        queries: [N], with ``("diffusion", "cond")``, see `torchrl_sparse.training.diffusion.targets.make_targets`.
+        draws: of noise a query.
+        n_action_steps: actions executed of a chunk.
+        seed: of the noise.
+
+    Returns:
+        f32 [N, draws, n_action_steps * A], normalised.
+    """
+    many = queries.select(keys.COND).repeat_interleave(draws)
+    generator = torch.Generator().manual_seed(seed)
+    many[keys.SEED] = torch.randint(2**62, (len(many), 1), generator=generator)
+    first = policy.n_obs_steps - 1
+    with torch.no_grad():
+        answers = planned_answers(policy, many)[:, first : first + n_action_steps]
+    return answers.flatten(1).unflatten(0, (-1, draws))
+
+
+def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> OfflineErrors:
+    """Compare a method's answers with what was demonstrated and with dense's.
+
+    Args:
+        answers: f32 [N, S, D], S >= 2 draws for each of N queries.
+        demonstrated: f32 [N, D].
+        dense: f32 [N, T, D], dense's answers to the same queries; of its own draws, not those of ``answers``.
+
+    Raises:
+        ValueError: for fewer than two draws.
+
+    Examples:
+        >>> draws = torch.tensor([[[0.0], [2.0]]])
+        >>> offline_errors(draws, demonstrated=torch.tensor([[1.0]]), dense=draws + 3)
+        OfflineErrors(error=1.0, energy_score=0.0, energy_distance=2.0, spread=1.4142135381698608)
+    """
+    if min(answers.shape[1], dense.shape[1]) < 2:
+        raise ValueError(
+            f"draws: expected at least 2, got {answers.shape[1]} of the method and {dense.shape[1]} of dense"
+        )
+    wanted, within = demonstrated[:, None], _mean_distance(answers)
+    return OfflineErrors(
+        (answers - wanted).abs().mean().item(),
+        (torch.cdist(answers, wanted).mean() - within / 2).item(),
+        (2 * torch.cdist(answers, dense).mean() - within - _mean_distance(dense)).item(),
+        answers.var(1).mean().sqrt().item(),
+    )
+
+
+def _mean_distance(draws: Tensor) -> Tensor:
+    """Return the mean distance of two different draws of a query, [N, S, D] -> []."""
+    count = draws.shape[1]
+    return torch.cdist(draws, draws).sum() / (len(draws) * count * (count - 1))
