@@ -1,7 +1,7 @@
 """Profile one query in the native engine: its parts, its threads, and its tail.
 
     python recipes/profile_query.py policy=assets/lift sampler=ddim_87_20
-    python recipes/profile_query.py queries=100000 hz=50 busy=1 library=build/tsp/libtsp.so     # an hour
+    python recipes/profile_query.py queries=100000 hz=50 busy=1 library=build/tsp/libtsp.so     # 33 minutes
 
 Writes OUT/query.json, three tables and OUT/query_threads.png. Times are medians, everything interleaved in one process; in
 the tail, every query counts.
@@ -9,9 +9,8 @@ the tail, every query counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
@@ -44,23 +43,20 @@ def main(config: DictConfig) -> None:
     counts = sorted({1, *(count for count in config.thread_counts if count <= usable_cores())})
     with num_threads(config.threads):
         parts = query_parts(policy, config.repeats, config.warmup)
-        with busy_cores(config.busy):
-            late = tail(paced(policy_call(policy), config))
-            exported = exported_tail(policy, config) if config.library else None
+        tails = query_tails(policy, config)
     threads = thread_seconds(
         policy.network, {"dense": dense, config.sampler: chosen}, counts, config.repeats, config.warmup
     )
     found = QueryProfile(
-        format="query/1",
+        format="query/2",
         machine=describe_machine(threads=config.threads),
         sampler=config.sampler,
         parts_s=parts,
         threads_s={name: {str(count): at[count] for count in at} for name, at in threads.items()},
-        tail_s=late,
+        tails_s=tails,
         queries=config.queries,
         busy=config.busy,
         hz=config.hz,
-        exported_tail_s=exported,
     )
     out = Path(config.out)
     write_json(out / "query.json", found)
@@ -68,14 +64,16 @@ def main(config: DictConfig) -> None:
     print(f"\n{format_query_profile(found)}\n\nfiles are in {out}")
 
 
-def exported_tail(policy: DiffusionPolicy, config: DictConfig) -> dict[str, float]:
-    with exported_call(policy, Path(config.library)) as call:
-        return tail(paced(call, config))
-
-
-def paced(call: Callable[[], Any], config: DictConfig) -> list[float]:
-    with progress("tail", "query", config.queries) as show:
-        return paced_seconds(call, config.queries, config.hz, show)
+def query_tails(policy: DiffusionPolicy, config: DictConfig) -> dict[str, dict[str, float]]:
+    """Time many queries from Python and, with a library, as many in C between them."""
+    with ExitStack() as stack:
+        calls = {"Python": policy_call(policy)}
+        if config.library:
+            calls["C"] = stack.enter_context(exported_call(policy, Path(config.library)))
+        stack.enter_context(busy_cores(config.busy))
+        show = stack.enter_context(progress("tail", "query", config.queries))
+        seconds = paced_seconds(calls, config.queries, config.hz, show)
+    return {name: tail(samples) for name, samples in seconds.items()}
 
 
 if __name__ == "__main__":

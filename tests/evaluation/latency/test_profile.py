@@ -1,5 +1,6 @@
 """One query under the glass: its parts add up, its threads are compared, its tail is kept, and what cannot be is one line."""
 
+import itertools
 from pathlib import Path
 from time import perf_counter
 
@@ -21,6 +22,7 @@ from torchrl_sparse.evaluation.latency.profile import (
     tail,
     thread_seconds,
 )
+from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.query_report import QueryProfile
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
@@ -70,11 +72,27 @@ def test_the_serial_share_of_amdahls_law_is_found_again(share):
 def test_the_tail_keeps_the_latest_and_the_pace_is_kept(policy):
     with busy_cores(1):
         start = perf_counter()
-        samples = paced_seconds(policy_call(policy), queries=4, hz=20)
+        samples = paced_seconds({"Python": policy_call(policy)}, queries=4, hz=20)["Python"]
     assert perf_counter() - start > 3 / 20
     assert len(samples) == 4
     assert tail(samples)["max"] == max(samples)
     assert tail([*[1.0] * 1998, 2.0, 9.0])["p99.9"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_callers_take_turns_evenly_in_the_period():
+    order, begins = [], []
+
+    def caller(name):
+        def call():
+            order.append(name)
+            begins.append(perf_counter())
+
+        return call
+
+    samples = paced_seconds({"a": caller("a"), "b": caller("b")}, queries=3, hz=10)
+    assert order[2:] == ["a", "b"] * 3  # the first two warm up
+    assert all(later - earlier > 0.02 for earlier, later in itertools.pairwise(begins[2:]))
+    assert {name: len(seconds) for name, seconds in samples.items()} == {"a": 3, "b": 3}
 
 
 @needs_native
@@ -82,12 +100,15 @@ def test_the_recipe_leaves_tables_and_a_figure(tmp_path, policy):
     policy.save_pretrained(tmp_path / "policy")
     options = ("queries=20", "repeats=2", "warmup=0", "thread_counts=[2]", f"out={tmp_path}/out")
     output = run("profile_query", f"policy={tmp_path}/policy", "sampler=ddim2", *options)
-    assert "20 queries, one after the other, beside 0 busy processes." in output
+    assert "20 queries, one after the other." in output
     found = read_json(tmp_path / "out" / "query.json", QueryProfile)
     assert list(found.parts_s) == PARTS
     assert set(found.threads_s) == {"dense", "ddim2"}
     assert set(found.threads_s["dense"]) == {"1", "2"} if usable_cores() > 1 else {"1"}
-    assert found.tail_s["p50"] <= found.tail_s["p99.9"] <= found.tail_s["max"]
+    late = found.tails_s["Python"]
+    assert late["p50"] <= late["p99.9"] <= late["max"]
+    (row,) = read_table(tmp_path / "out" / "query.json", "tails").rows
+    assert (row["beside"], row["queries"]) == ("0 busy processes", "20, one after the other")
     assert (tmp_path / "out" / "query_threads.png").stat().st_size > 0
 
 

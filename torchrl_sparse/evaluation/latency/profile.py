@@ -149,23 +149,31 @@ def serial_share(seconds: dict[int, float]) -> float:
 
 @torch.no_grad()
 def paced_seconds(
-    call: Callable[[], Any],
+    calls: Mapping[str, Callable[[], Any]],
     queries: int,
     hz: float | None,
     on_query: Callable[[int, int], None] | None = None,
-) -> list[float]:
-    """Time each of many queries, which begin ``hz`` times a second as a control loop's do; None: one after the other.
+) -> dict[str, list[float]]:
+    """Time many queries of each caller, which begin ``hz`` times a second as a control loop's do; None: one after the other.
 
-    A query that comes late delays the next; it is timed from its own beginning.
+    Several callers take turns, spread evenly over the period. A query that comes late delays the next; each is timed from its
+    own beginning.
+
+    Returns:
+        name of a caller -> seconds of its ``queries``, in order.
     """
-    call()
-    samples, begin = [], time.perf_counter()
-    for number in range(queries):
-        if hz is not None:
-            time.sleep(max(0.0, begin + number / hz - time.perf_counter()))
-        start = time.perf_counter()
+    for call in calls.values():
         call()
-        samples.append(time.perf_counter() - start)
+    samples: dict[str, list[float]] = {name: [] for name in calls}
+    begin = time.perf_counter()
+    for number in range(queries):
+        for turn, (name, call) in enumerate(calls.items()):
+            if hz is not None:
+                due = begin + (number + turn / len(calls)) / hz
+                time.sleep(max(0.0, due - time.perf_counter()))
+            start = time.perf_counter()
+            call()
+            samples[name].append(time.perf_counter() - start)
         if on_query is not None:
             on_query(number + 1, queries)
     return samples

@@ -9,6 +9,7 @@ from pathlib import Path
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
+from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
@@ -46,7 +47,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """Read a file of results, whose kind its name begins with.
 
     Args:
-        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json`` or ``vla_latency*.json``.
+        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json`` or ``vla_latency*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -118,6 +119,11 @@ def _engine(path: Path) -> dict[str, Table]:
     return {name: _table(name, engine_rows(shape), len(COLUMNS)) for name, shape in shapes.items()}
 
 
+def _query(path: Path) -> dict[str, Table]:
+    found = load_query_profile(path)
+    return {name: _table(found.sampler, rows) for name, rows in query_rows(found).items()}
+
+
 def _vla(path: Path) -> dict[str, Table]:
     results = load_vla_results(path)
     rows = {"methods": vla_method_rows(results), "parts": vla_part_rows(results)}
@@ -169,5 +175,6 @@ _READERS = {
     "aggregate": _aggregate,
     "realtime": _realtime,
     "engine": _engine,
+    "query": _query,
     "vla_latency": _vla,
 }
