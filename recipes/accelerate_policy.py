@@ -36,7 +36,7 @@ from torchrl_sparse.training.pruner.config import PrunerConfig
 @recipe("accelerate_policy")
 def main(config: DictConfig) -> None:
     out, task = Path(config.out), find_task(config.task)
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     options = {name: config[name] for name in SHARED_OPTIONS}
     request = Request(task.name, **options, n_action_steps=n_action_steps, repeats=config.latency_repeats)

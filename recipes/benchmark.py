@@ -53,7 +53,7 @@ def main(config: DictConfig) -> None:
         config.methods = default_methods(planners)
         print(f"methods: {', '.join(config.methods)}")
     check_names(config, partial(check_method, planners=planners))
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
     first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
@@ -78,6 +78,7 @@ def main(config: DictConfig) -> None:
             | settings
             | {"n_action_steps": actors[name].n_action_steps},
             num_envs=config.num_envs,
+            policy_device=config.device,
             workers=config.workers,
             backend=config.backend,
         )
@@ -93,7 +94,7 @@ def main(config: DictConfig) -> None:
         split=config.split,
         seed=config.seed,
         terms=terms,
-        machine=describe_machine(threads=config.threads),
+        machine=describe_machine(config.device, config.threads),
         policy=describe_policy(policy, config.n_action_steps),
         pairs=config.pairs,
     )

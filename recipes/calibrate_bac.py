@@ -27,7 +27,7 @@ from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 @recipe("calibrate_bac")
 def main(config: DictConfig) -> None:
     task = find_task(config.task).name
-    policy = DiffusionPolicy.from_pretrained(config.policy)
+    policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.sampler is not None:
         train_steps = policy.sampler.num_train_timesteps
         policy.sampler = Sampler.from_name(config.sampler, num_train_timesteps=train_steps)

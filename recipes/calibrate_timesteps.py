@@ -29,7 +29,7 @@ from torchrl_sparse.training.diffusion.timesteps import FoundTimesteps, find_tim
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    policy = DiffusionPolicy.from_pretrained(config.policy)
+    policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     task = find_task(config.task)
     demos = read_demos(
         config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name

@@ -30,7 +30,7 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    policy, task = DiffusionPolicy.from_pretrained(config.policy), find_task(config.task)
+    policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
     train_steps = policy.sampler.num_train_timesteps
     samplers = {name: Sampler.from_name(name, num_train_timesteps=train_steps) for name in config.samplers}
     demos = read_demos(

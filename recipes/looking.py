@@ -61,12 +61,13 @@ def main(config: DictConfig) -> None:
 
 def make_policy(config: DictConfig) -> DiffusionPolicy:
     """Return the policy with the pruner and its sampler, or with the sampler that is asked for."""
-    policy = DiffusionPolicy.from_pretrained(config.policy)
+    policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.pruner is None:
         return policy if config.sampler is None else policy.with_plan(None, Sampler.from_name(config.sampler))
     pruner = SAGPruner.from_pretrained(config.pruner)
     made_for = pruner.made_for
-    return policy.with_plan(pruner, Sampler.from_name(made_for.sampler, made_for.num_inference_steps))
+    pruned = policy.with_plan(pruner, Sampler.from_name(made_for.sampler, made_for.num_inference_steps))
+    return pruned.to(config.device)
 
 
 if __name__ == "__main__":

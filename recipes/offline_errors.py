@@ -40,7 +40,7 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
-    policy, task = DiffusionPolicy.from_pretrained(config.policy), find_task(config.task)
+    policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
     played = read_tables(config, task.name)
     n_action_steps = executed_steps(task.name, policy.source)
     demos = read_demos(

@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     if (seen := observed_keys(task.name, policy)) != task.state_keys:  # from which the pose to hold is read
         raise ValueError(
             f"policy: expected one that observes {', '.join(task.state_keys)}, got one of {', '.join(seen)}"
@@ -79,7 +79,7 @@ def main(config: DictConfig) -> None:
         seed=config.seed,
         control_freq=config.control_freq,
         n_action_steps=config.n_action_steps,
-        machine=describe_machine(threads=config.threads),
+        machine=describe_machine(config.device, config.threads),
         margin=config.margin,
     )
     save_realtime(results, out / "realtime.json")
@@ -109,6 +109,7 @@ def evaluate_delayed(
         log=episode_log(config.out, f"{name}_delay{steps}"),
         identity={**method_identity(name, policy), **settings, "delay_steps": steps},
         num_envs=config.num_envs,
+        policy_device=config.device,
         workers=config.workers,
         backend=config.backend,
     )

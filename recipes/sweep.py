@@ -21,6 +21,7 @@ from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
+    ServedSweep,
     find_program,
     merge_trials,
     read_sweep,
@@ -28,7 +29,7 @@ from torchrl_sparse.evaluation.results.sweeps import (
     write_trials,
 )
 from torchrl_sparse.runtime.lock import lock_output
-from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import describe_differences, read_json, write_json
 
 RECIPES = Path(__file__).parent
 
@@ -65,12 +66,14 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     """Create the sweep, unless an earlier call did, and run its trials here."""
     import wandb
 
-    note = out / "sweep_id"
-    sweep = sweep | {"program": str(find_program(sweep["program"]))}
-    if not note.exists():
-        with atomic_path(note) as temporary:
-            temporary.write_text(wandb.sweep(sweep, project=config.project))
-    wandb.agent(note.read_text(), project=config.project, count=config.count)
+    path, made_for = out / "sweep.json", {"project": config.project, "sweep": sweep}
+    if not path.exists():
+        program = {"program": str(find_program(sweep["program"]))}
+        write_json(path, ServedSweep(wandb.sweep(sweep | program, project=config.project), made_for))
+    note = read_json(path, ServedSweep)
+    if differing := describe_differences(note.made_for, made_for):
+        raise ValueError(f"out: {path} is of another sweep: {differing}; choose another out or move it away")
+    wandb.agent(note.sweep_id, project=config.project, count=config.count)
 
 
 def summarise(sweep: LocalSweep) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
+from torch import Tensor
 
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
@@ -41,9 +42,12 @@ from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads or torch.get_num_threads())
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
+    masks = [CacheSchedule.from_pretrained(path).mask() for path in initial_schedules(config)]
+    if config.spread and (masks or config.method != "sag"):
+        raise ValueError(f"spread: expected null with an init or without method=sag, got {config.spread}")
     trainer = make_trainer(config)
     if not (out / CHECKPOINT).exists():
-        begin(trainer, config)
+        begin(trainer, masks, config)
     made = {"init": initial_schedules(config), "targets": settings["targets"]}
     made |= {name: settings[name] for name in ("spread", "rollouts")}
     train(trainer, settings, export=partial(export_planner, trainer, out, made))
@@ -55,7 +59,7 @@ def main(config: DictConfig) -> None:
 
 def make_trainer(config: DictConfig) -> PrunerTrainer:
     """Read the policy and make what its gates are trained on, unless an earlier run did."""
-    policy = DiffusionPolicy.from_pretrained(config.policy)
+    policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.sampler is not None:
         policy.sampler = Sampler(**config.sampler)
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
@@ -83,7 +87,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     }
     stale = () if path.with_name(CHECKPOINT).exists() else (ValueError,)
     with suppress(FileNotFoundError, *stale):
-        return load_targets(path, made_for)
+        return load_targets(path, made_for).to(policy.device)
     task = find_task(config.task)
     seen, poses = observed_keys(task.name, policy), task.acts_in_poses
     demos = read_demos(config.demos, seen, poses=poses, task=task.name)
@@ -101,19 +105,15 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     return targets
 
 
-def begin(trainer: PrunerTrainer, config: DictConfig) -> None:
-    """Fit the gates to the schedules of ``init``, or spread their logits; else leave them as they are."""
-    paths = initial_schedules(config)
+def begin(trainer: PrunerTrainer, masks: list[Tensor], config: DictConfig) -> None:
+    """Fit the gates to the masks of ``init``, or spread their logits; else leave them as they are."""
     if config.spread:
-        if paths or config.method != "sag":
-            raise ValueError(f"spread: expected null with an init or without method=sag, got {config.spread}")
         spread_logits(trainer.gates, trainer.train_set, config.spread)
-    if not paths:
+    if not masks:
         return
-    masks = [CacheSchedule.from_pretrained(path).mask() for path in paths]
     with progress("fit to schedules", "step") as show:
         fit_to_masks(trainer.gates, masks, trainer.train_set, seed=trainer.config.seed, on_progress=show)
-    print(f"{', '.join(paths)}: fitted, {trainer.validate()}")
+    print(f"{', '.join(initial_schedules(config))}: fitted, {trainer.validate()}")
 
 
 if __name__ == "__main__":

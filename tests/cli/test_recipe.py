@@ -4,8 +4,9 @@ import os
 import sys
 
 import pytest
+import yaml
 
-from tests.recipe_modules import load_recipe, run
+from tests.recipe_modules import RECIPES, load_recipe, run
 from torchrl_sparse.runtime.lock import lock_output
 
 
@@ -64,6 +65,8 @@ def fail(monkeypatch, capsys):
         ("calibrate_bac", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
+        ("train_pruner", ["init=nope.json"], "expected a file nope.json, got none"),
+        ("train_pruner", ["method=l2c", "spread=1"], "spread: expected null with an init or without"),
         ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
@@ -105,6 +108,36 @@ def test_the_second_on_one_output_is_told_who_the_first_is(fail, tmp_path):
             assert sorted(tmp_path.rglob("*")) == before
         told = f"out: expected one that nobody works on, got {tmp_path / name}, held by process {os.getpid()} on "
         assert line.startswith(told)
+
+
+def asks_policies(path):
+    """True for the recipes that ask a policy anything; the file of one that only times the native engine says so."""
+    options = yaml.safe_load(path.read_text())
+    return "policy" in options and options.get("engine") != "native"
+
+
+@pytest.mark.parametrize(
+    "recipe", [path.stem for path in sorted(RECIPES.glob("*.yaml")) if asks_policies(path)]
+)
+def test_every_recipe_that_asks_a_policy_takes_a_device_and_refuses_a_missing_one(fail, tmp_path, recipe):
+    line = fail(recipe, "device=abacus", f"out={tmp_path}/out")
+    assert line.startswith("device: expected one that this machine and PyTorch have, got 'abacus'")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_sweep_on_a_server_is_taken_up_by_itself_alone(fail, monkeypatch, tmp_path):
+    created, joined = [], []
+    monkeypatch.setattr("wandb.sweep", lambda settings, project: created.append(settings) or "id1")
+    monkeypatch.setattr("wandb.agent", lambda sweep_id, **_: joined.append(sweep_id))
+    options = "mode=online", f"out={tmp_path}/out"
+    for _ in range(2):
+        monkeypatch.setattr(sys, "argv", ["sweep.py", "sweep=ddim_lift", *options])
+        load_recipe("sweep").main()
+    assert len(created) == 1
+    assert joined == ["id1", "id1"]
+    line = fail("sweep", "sweep=bac_lift", *options)
+    assert line.startswith(f"out: {tmp_path}/out/sweep.json is of another sweep: sweep.")
+    assert len(joined) == 2
 
 
 def test_the_whole_traceback_can_be_had(monkeypatch):

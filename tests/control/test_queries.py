@@ -18,7 +18,7 @@ class CountingEnv:
     def base_env(self):
         return self
 
-    def rollout(self, horizon, actor):
+    def rollout(self, horizon, actor, auto_cast_to_device):
         steps, td = [], TensorDict()
         for at in range(horizon):
             td["step"], td[keys.IS_INIT] = torch.tensor([float(at)]), torch.tensor([at == 0])
@@ -34,6 +34,7 @@ def test_a_query_is_recorded_with_the_chunk_before_it():
     policy = TensorDictModule(
         lambda step: step[..., None].repeat(1, 4, 2), in_keys=["step"], out_keys=[keys.CHUNK]
     )
+    policy.device = torch.device("cpu")
     queries = record_queries(ChunkExecutor(policy, n_action_steps=3), lambda seeds: CountingEnv(), [1, 2])
     assert queries["step"].flatten().tolist() == [0, 3, 6, 0, 3, 6]
     assert queries[keys.ELAPSED].flatten().tolist() == [0, 3, 3, 0, 3, 3]

@@ -20,6 +20,8 @@ def record_queries(
 ) -> TensorDictBase:
     """Record every query of one episode per seed: [number of queries], with what the policy read and what it answered.
 
+    The queries are where the policy is; the environment is where it is made.
+
     The chunk of the query before and the steps since, 0 in the first, are there whether the policy reads them or not, so that
     another can be asked that does.
 
@@ -29,10 +31,11 @@ def record_queries(
         seeds: of the episodes.
     """
     env = make_env(seeds=list(seeds))
-    episodes = [env.rollout(env.base_env.horizon, actor) for _ in seeds]
+    episodes = [env.rollout(env.base_env.horizon, actor, auto_cast_to_device=True) for _ in seeds]
     env.close()
     wanted = [*actor.policy.in_keys, *actor.policy.out_keys, keys.LAST_CHUNK, keys.ELAPSED]
-    return torch.cat([_queries(steps).select(*wanted, strict=False) for steps in episodes])
+    queries = torch.cat([_queries(steps).select(*wanted, strict=False) for steps in episodes])
+    return queries.to(actor.policy.device)
 
 
 def _queries(steps: TensorDictBase) -> TensorDictBase:

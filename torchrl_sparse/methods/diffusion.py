@@ -224,7 +224,7 @@ def make_method(
     planner, sampler = method.make(inputs)
     if written.rates:
         _ask_for(planner, written)
-    made = policy.with_plan(planner, sampler, method.start(inputs))
+    made = policy.with_plan(planner, sampler, method.start(inputs)).to(policy.device)
     if method.noise:
         made = made.with_noise(method.noise)
     if written.weights:

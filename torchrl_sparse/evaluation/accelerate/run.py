@@ -176,7 +176,7 @@ def _from_demonstrations(
     queries = demos.windows(rows[spread], policy.n_obs_steps).select(keys.HISTORY_STATE)
     index = torch.arange(len(spread))[:, None]
     queries.update({keys.EPISODE_SEED: torch.full_like(index, request.seed), keys.EPISODE_STEP: index})
-    return targets, queries
+    return targets, queries.to(policy.device)
 
 
 def _measure_errors(
@@ -207,13 +207,14 @@ def _time(
     request: Request,
 ) -> tuple[Machine, dict[str, Latency]]:
     """Time all methods, unless they were timed on this machine; on another they are timed anew."""
-    machine = describe_machine(threads=request.threads)
+    machine = describe_machine(methods[DENSE].device, request.threads)
     settings = {
         **made_for,
         "planners": {name: method.plan.fingerprint for name, method in methods.items()},
         "engine": methods[DENSE].engine_info(),
         "repeats": request.repeats,
         "cpu": machine.cpu,
+        "device": machine.device,
         "threads": machine.threads,
         "torch": machine.torch,
     }
@@ -253,6 +254,7 @@ def _play(
             seeds[:count],
             log=episode_log(out, name),
             identity=method_identity(name, methods[name]) | settings,
+            policy_device=methods[name].device,
             workers=request.workers,
         )
 

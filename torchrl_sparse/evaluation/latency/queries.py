@@ -27,7 +27,7 @@ def time_queries(
     samples: Mapping[str, int] | None = None,
     on_round: Callable[[int, int], None] | None = None,
 ) -> dict[str, Latency]:
-    """Time recorded queries [N] under each method, interleaved; see `measure_latency`.
+    """Time recorded queries [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
 
     Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods in
     ``samples`` are asked it so many times at once.
@@ -37,7 +37,8 @@ def time_queries(
         name: partial(_answer_next, method, cycle(_copied(queries, samples.get(name, 1)).unbind(0)))
         for name, method in methods.items()
     }
-    return measure_latency(calls, repeats=repeats, threads=threads, on_round=on_round)
+    device = next(iter(methods.values())).device
+    return measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=on_round)
 
 
 def time_planning(
@@ -67,11 +68,10 @@ def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> 
 
 
 def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
-    device = next(policy.network.parameters()).device
     encoded = policy.module["encode"](query.select(*policy.in_keys, strict=False))
     encoded = policy.module["start"](encoded)
-    start = synchronised_clock(device)
+    start = synchronised_clock(policy.device)
     planned = policy.module["plan"](encoded)
-    seconds = synchronised_clock(device) - start
+    seconds = synchronised_clock(policy.device) - start
     policy.module["denoise"](planned)
     return seconds

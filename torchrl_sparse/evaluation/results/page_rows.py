@@ -47,7 +47,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """Read a file of results, whose kind its name begins with.
 
     Args:
-        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json`` or ``vla_latency*.json``.
+        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json`` or
+            ``vla_latency*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 

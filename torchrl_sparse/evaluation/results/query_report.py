@@ -24,7 +24,8 @@ class QueryProfile:
         sampler: name of the sampler.
         parts_s: ``"query"`` and the parts that it is made of, medians; see `query_parts`.
         threads_s: name of a sampler -> number of threads, as text -> median of an unpruned query.
-        tails_s: ``"Python"``, and ``"C"`` if the exported policy was asked too -> ``"p50"``, ``"p99"``, ``"p99.9"`` and ``"max"`` of ``queries``.
+        tails_s: ``"Python"``, and ``"C"`` if the exported policy was asked too -> ``"p50"``, ``"p99"``, ``"p99.9"`` and
+            ``"max"`` of ``queries``.
         queries: of each that were timed for the tail, in turns.
         hz: how often each began; None is one after the other.
         busy: other processes that computed meanwhile.

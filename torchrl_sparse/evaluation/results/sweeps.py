@@ -21,6 +21,7 @@ from torchrl_sparse.storage.json import describe_differences, read_json, to_plai
 
 __all__ = [
     "LocalSweep",
+    "ServedSweep",
     "Trial",
     "find_program",
     "merge_trials",
@@ -54,6 +55,14 @@ class SavedSweep:
 
     config: dict[str, Any]
     trials: tuple[Trial, ...]
+
+
+@dataclass(frozen=True)
+class ServedSweep:
+    """The content of a ``sweep.json`` of a sweep on W&B's server: the id that it has there, and what it was made for."""
+
+    sweep_id: str
+    made_for: dict[str, Any]
 
 
 def read_sweep(path: str | os.PathLike) -> dict[str, Any]:

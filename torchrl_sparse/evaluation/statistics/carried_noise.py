@@ -79,7 +79,8 @@ def carried_noise(
     network, target = policy.network, targets["target"]
     generator = torch.Generator().manual_seed(seed)
     shape = (len(targets) * draws, sampler.num_inference_steps, *target.shape[1:])
-    noise, cond = torch.randn(shape, generator=generator), targets[keys.COND].repeat_interleave(draws, 0)
+    cond = targets[keys.COND].repeat_interleave(draws, 0)
+    noise = torch.randn(shape, generator=generator).to(cond.device)
     chains = [
         _chain(network, sampler, noise[rows], cond[rows], on_progress)
         for rows in torch.arange(len(noise)).split(_BATCH)
@@ -108,7 +109,7 @@ def _chain(
     sample, cleans = noise[:, 0], []
     following = [*noise.unbind(1)[1:], None]  # of the transition after each step
     for k, timestep in enumerate(sampler.timesteps.tolist()):
-        eps = network(sample, torch.full((len(sample),), timestep), cond)
+        eps = network(sample, torch.full((len(sample),), timestep, device=sample.device), cond)
         earlier = cleans[::-1][:2]
         cleans.append(sampler.coefficients.clean(k, sample, eps))
         sample = sampler.step(eps, k, sample, following[k], earlier)

@@ -122,9 +122,9 @@ def _paired(difference: Tensor, starts: list[Tensor]) -> tuple[float, float, flo
 
 def _phases(masks: Tensor, starts: list[Tensor], phases: int) -> Tensor:
     """Return f32 [P, K, 3L]: how much more often than on average each cell is pruned in each phase, 0 without a query."""
-    phase = torch.empty(len(masks), dtype=torch.long)
+    masks, phase = masks.cpu(), torch.empty(len(masks), dtype=torch.long)
     for rows in starts:
-        phase[rows] = torch.arange(len(rows)) * phases // len(rows)
+        phase[rows.cpu()] = torch.arange(len(rows)) * phases // len(rows)
     change = torch.zeros(phases, *masks.shape[1:])
     for number in phase.unique().tolist():
         change[number] = masks[phase == number].float().mean(dim=0) - masks.float().mean(dim=0)

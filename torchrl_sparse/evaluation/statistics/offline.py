@@ -55,7 +55,7 @@ def draw_answers(
     """
     many = queries.select(keys.COND).repeat_interleave(draws)
     generator = torch.Generator().manual_seed(seed)
-    many[keys.SEED] = torch.randint(2**62, (len(many), 1), generator=generator)
+    many[keys.SEED] = torch.randint(2**62, (len(many), 1), generator=generator).to(policy.device)
     first = policy.n_obs_steps - 1
     with torch.no_grad():
         answers = planned_answers(policy, many)[:, first : first + n_action_steps]

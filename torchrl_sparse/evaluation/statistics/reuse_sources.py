@@ -85,5 +85,5 @@ def reuse_sources(policy: DiffusionPolicy, queries: TensorDictBase) -> ReuseSour
         total = total + source_similarity(features, before if elapsed[row] else None)
         before = features
     counts = torch.tensor([len(queries), len(queries), sum(map(bool, elapsed))])
-    own, latest, query = (total / counts[:, None, None]).tolist()
+    own, latest, query = (total.cpu() / counts[:, None, None]).tolist()
     return ReuseSources(len(queries), own, latest, query)

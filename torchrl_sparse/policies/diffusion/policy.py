@@ -179,6 +179,15 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["denoise"].noise
 
     @property
+    def device(self) -> torch.device:
+        """Where the networks are, and queries and their noise must be; ``policy.to("cuda")`` moves it."""
+        return next(self.network.parameters()).device
+
+    @property
+    def n_obs_steps(self) -> int:
+        return self.network.n_obs_steps
+
+    @property
     def num_inference_steps(self) -> int:
         """Denoising steps K."""
         return self.sampler.num_inference_steps
@@ -192,10 +201,6 @@ class DiffusionPolicy(TensorDictSequential):
     def horizon(self) -> int:
         """Actions that the network denoises, H; a chunk leaves out those before the present step."""
         return self.network.horizon
-
-    @property
-    def n_obs_steps(self) -> int:
-        return self.network.n_obs_steps
 
     @property
     def fingerprint(self) -> str:
@@ -239,15 +244,15 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        device = next(self.network.parameters()).device
-        start = synchronised_clock(device)
+        start = synchronised_clock(self.device)
         try:
             if not answer_directly(tensordict, *self.module.values()):
                 tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error
-        seconds = synchronised_clock(device) - start
-        return tensordict.set(keys.LATENCY, torch.full((*tensordict.batch_size, 1), seconds, device=device))
+        seconds = synchronised_clock(self.device) - start
+        batch = *tensordict.batch_size, 1
+        return tensordict.set(keys.LATENCY, torch.full(batch, seconds, device=self.device))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.

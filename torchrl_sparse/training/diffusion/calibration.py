@@ -19,7 +19,7 @@ def calibrate_policy(
 ) -> Calibration:
     """Calibrate on the first observation of one episode per seed, as BAC's release does with a single one."""
     env = make_env(seeds=list(seeds))
-    first = torch.stack([env.reset() for _ in seeds])
+    first = torch.stack([env.reset() for _ in seeds]).to(policy.device)
     env.close()
     encoded = policy.module["encode"](first)
     noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))

@@ -58,7 +58,7 @@ def make_targets(
         on_progress: called with (windows answered, all).
 
     Returns:
-        [N]: ``("diffusion", "cond")`` f32 [N, To, D], ``("diffusion", "seed")`` i64 [N, 1], ``"target"``
+        [N], where the policy is: ``("diffusion", "cond")`` f32 [N, To, D], ``("diffusion", "seed")`` i64 [N, 1], ``"target"``
         f32 [N, H, A], normalised.
 
     Raises:
@@ -74,7 +74,8 @@ def make_targets(
             f"share: expected at least one of {len(rows)} windows and not more than all, got {share}"
         )
     generator = torch.Generator().manual_seed(seed)
-    windows = demos.windows(rows[torch.randperm(len(rows), generator=generator)[:size]], network.n_obs_steps)
+    drawn = rows[torch.randperm(len(rows), generator=generator)[:size]]
+    windows = demos.windows(drawn, network.n_obs_steps).to(policy.device)
     targets = TensorDict(
         {
             keys.COND: normalizer.normalize_state(windows[keys.HISTORY_STATE]),
@@ -82,7 +83,7 @@ def make_targets(
             "target": normalizer.normalize_action(windows[keys.ACTION]),
         },
         [size],
-    )
+    ).to(policy.device)
     if source == "teacher":
         targets["target"] = dense_answers(policy, targets, on_progress)
     return targets

@@ -60,7 +60,8 @@ def fit_to_masks(
     for update in range(total):
         mask = masks[update % len(masks)]
         cond = targets[keys.COND][torch.randint(len(targets), (_BATCH,))]
-        rate = torch.full((len(cond), 1), prune_rate(mask).item()) if gates.rate_input else None
+        given = torch.full((len(cond), 1), prune_rate(mask).item(), device=cond.device)
+        rate = given if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
         if (shape := logits.shape[1:]) != mask.shape:
             raise ValueError(f"mask: expected [K, 3L] = {[*shape]} as the gates have, got {[*mask.shape]}")
@@ -90,7 +91,7 @@ def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, s
         samples: observations to measure it with, the first.
     """
     cond = targets[keys.COND][:samples]
-    rate = torch.full((len(cond), 1), 0.5) if gates.rate_input else None
+    rate = torch.full((len(cond), 1), 0.5, device=cond.device) if gates.rate_input else None
     observed, weight = cond.flatten(1), gates.obs.weight
     deviation = observed.std(dim=0)
     varies = deviation > _SMALLEST_DEVIATION

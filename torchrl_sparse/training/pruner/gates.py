@@ -52,7 +52,7 @@ GATES: dict[str, Callable[..., nn.Module]] = {"sag": _sag, "l2c": _l2c}
 def make_gates(
     method: str, policy: DiffusionPolicy, *, rate_input: bool = False, seed: int = 0, **sizes: Any
 ) -> nn.Module:
-    """Return untrained gates for a policy.
+    """Return untrained gates for a policy, where it is.
 
     Args:
         method: a key of `GATES`: ``"sag"``, which reads the observation, or ``"l2c"``, which does not.
@@ -73,4 +73,4 @@ def make_gates(
     if method not in GATES:
         raise ValueError(f"method: expected one of {', '.join(GATES)}, got {method!r}")
     torch.manual_seed(seed)
-    return GATES[method](policy, rate_input, **sizes)
+    return GATES[method](policy, rate_input, **sizes).to(policy.device)

@@ -46,7 +46,7 @@ class PrunerTrainer(Trainer):
     Args:
         gates: :class:`~torchrl_sparse.blocks.sag.network.PrunerNetwork` or :class:`~torchrl_sparse.blocks.l2c.StaticGates`.
         policy: the policy, with the sampler that will be pruned; its weights get no gradient.
-        targets: of the calibration set, see `make_targets`; the last tenth is held out.
+        targets: of the calibration set, see `make_targets`, where gates and policy are; the last tenth is held out.
         config: how to train.
 
     Attributes:
@@ -65,7 +65,8 @@ class PrunerTrainer(Trainer):
                 f"got {config.rate_range} and rate_input={gates.rate_input}"
             )
         steps = torch.arange(policy.num_inference_steps)
-        self._may_prune = (steps % 2 == 1 if config.objective == "noise" else steps > 0)[:, None]
+        may_prune = (steps % 2 == 1 if config.objective == "noise" else steps > 0)[:, None]
+        self._may_prune = may_prune.to(policy.device)
         highest = self._may_prune.double().mean().item()
         if (asked := max(config.rate_range or (config.rate,))) > highest:
             kept = "every other step" if config.objective == "noise" else "the first step"
@@ -76,7 +77,7 @@ class PrunerTrainer(Trainer):
         policy.network.requires_grad_(False)
         held_out = max(1, len(targets) // 10)
         self.train_set, self.held_out = targets[:-held_out], targets[-held_out:]
-        self.weight = block_weights(policy, config.cost)
+        self.weight = block_weights(policy, config.cost).to(policy.device)
         total = math.ceil(config.epochs * len(self.train_set) / config.batch_size)
         if config.max_updates is not None:
             total = min(total, config.max_updates)
@@ -154,12 +155,12 @@ class PrunerTrainer(Trainer):
 
     def load_state(self, state: dict[str, Any]) -> None:
         super().load_state(state)
-        self.weight = state["weight"]  # seconds are measured anew in every process
+        self.weight = state["weight"].to(self.policy.device)  # seconds are measured anew in every process
 
     def _masks(self, cond: Tensor) -> Tensor:
         """Return the masks bool [B, K, 3L] as they will be used, at the rate that is trained for."""
         self.gates.eval()
-        masks = self._logits(cond, torch.full((len(cond), 1), self.config.rate)) > 0
+        masks = self._logits(cond, torch.full((len(cond), 1), self.config.rate, device=cond.device)) > 0
         return masks & self._may_prune
 
     def _logits(self, cond: Tensor, rate: Tensor) -> Tensor:
@@ -177,9 +178,9 @@ class PrunerTrainer(Trainer):
 
     def _draw_rates(self, batch: int) -> Tensor:
         if self.config.rate_range is None:
-            return torch.full((batch, 1), self.config.rate)
+            return torch.full((batch, 1), self.config.rate, device=self.policy.device)
         low, high = self.config.rate_range
-        return low + (high - low) * torch.rand(batch, 1)
+        return low + (high - low) * torch.rand(batch, 1).to(self.policy.device)
 
     def _fidelity(self, batch: TensorDict, gate: Tensor) -> Tensor:
         config, policy = self.config, self.policy
@@ -204,7 +205,7 @@ class PrunerTrainer(Trainer):
         """Return the errors of one step for the whole batch, drawn with its noise, as L2C's release does."""
         clean, policy = batch["target"], self.policy
         step = 1 + 2 * int(torch.randint(policy.num_inference_steps // 2, ()))
-        noise = torch.randn(len(clean), 2, *clean.shape[1:])
+        noise = torch.randn(len(clean), 2, *clean.shape[1:]).to(clean.device)
         return noise_errors(
             policy.network, policy.sampler, clean, noise, batch[keys.COND], gate[:, step], step
         )
@@ -219,6 +220,6 @@ def mean_mask(share: Tensor) -> Tensor:
     >>> mean_mask(torch.tensor([[0.0, 0.0], [0.9, 0.4]])).tolist()
     [[False, False], [True, False]]
     """
-    mask = torch.zeros(share.numel(), dtype=torch.bool)
+    mask = torch.zeros(share.numel(), dtype=torch.bool, device=share.device)
     mask[share.flatten().argsort(descending=True, stable=True)[: round(share.sum().item())]] = True
     return mask.view_as(share)
