@@ -9,6 +9,10 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 
 
+class OnCPU(TensorDictModule):
+    device = torch.device("cpu")
+
+
 class CountingEnv:
     """An episode of seven steps, each observed by its number."""
 
@@ -31,10 +35,7 @@ class CountingEnv:
 
 
 def test_a_query_is_recorded_with_the_chunk_before_it():
-    policy = TensorDictModule(
-        lambda step: step[..., None].repeat(1, 4, 2), in_keys=["step"], out_keys=[keys.CHUNK]
-    )
-    policy.device = torch.device("cpu")
+    policy = OnCPU(lambda step: step[..., None].repeat(1, 4, 2), in_keys=["step"], out_keys=[keys.CHUNK])
     queries = record_queries(ChunkExecutor(policy, n_action_steps=3), lambda seeds: CountingEnv(), [1, 2])
     assert queries["step"].flatten().tolist() == [0, 3, 6, 0, 3, 6]
     assert queries[keys.ELAPSED].flatten().tolist() == [0, 3, 3, 0, 3, 3]
