@@ -94,7 +94,7 @@ OPTIONS: dict[str, Any] = {
     "profile_query.sampler": Word,
     "calibrate_bac.sampler": Word | None,
     "candidates": Section,
-    **dict.fromkeys(("accelerate_policy.candidates.samplers", "searched", "cached"), list[Word]),
+    **dict.fromkeys(("accelerate_policy.candidates.samplers", "searched", "cached", "rounded"), list[Word]),
     **dict.fromkeys(("updates", "intervals"), list[Count]),
     "looking.sampler": Word | None,
     "looking.pruner": Word | None,

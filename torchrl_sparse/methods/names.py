@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-__all__ = ["MethodName"]
+__all__ = ["WEIGHTS", "MethodName"]
+
+WEIGHTS = ("bf16", "int8")
 
 _PATTERN = re.compile(
     r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?"  # the policy, and how its chunks are executed
-    r"(?::(bf16|int8))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
+    rf"(?::({'|'.join(WEIGHTS)}))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
 )
 
 

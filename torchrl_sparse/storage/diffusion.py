@@ -7,6 +7,7 @@
      "schedule": {arguments of Sampler},
      "plan": "plan.json" or "plan", a planner's file or folder beside this one; only where something is pruned,
      "warm_start": steps of a query that begins from the last chunk; only where not all begin from noise,
+     "engine": "native_int8" or "native_bf16"; only where the policy runs with rounded weights,
      "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
 
@@ -33,6 +34,7 @@ from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, wri
 FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
 PlanName = Literal["plan.json", "plan"]  # of fixed names alone: a file cannot ask for one elsewhere
+RoundedEngine = Literal["native_bf16", "native_int8"]  # what is no choice of speed alone
 _NETWORK, _NORMALIZER, _VISION = "network.", "normalizer.", "vision."
 
 
@@ -47,6 +49,7 @@ class _Config:
     source: dict[str, Any] | None = None
     plan: PlanName | None = None
     warm_start: int | None = None
+    engine: RoundedEngine | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class StoredPolicy:
             robomimic's; None for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
         warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
+        engine: that rounds weights and activations; None if nothing is rounded.
     """
 
     network: TransformerForDiffusion
@@ -74,12 +78,14 @@ class StoredPolicy:
     source: dict[str, Any] = field(default_factory=dict)
     plan: PlanName | None = None
     warm_start: int | None = None
+    engine: RoundedEngine | None = None
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
     """Write both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
     vision = None if policy.vision is None else policy.vision.config
-    network, schedule, kept = policy.network.config, policy.sampler.config, (policy.plan, policy.warm_start)
+    network, schedule = policy.network.config, policy.sampler.config
+    kept = policy.plan, policy.warm_start, policy.engine
     config = _Config(FORMAT, network, schedule, vision, policy.source or None, *kept)
     weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
     if policy.vision is not None:
@@ -110,7 +116,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
         module.eval()
     normalizer = _make(path / "model.safetensors", "normalizer", Normalizer, take(tensors, _NORMALIZER))
     vision, source = modules.get(_VISION), config.source or {}
-    kept = config.plan, config.warm_start
+    kept = config.plan, config.warm_start, config.engine
     return StoredPolicy(modules[_NETWORK], normalizer, sampler, vision, source, *kept)
 
 

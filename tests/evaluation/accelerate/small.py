@@ -11,6 +11,7 @@ GRID = Grid(
     cached=("ddpm4",),
     updates=(2, 9),
     intervals=(2, 6),
+    rounded=(),
     strides=(40,),
 )
 METHODS = [

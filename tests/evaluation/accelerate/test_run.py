@@ -9,6 +9,7 @@ import torch
 
 from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, episodes_of, fixed_times
 from torchrl_sparse import Uniform
+from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
 from torchrl_sparse.evaluation.results.schema import load_results
@@ -37,6 +38,18 @@ def test_every_candidate_is_measured_and_the_most_promising_taken(go, policy, tm
     assert found.chosen == found.ranking[0]
     assert found.played == {}
     assert load_acceleration(tmp_path / "acceleration.json") == found
+
+
+@pytest.mark.skipif(not native_available()[0], reason="only the native engine rounds")
+def test_dense_and_chains_without_a_cache_are_tried_with_rounded_weights(go):
+    found, _ = go(replace(GRID, rounded=("int8",)))
+    (searched,) = (name for name in found.candidates if name.startswith("ddpm_") and ":" not in name)
+    rounded = {name for name in found.candidates if ":" in name}
+    assert rounded == {f"{name}:int8" for name in ("dense", "ddpm2_logsnr", "ddim4", searched)}
+    assert found.candidates["dense:int8"].family == "stochastic"
+    assert found.candidates["dense:int8"].error != found.candidates["dense"].error
+    with pytest.raises(ValueError, match="rounded: expected some of bf16, int8, got 'int4'"):
+        Grid(rounded=("int4",))
 
 
 def test_the_error_of_a_cached_chain_is_that_of_its_mask(go, policy, demos):

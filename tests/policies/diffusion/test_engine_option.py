@@ -42,6 +42,21 @@ def test_the_option_is_taken_by_the_constructors(policy, tmp_path):
         DiffusionPolicy.from_pretrained(tmp_path, engine="turbo")
 
 
+@pytest.mark.skipif(not native_available()[0], reason="only the native engine rounds")
+def test_rounded_weights_are_saved_as_such_and_given_up_for_an_exact_engine(policy, tmp_path):
+    policy.engine = "native_int8"
+    policy.save_pretrained(tmp_path)
+    rounded, exact = (
+        DiffusionPolicy.from_pretrained(tmp_path, engine=engine) for engine in ("auto", "native")
+    )
+    assert (rounded.engine, exact.engine) == ("native_int8", "native")
+    answers = [loaded(request(3))[keys.CHUNK] for loaded in (rounded, exact)]
+    assert not torch.equal(*answers)
+    torch.testing.assert_close(
+        answers[0], policy(request(3))[keys.CHUNK], atol=5e-2, rtol=0
+    )  # fp16 on the way
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("through_data", [False, True])
 def test_weights_that_change_change_the_actions(policy, engine, through_data):

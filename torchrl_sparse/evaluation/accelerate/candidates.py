@@ -14,10 +14,13 @@ from tqdm import tqdm
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.blocks.engine.native.engine import native_supports
 from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.evaluation.accelerate.stages import Search, read_or_make
 from torchrl_sparse.evaluation.results.acceleration import Family
+from torchrl_sparse.evaluation.results.schema import DENSE
+from torchrl_sparse.methods.names import WEIGHTS
 from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -38,6 +41,8 @@ class Grid:
         cached: chains that cache schedules are made for, beside the policy's own.
         updates: M, how often BAC computes a block; of each chain those below its steps.
         intervals: of uniform caching; of each chain those below its steps.
+        rounded: weights, ``"int8"`` or ``"bf16"``, that dense and every chain without a cache are tried with too, where the
+            native engine runs.
         strides: of the search, see `search_timesteps`.
 
     Raises:
@@ -52,6 +57,7 @@ class Grid:
     cached: tuple[str, ...] = ("ddpm10_logsnr", "ddim10")
     updates: tuple[int, ...] = (3, 5, 10, 20)
     intervals: tuple[int, ...] = (2, 4, 7)
+    rounded: tuple[str, ...] = ("int8",)
     strides: tuple[int, ...] = (10, 5, 2)
 
     def __post_init__(self) -> None:
@@ -61,6 +67,9 @@ class Grid:
         for name in self.searched:
             if SamplerName.parse(name).timesteps is not None:
                 raise ValueError(f"searched: expected KIND and STEPS, such as ddpm3, got {name!r}")
+        for weights in self.rounded:
+            if weights not in WEIGHTS:
+                raise ValueError(f"rounded: expected some of {', '.join(WEIGHTS)}, got {weights!r}")
 
 
 def calibrate_candidates(
@@ -93,6 +102,8 @@ def calibrate_candidates(
     bar = tqdm(grid.searched, desc=f"{'timesteps':>14}", unit="search")
     for chain in bar:
         names.append(_search(policy, targets, chain, grid, folder, made_for, n_action_steps, bar.refresh))
+    if native_supports(policy.network)[0]:
+        names += [f"{name}:{weights}" for weights in grid.rounded for name in (DENSE, *names)]
     for chain in tqdm([None, *grid.cached], desc=f"{'schedules':>14}", unit="chain"):
         names += _cache_schedules(policy, targets, chain, grid, folder)
     return list(dict.fromkeys(names))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -34,7 +34,7 @@ from torchrl_sparse.policies.diffusion.kinds import check_kinds
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
-from torchrl_sparse.storage.diffusion import StoredPolicy, read_pretrained, write_pretrained
+from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
 
@@ -257,12 +257,17 @@ class DiffusionPolicy(TensorDictSequential):
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
+        An engine that rounds is kept, any other is the reader's choice.
+
         Raises:
             ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
                 None nor a `WarmStart`; nothing is written.
         """
-        warm = stored_start(self.start)
-        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm
+        warm, rounds = (
+            stored_start(self.start),
+            self.engine if self.engine in get_args(RoundedEngine) else None,
+        )
+        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm, rounds
         write_pretrained(
             Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
         )
@@ -275,6 +280,8 @@ class DiffusionPolicy(TensorDictSequential):
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
         """Read what `save_pretrained` wrote, with sampler, start and planner; a ``.ckpt`` as `from_diffusion_policy` does.
+
+        A policy that was saved with rounded weights rounds them again under ``engine="auto"``; ``"native"`` does not.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -298,6 +305,8 @@ class DiffusionPolicy(TensorDictSequential):
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
+        if engine == "auto" and stored.engine is not None:
+            engine = stored.engine
         options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
         policy = cls(stored.network, stored.normalizer, **options)
         policy.source = stored.source
