@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
-from tests.evaluation.synthetic import make_results
+from tests.evaluation.synthetic import MACHINE, POLICY, make_results
+from torchrl_sparse.evaluation.benchmarks.rounds import play_rounds
+from torchrl_sparse.evaluation.latency.measure import summarize_latency
+from torchrl_sparse.evaluation.results.acceleration import Played
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.page_rows import read_table
-from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.report import format_table, results_rows
+from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.statistics.scores import mean_interval
+from torchrl_sparse.evaluation.statistics.scores import mean_interval, mean_z
+from torchrl_sparse.evaluation.statistics.sequential import Design
 
 
 def test_intervals_are_those_of_the_t_tests():
@@ -52,3 +58,46 @@ def test_a_page_that_asks_for_scores_of_a_task_without_is_told(tmp_path):
     EpisodeLog(tmp_path / "episodes" / "dense.jsonl").append(EpisodeResult(100_000, True, 30, 4, 1e9, 0.0))
     with pytest.raises(ValueError, match="rows: expected episodes of lift with scores, got none"):
         read_table(tmp_path / "results.json", "scores")
+
+
+def scored(mean, count=60, solved=False):
+    """Episodes of a task that hardly anybody solves, whose scores scatter around a mean."""
+    scores = np.clip(np.random.default_rng(int(100 * mean)).normal(mean, 0.1, count), 0, 1)
+    return [EpisodeResult(seed, solved, 60, 3, 30.0, 0.0, score=score) for seed, score in enumerate(scores)]
+
+
+def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
+    runs = {
+        name: MethodRun(scored(mean), summarize_latency([1.0] * 5), (0.1, 0.4))
+        for name, mean in {"dense": 0.7, "same": 0.74, "worse": 0.4}.items()
+    }
+    results = build_results(
+        runs,
+        task="PushT",
+        split="development",
+        seed=0,
+        terms=Terms(Design(60), 60, by_degrees=True),
+        machine=MACHINE,
+        policy=POLICY,
+    )
+    save_results(results, tmp_path / "results.json")
+    assert load_results(tmp_path / "results.json") == results
+    worse, same = Played.of(results.methods["worse"]), Played.of(results.methods["same"])
+    assert worse.paired_vs_dense.verdict == "undecided"  # nothing was solved, and nothing lost by that
+    assert worse.verdicts == {"the score": "inferior"}
+    assert (same.is_right, worse.is_right) == (True, False)
+    gains = [a.score - b.score for a, b in zip(runs["worse"].episodes, runs["dense"].episodes, strict=True)]
+    assert worse.score.vs_dense.ci95 == pytest.approx([*ttest_1samp(gains, 0).confidence_interval()])
+    assert worse.score.p_value < 0.001
+    row = results_rows(results)[2]
+    assert row["verdict"] == "inferior"
+    assert "time vs dense" not in row
+    assert "2 comparisons with dense" in format_table(results)
+
+
+def test_episodes_of_such_a_task_go_on_until_the_score_is_decided():
+    played = {"dense": scored(0.7, 300), "far": scored(0.4, 300), "close": scored(0.665, 300)}
+    terms = Terms(Design(300, 30), 60, by_degrees=True)
+    episodes = play_rounds(["far", "close"], lambda name, count: played[name][:count], terms)
+    assert len(episodes["far"]) < 100
+    assert mean_z(np.zeros(1), -0.05) == 0  # one episode says nothing

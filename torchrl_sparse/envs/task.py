@@ -17,6 +17,8 @@ class Task(Protocol):
     Attributes:
         name: of the task in results.
         alias: short name for folders and command lines.
+        by_degrees: whether episodes are judged by their score, the highest reward of a step, since success is rare and says
+            little.
         early_cut: steps within which a policy of the expert's speed is done; None where that was not measured.
         state_dim, action_dim: sizes of the low-dimensional observation and of the action.
         state_keys: names, in demonstration files, of the observations whose concatenation is the state.
@@ -27,6 +29,7 @@ class Task(Protocol):
 
     name: str
     alias: str
+    by_degrees: bool
     early_cut: int | None
 
     @property

@@ -158,6 +158,7 @@ class StateTask(_Named):
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
             without one.
         way_of: see `RobosuiteTask`.
+        by_degrees: see `Task`.
     """
 
     name: str
@@ -167,6 +168,7 @@ class StateTask(_Named):
     environment: str
     expert: str | None = None
     way_of: str | None = None
+    by_degrees: bool = False
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -258,7 +260,9 @@ _ROBOSUITE = (
     ),
 )
 _OTHERS = (
-    StateTask("PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert")),
+    StateTask(
+        "PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert"), by_degrees=True
+    ),
     StateTask(
         *("BlockPush", "block_push", 16, 2, f"{_ENVS}.block_push:BlockPushEnv"),
         expert=_expert("block_push:BlockPushExpert"),

@@ -1,5 +1,7 @@
 """Looking again and again costs no error: the design's level, and whole benchmarks simulated at the margins."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -100,3 +102,10 @@ def test_published_simulation_is_what_its_command_makes():
 
 def test_a_single_pair_decides_nothing():
     assert abs(time_z([30], [30], 400, 1.1)) < 1
+
+
+@pytest.mark.parametrize("looks", [1, 30])
+def test_a_p_value_never_grows_with_the_evidence(looks):
+    p_values = [Design(300, looks).p_value(z, 300) for z in (1, 2, 4, 8, 20, 60, math.inf)]
+    assert p_values == sorted(p_values, reverse=True)
+    assert p_values[-1] < 1e-12

@@ -76,9 +76,9 @@ def choose(
 ) -> str:
     """Return the method to take.
 
-    Of the methods that are non-inferior to dense in success and in time: with a budget, which all of them keep, the one whose
-    success is surest; else the fastest. Where none is shown to be, the one whose interval reaches least below dense. Where none
-    was played, the first of the ranking.
+    Of the methods that are non-inferior to dense in success and in time, or in the score of a task done by degrees: with a
+    budget, which all of them keep, the one that is surest; else the fastest. Where none is shown to be, the one whose interval
+    reaches least below dense. Where none was played, the first of the ranking.
     """
     tried = [name for name in ranking if name in played]
     if not tried:
@@ -86,4 +86,4 @@ def choose(
     right = [name for name in tried if played[name].is_right]
     if right and budget_ms is None:
         return min(right, key=lambda name: candidates[name].latency_s.p50)
-    return max(right or tried, key=lambda name: played[name].paired_vs_dense.ci95[0])
+    return max(right or tried, key=lambda name: played[name].judged.ci95[0])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.labels import place_labels
+from torchrl_sparse.evaluation.results.parts import Interval
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1
 from torchrl_sparse.evaluation.results.text import threads_text
 
@@ -24,7 +25,9 @@ _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
 
 def plot_pareto(results: AnyResults, path: str | os.PathLike) -> Path:
-    """Draw success, with its interval, against the median latency of a query (log axis); the marker is the verdict.
+    """Draw success, or the score, with its interval, against the median latency of a query (log axis).
+
+    The marker is the verdict.
 
     Args:
         results: of a benchmark.
@@ -32,26 +35,33 @@ def plot_pareto(results: AnyResults, path: str | os.PathLike) -> Path:
     """
     methods = results.methods
     figure, axes = make_figure(9, 5)
-    points = {
-        name: (1e3 * method.latency_s.p50, 100 * method.success.rate) for name, method in methods.items()
-    }
-    intervals = {name: [100 * limit for limit in method.success.ci95] for name, method in methods.items()}
+    heights = {name: _height(method) for name, method in methods.items()}
+    points = {name: (1e3 * method.latency_s.p50, 100 * heights[name][0]) for name, method in methods.items()}
+    intervals = {name: [100 * limit for limit in ci95] for name, (_, ci95) in heights.items()}
     colors = method_colors(methods)
     axes.set_xscale("log")
     for name, method in methods.items():
         axes.vlines(points[name][0], *intervals[name], color=colors[name], linewidth=2, alpha=0.55)
-        marker = "s" if name == DENSE else _MARKERS[method.paired_vs_dense.verdict]
+        marker = "s" if name == DENSE else _MARKERS[method.judged.verdict]
         axes.plot(*points[name], marker, color=colors[name], markersize=9, zorder=3)
     _draw_front(axes, points)
     _set_limits(axes, points, min(low for low, _ in intervals.values()))
     _draw_margin(axes, points[DENSE][1], 100 * results.dense.paired_vs_dense.margin, colors[DENSE])
     axes.set_xlabel("latency per query, median (ms, log scale)")
-    axes.set_ylabel("success (%), 95 % interval")
+    what = "score, % of the highest" if results.by_degrees else "success (%)"
+    axes.set_ylabel(f"{what}, 95 % interval")
     title = f"{results.task}: {results.dense.success.n} paired episodes; {results.machine.cpu}"
     axes.set_title(f"{title}, {threads_text(results.machine.threads)}", loc="left")
     _verdict_legend(figure, axes, methods)
     place_labels(figure, axes, points, intervals, colors)
     return save_figure(figure, path)
+
+
+def _height(method: MethodEntry1) -> tuple[float, Interval]:
+    """Return what is drawn of a method, and its interval."""
+    if method.score:
+        return method.score.mean, method.score.ci95
+    return method.success.rate, method.success.ci95
 
 
 def _set_limits(axes: Axes, points: Mapping[str, tuple[float, float]], lowest: float) -> None:
@@ -99,7 +109,7 @@ def _draw_front(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
 def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntry1]) -> None:
     from matplotlib.lines import Line2D
 
-    present = {m.paired_vs_dense.verdict for name, m in methods.items() if name != DENSE}
+    present = {m.judged.verdict for name, m in methods.items() if name != DENSE}
     handles = [
         Line2D([], [], color="#777777", marker=marker, linestyle="", markersize=8, label=verdict)
         for verdict, marker in _MARKERS.items()

@@ -9,16 +9,25 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from torchrl_sparse.evaluation.latency.measure import Machine
-from torchrl_sparse.evaluation.results.parts import Difference, Percentiles, Success, TimeDifference, require
+from torchrl_sparse.evaluation.results.parts import (
+    Difference,
+    Percentiles,
+    Score,
+    Success,
+    TimeDifference,
+    require,
+)
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry
 from torchrl_sparse.evaluation.results.text import (
     count_text,
     difference_text,
+    mean_text,
     milliseconds_text,
     ratio_text,
     threads_text,
     verdict_text,
 )
+from torchrl_sparse.evaluation.statistics.intervals import Verdict
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -36,6 +45,7 @@ __all__ = [
 
 Family = Literal["stochastic", "cached", "deterministic", "pruner"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
+_JUDGED, _TIMED = ("vs dense, points", "verdict"), ("time vs dense", "time verdict")
 
 
 @dataclass(frozen=True)
@@ -64,16 +74,29 @@ class Played:
     success: Success
     paired_vs_dense: Difference
     time_vs_dense: TimeDifference
+    score: Score | None = None
 
     @classmethod
     def of(cls, entry: MethodEntry) -> Played:
         """Take it from a benchmark's entry."""
-        return cls(entry.success, entry.paired_vs_dense, entry.time_vs_dense)
+        return cls(entry.success, entry.paired_vs_dense, entry.time_vs_dense, entry.score)
+
+    @property
+    def judged(self) -> Difference:
+        """What it is judged by: success, or the score of a task that is done by degrees."""
+        return self.score.vs_dense if self.score else self.paired_vs_dense
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """What it is judged in -> the verdict: success and time, or the score."""
+        if self.score:
+            return {"the score": self.judged.verdict}
+        return {"success": self.judged.verdict, "time": self.time_vs_dense.verdict}
 
     @property
     def is_right(self) -> bool:
-        """Whether it is non-inferior to dense in success and in time."""
-        return self.paired_vs_dense.verdict == self.time_vs_dense.verdict == "non-inferior"
+        """Whether it is non-inferior to dense in all that it is judged in."""
+        return {*self.verdicts.values()} == {"non-inferior"}
 
 
 @dataclass(frozen=True)
@@ -169,11 +192,19 @@ def verdict_line(acceleration: Acceleration) -> str:
     if name not in played:
         return f"{chosen} Chosen offline, by the error to demonstrations alone: no episode was played."
     ours, dense = played[name], played[DENSE]
-    counts = f"It solved {count_text(ours.success)}, dense {count_text(dense.success)}"
+    told = f"It solved {count_text(ours.success)}, dense {count_text(dense.success)}"
+    if ours.score and dense.score:
+        told = f"Its score is {_score_text(ours.score)}, dense's {_score_text(dense.score)}"
     if ours.is_right:
-        return f"{chosen} {counts}: non-inferior to dense in success and in time."
-    found = f"{ours.paired_vs_dense.verdict} in success, {ours.time_vs_dense.verdict} in time"
-    return f"{chosen} {counts}: {found}. No method played is shown to be as good as dense; this one comes nearest."
+        return f"{chosen} {told}: non-inferior to dense in {' and in '.join(ours.verdicts)}."
+    found = ", ".join(f"{verdict} in {what}" for what, verdict in ours.verdicts.items())
+    return (
+        f"{chosen} {told}: {found}. No method played is shown to be as good as dense; this one comes nearest."
+    )
+
+
+def _score_text(score: Score) -> str:
+    return mean_text(score.mean, score.ci95)
 
 
 def _row(acceleration: Acceleration, name: str) -> dict[str, str]:
@@ -186,20 +217,18 @@ def _row(acceleration: Acceleration, name: str) -> dict[str, str]:
         "p95, ms": milliseconds_text(candidate.latency_s.p95),
         "speed-up": f"{acceleration.speedup(name):.2f}×",
         "budget": "" if name == DENSE else "within" if name in acceleration.ranking else "over",
-        **(_episode_cells(name, played) if acceleration.played else {}),
+        **(_episode_cells(name, played, acceleration.played[DENSE]) if acceleration.played else {}),
     }
 
 
-def _episode_cells(name: str, played: Played | None) -> Mapping[str, str]:
-    cells = dict.fromkeys(("success", "vs dense, points", "verdict", "time vs dense", "time verdict"), "")
+def _episode_cells(name: str, played: Played | None, dense: Played) -> Mapping[str, str]:
+    """Return what episodes said: success and time, or the score where dense has one; empty of a method not played."""
+    columns = ("score", *_JUDGED) if dense.score else ("success", *_JUDGED, *_TIMED)
     if played is None:
-        return cells
-    cells["success"] = count_text(played.success)
+        return dict.fromkeys(columns, "")
+    told = count_text(played.success) if dense.score is None else _score_text(played.score)
     if name == DENSE:
-        return cells
-    return cells | {
-        "vs dense, points": difference_text(played.paired_vs_dense),
-        "verdict": verdict_text(played.paired_vs_dense),
-        "time vs dense": ratio_text(played.time_vs_dense),
-        "time verdict": verdict_text(played.time_vs_dense),
-    }
+        return dict.fromkeys(columns, "") | {columns[0]: told}
+    judged, time = played.judged, played.time_vs_dense
+    texts = (told, difference_text(judged), verdict_text(judged), ratio_text(time), verdict_text(time))
+    return dict(zip(columns, texts, strict=False))

@@ -17,6 +17,7 @@ from torchrl_sparse.evaluation.results.parts import (
     Percentiles,
     PolicyShape,
     PValues,
+    Score,
     Success,
     TimeDifference,
     TokensKept,
@@ -33,7 +34,13 @@ from torchrl_sparse.evaluation.statistics.durations import (
     success_within,
     time_ratio,
 )
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, paired_difference
+from torchrl_sparse.evaluation.statistics.intervals import (
+    DEFAULT_MARGIN,
+    PairedDifference,
+    paired_difference,
+    verdict,
+)
+from torchrl_sparse.evaluation.statistics.scores import mean_interval, mean_z
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["MethodRun", "Terms", "build_results", "compare_episodes", "compare_pair"]
@@ -68,8 +75,9 @@ class Terms:
         design: when the episodes are looked at.
         episode_horizon: steps after which an episode is truncated.
         early_cut: of the task, see `torchrl_sparse.envs.tasks`; None for a task without one.
-        margin: of success: a difference of rates.
+        margin: of success: a difference of rates; of a task that is done by degrees, of mean scores.
         time_margin: of the restricted mean time: a share of dense's.
+        by_degrees: whether scores decide instead of success and time, see `torchrl_sparse.envs.task.Task`.
     """
 
     design: Design
@@ -77,14 +85,20 @@ class Terms:
     early_cut: int | None = None
     margin: float = DEFAULT_MARGIN
     time_margin: float = DEFAULT_TIME_MARGIN
+    by_degrees: bool = False
 
     def statistics(self, pairs: EpisodePairs) -> tuple[float, float]:
         """Return by how many standard errors success and time are better than their margins."""
         return pairs.statistics(self.episode_horizon, self.margin, self.time_margin)
 
+    def score_statistic(self, pairs: EpisodePairs) -> float:
+        """Return by how many standard errors the mean score is better than its margin."""
+        return mean_z(pairs.score_gains, -self.margin)
+
     def decided(self, pairs: EpisodePairs) -> bool:
         """Tell whether the verdict of a method on these episodes, at a look of the design, is reached."""
-        return self.design.decides(len(pairs.method), *self.statistics(pairs))
+        deciding = (self.score_statistic(pairs),) if self.by_degrees else self.statistics(pairs)
+        return self.design.decides(len(pairs.method), *deciding)
 
 
 def build_results(
@@ -240,7 +254,18 @@ def compare_episodes(
         "restricted_mean_time": float(ours.mean()),
         "success_within": {str(step): share for step, share in shares.items()},
         "correlation_with_dense": correlation(ours, theirs),
+        "score": _score(name, pairs, terms) if terms.by_degrees else None,
     }
+
+
+def _score(name: str, pairs: EpisodePairs, terms: Terms) -> Score:
+    mean, ci = mean_interval([episode.score for episode in pairs.method])
+    if name == DENSE:
+        return Score(mean, ci, Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior"), None)
+    n, design = len(pairs.method), terms.design
+    gain, gain_ci = mean_interval(pairs.score_gains, design.confidence(n))
+    beside_dense = Difference(gain, gain_ci, terms.margin, verdict(gain_ci, terms.margin))
+    return Score(mean, ci, beside_dense, design.p_value(abs(terms.score_statistic(pairs)), n))
 
 
 def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:

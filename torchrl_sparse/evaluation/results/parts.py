@@ -18,6 +18,7 @@ __all__ = [
     "Flops",
     "Interval",
     "PValues",
+    "Score",
     "PairedEntry",
     "Percentiles",
     "PolicyShape",
@@ -98,6 +99,26 @@ class Difference:
 
 
 @dataclass(frozen=True)
+class Score:
+    """Mean score of episodes, of a task that is done by degrees, with Student's 95 % interval, and beside dense's.
+
+    Attributes:
+        vs_dense: mean paired difference; see `Difference`.
+        p_value: of its verdict, see `PValues`; None of dense.
+    """
+
+    mean: float
+    ci95: Interval
+    vs_dense: Difference
+    p_value: float | None
+
+    def __post_init__(self) -> None:
+        require(0 <= self.mean <= 1, "mean", "0 to 1", self.mean)
+        check_interval(self.ci95)
+        _check_p("p_value", self.p_value)
+
+
+@dataclass(frozen=True)
 class TimeDifference:
     """Restricted mean time over dense's on the same seeds, with its 95 % interval and the verdict against a margin.
 
@@ -134,8 +155,11 @@ class PValues:
 
     def __post_init__(self) -> None:
         for name in ("success", "time"):
-            value = getattr(self, name)
-            require(0 <= value <= 0.5, name, "0 to 0.5", value)
+            _check_p(name, getattr(self, name))
+
+
+def _check_p(name: str, value: float | None) -> None:
+    require(value is None or 0 <= value <= 0.5, name, "0 to 0.5", value)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
     count_text,
     difference_text,
+    mean_text,
     milliseconds_text,
     ratio_text,
     threads_text,
@@ -59,6 +60,10 @@ def _survivors(results: AnyResults) -> set[str] | None:
     """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
     if not isinstance(results, Results):
         return None
+    if results.by_degrees:
+        scores = {name: method.score.p_value for name, method in results.methods.items()}
+        p_values = {f"{name} success": p for name, p in scores.items() if p is not None}
+        return holm(p_values, _comparisons(results))
     tested = {name: method.p_values for name, method in results.methods.items() if method.p_values}
     p_values = {f"{name} success": p.success for name, p in tested.items()}
     p_values |= {f"{name} time": p.time for name, p in tested.items()}
@@ -66,20 +71,25 @@ def _survivors(results: AnyResults) -> set[str] | None:
 
 
 def _comparisons(results: Results) -> int:
-    """Return the verdicts of the table: on success and on time, of every method but dense."""
-    return 2 * (len(results.methods) - 1)
+    """Return the verdicts of the table: on success and on time, or on the score alone, of every method but dense."""
+    return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
 
 
 def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> dict[str, str]:
-    error, baseline = method.action_error_vs_dense, name == DENSE
+    error, baseline, score = method.action_error_vs_dense, name == DENSE, method.score
     survives = survivors is None or f"{name} success" in survivors
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
     return {
         "method": name,
         "success": count_text(method.success),
-        "vs dense, points": "" if baseline else difference_text(method.paired_vs_dense),
-        "verdict": "baseline" if baseline else verdict_text(method.paired_vs_dense, survives),
-        **(_time_cells(name, method, survivors or ()) if isinstance(method, MethodEntry) else {}),
+        **({"score": mean_text(score.mean, score.ci95)} if score else {}),
+        "vs dense, points": "" if baseline else difference_text(method.judged),
+        "verdict": "baseline" if baseline else verdict_text(method.judged, survives),
+        **(
+            _time_cells(name, method, survivors or ())
+            if isinstance(method, MethodEntry) and not score
+            else {}
+        ),
         "pruned": f"{100 * method.prune_rate:.1f} %",
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
@@ -191,17 +201,20 @@ def results_note(results: AnyResults) -> str:
     """Return the lines that explain the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
     n, margin = dense.success.n, dense.paired_vs_dense.margin
+    compared, scored = "difference to dense with Tango's", results.by_degrees
+    if scored:
+        compared = "score, the highest reward of an episode, and its difference to dense with Student's; verdicts are on it"
     steps, flops = f"{policy.num_inference_steps} denoising steps", "denoiser only"
     if dense.tokens:
         steps, flops = f"chunks of {policy.horizon} actions", "whole network"
     lines = [
         f"{results.task}, {_episodes_text(results)}: the same initial states "
-        "and the same noise for every method. Success with Wilson's 95 % interval, difference to dense with "
-        "Tango's.",
+        f"and the same noise for every method. Success with Wilson's 95 % interval, {compared}.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
         "below 0, whatever the margin.",
-        *(_time_lines(results) if isinstance(results, Results) else []),
+        *(_time_lines(results) if isinstance(results, Results) and not scored else []),
+        *(_comparison_lines(results) if isinstance(results, Results) else []),
         f"Dense: {policy.params:,} parameters, {steps}. FLOPs are "
         f"2·MAC of a query, {flops}. Latency of a query, all methods interleaved in one process, on "
         f"{machine.cpu}, {machine.device}, {threads_text(machine.threads)}, torch {machine.torch}, "
@@ -242,6 +255,9 @@ def _time_lines(results: Results) -> Iterator[str]:
         f"95 % interval and a verdict against a margin of {100 * margin:g} %; correlation is that of these steps with dense's "
         "over the seeds, about 0 where a method does not share dense's noise step by step."
     )
+
+
+def _comparison_lines(results: Results) -> Iterator[str]:
     yield (
         f"{_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
         "correction for them."

@@ -24,6 +24,7 @@ from torchrl_sparse.evaluation.results.parts import (
     Percentiles,
     PolicyShape,
     PValues,
+    Score,
     Success,
     TimeDifference,
     TokensKept,
@@ -80,6 +81,13 @@ class MethodEntry1:
     planning_s: Percentiles | None = None
     tokens: TokensKept | None = None
 
+    score = None  # version 1 tells none
+
+    @property
+    def judged(self) -> Difference:
+        """What it is judged by: the difference of success to dense's, or of the score where there is one."""
+        return self.score.vs_dense if self.score else self.paired_vs_dense
+
     def __post_init__(self) -> None:
         require(0 <= self.prune_rate <= 1, "prune_rate", "0 to 1", self.prune_rate)
 
@@ -98,6 +106,7 @@ class MethodEntry(MethodEntry1):
         correlation_with_dense: Pearson's, of times over the seeds; None also where times never differ.
         p_values: of the two verdicts.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement.
+        score: of a task that is done by degrees; its verdict is the one that counts there.
         per_episode: what an episode costs; of policies with visual tokens, whose queries differ, or where methods are asked
             unequally often.
     """
@@ -108,6 +117,7 @@ class MethodEntry(MethodEntry1):
     correlation_with_dense: float | None = None
     p_values: PValues | None = None
     speedup_ci95: Interval | None = None
+    score: Score | None = None
     per_episode: EpisodeCost | None = None
 
     def __post_init__(self) -> None:
@@ -146,6 +156,11 @@ class _Methods:
             got = method.success.n
             fits = got == n if same_episodes else got <= n
             require(fits, f"methods.{name}.success.n", expected, got)
+
+    @property
+    def by_degrees(self) -> bool:
+        """Whether the task is done by degrees, so that verdicts are those of scores."""
+        return self.dense.score is not None
 
     @property
     def dense(self) -> MethodEntry:

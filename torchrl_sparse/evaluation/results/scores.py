@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from torchrl_sparse.evaluation.results.parts import Difference
-from torchrl_sparse.evaluation.results.text import difference_text, verdict_text
+from torchrl_sparse.evaluation.results.text import difference_text, mean_text, verdict_text
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.intervals import verdict
 from torchrl_sparse.evaluation.statistics.scores import mean_interval
@@ -36,8 +36,11 @@ def score_rows(scores: Mapping[str, Mapping[int, float]], margin: float) -> list
 
 
 def _row(name: str, told: Mapping[int, float], dense: Mapping[int, float], margin: float) -> dict[str, str]:
-    mean, (low, high) = mean_interval([*told.values()])
-    row = {"method": name, "episodes": str(len(told)), "mean score": f"{mean:.3f} [{low:.3f}, {high:.3f}]"}
+    row = {
+        "method": name,
+        "episodes": str(len(told)),
+        "mean score": mean_text(*mean_interval([*told.values()])),
+    }
     if name == "dense":
         return row | {"vs dense, points": "", "verdict": "baseline"}
     diff, ci = mean_interval([told[seed] - dense[seed] for seed in told.keys() & dense.keys()])

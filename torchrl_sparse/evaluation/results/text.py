@@ -7,6 +7,7 @@ from torchrl_sparse.evaluation.results.parts import Difference, Interval, Succes
 __all__ = [
     "count_text",
     "difference_text",
+    "mean_text",
     "milliseconds_text",
     "percent_text",
     "points_text",
@@ -37,6 +38,15 @@ def percent_text(success: Success) -> str:
 def difference_text(difference: Difference) -> str:
     """Return a difference of success rates with its interval, in points."""
     return points_text(difference.diff, difference.ci95)
+
+
+def mean_text(mean: float, interval: Interval) -> str:
+    """Return a mean score with its interval.
+
+    >>> mean_text(0.7049, (0.6502, 0.7606))
+    '0.705 [0.650, 0.761]'
+    """
+    return f"{mean:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]"
 
 
 def points_text(diff: float, interval: Interval) -> str:

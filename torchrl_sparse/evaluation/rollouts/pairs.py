@@ -32,6 +32,14 @@ class EpisodePairs:
         """Successes of both."""
         return [episode.success for episode in self.method], [episode.success for episode in self.other]
 
+    @property
+    def score_gains(self) -> NDArray[np.float64]:
+        """How much higher the first one's scores are, pair by pair."""
+        ours, theirs = (
+            np.array([episode.score for episode in episodes]) for episodes in (self.method, self.other)
+        )
+        return ours - theirs
+
     def times(self, horizon: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the restricted times of both; see `restricted_times`."""
         lengths = ([episode.length for episode in episodes] for episodes in (self.method, self.other))

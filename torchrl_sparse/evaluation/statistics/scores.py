@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t
 
-__all__ = ["mean_interval"]
+__all__ = ["mean_interval", "mean_z"]
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
@@ -27,3 +29,16 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
     half = float(t.ppf((1 + confidence) / 2, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5)
     mean = float(values.mean())
     return mean, (mean - half, mean + half)
+
+
+def mean_z(values: ArrayLike, bound: float) -> float:
+    """Return by how many standard errors the mean of ``values`` lies above ``bound``; 0 of fewer than two, which say nothing.
+
+    >>> round(mean_z([0.5, 0.7, 0.9], 0.5), 3), mean_z([0.5, 0.5], 0.6)
+    (1.732, -inf)
+    """
+    values = np.asarray(values, np.float64)
+    if len(values) < 2:
+        return 0.0
+    above, error = float(values.mean()) - bound, float(values.std(ddof=1)) / len(values) ** 0.5
+    return above / error if error > 0 else math.copysign(math.inf, above)

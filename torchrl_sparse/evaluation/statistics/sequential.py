@@ -28,6 +28,7 @@ __all__ = ["Design"]
 _SHAPE = 0.25  # between Pocock's limits (0.5), which stop early, and O'Brien and Fleming's (0), which lose no power
 _ERROR = 0.05  # of both sides together
 _NODES = 128  # of the integral over where a motion is that has not crossed
+_LARGEST_Z = 8.0  # beyond, a p-value is below 1e-15, and the nodes of the integral lie too far apart
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class Design:
         """
         if z <= 0:
             return 0.5
+        z = min(z, _LARGEST_Z)
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(norm.sf(z)))
 
