@@ -30,6 +30,7 @@ class _Named:
     name: str
     expert: str | None
     early_cut: int | None = None
+    by_degrees: bool = False
     way_of: str | None = None
 
     def load_way_of(self) -> Callable[[np.ndarray], int]:

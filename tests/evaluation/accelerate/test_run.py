@@ -46,7 +46,8 @@ def test_dense_and_chains_without_a_cache_are_tried_with_rounded_weights(go):
     (searched,) = (name for name in found.candidates if name.startswith("ddpm_") and ":" not in name)
     rounded = {name for name in found.candidates if ":" in name}
     assert rounded == {f"{name}:int8" for name in ("dense", "ddpm2_logsnr", "ddim4", searched)}
-    assert found.candidates["dense:int8"].family == "stochastic"
+    assert found.candidates["dense:int8"].family == "rounded"
+    assert found.candidates["ddpm2_logsnr:int8"].family == "stochastic"
     assert found.candidates["dense:int8"].error != found.candidates["dense"].error
     with pytest.raises(ValueError, match="rounded: expected some of bf16, int8, got 'int4'"):
         Grid(rounded=("int4",))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from tensordict import TensorDict
 from tqdm import tqdm
@@ -24,6 +24,7 @@ from torchrl_sparse.methods.names import WEIGHTS
 from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.storage.diffusion import RoundedEngine
 from torchrl_sparse.training.diffusion.timesteps import find_timesteps
 
 __all__ = ["Grid", "calibrate_candidates", "family"]
@@ -109,17 +110,19 @@ def calibrate_candidates(
     return list(dict.fromkeys(names))
 
 
-def family(policy: DiffusionPolicy) -> Family:
-    """Return what kind of candidate a policy under a method is.
+def family(policy: DiffusionPolicy, own: Sampler) -> Family:
+    """Return what kind of candidate a policy under a method is, beside the dense policy's ``own`` sampler.
 
     >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
-    >>> [family(policy.with_plan(None, Sampler(kind, 3))) for kind in ("ddpm", "ddim")]
+    >>> [family(policy.with_plan(None, Sampler(kind, 3)), policy.sampler) for kind in ("ddpm", "ddim")]
     ['stochastic', 'deterministic']
     """
     if not policy.plan.is_static:
         return "pruner"
     if not isinstance(policy.plan, Dense):
         return "cached"
+    if policy.engine in get_args(RoundedEngine) and policy.sampler.config == own.config:
+        return "rounded"
     draws = any(policy.sampler.coefficients.reads_noise(k) for k in range(policy.num_inference_steps))
     return "stochastic" if draws else "deterministic"
 

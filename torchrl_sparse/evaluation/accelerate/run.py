@@ -120,7 +120,7 @@ def accelerate(
     errors = _measure_errors(methods, targets, out, made_for, request)
     machine, timings = _time(methods, queries, out, made_for, request)
     candidates = {
-        name: Candidate(family(method), errors[name], Percentiles.of(timings[name]))
+        name: Candidate(family(method, policy.sampler), errors[name], Percentiles.of(timings[name]))
         for name, method in methods.items()
     }
     fast = within_budget(candidates, request.budget_ms)

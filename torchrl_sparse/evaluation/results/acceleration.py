@@ -43,7 +43,7 @@ __all__ = [
     "verdict_line",
 ]
 
-Family = Literal["stochastic", "cached", "deterministic", "pruner"]
+Family = Literal["stochastic", "rounded", "cached", "deterministic", "pruner"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 _JUDGED, _TIMED = ("vs dense, points", "verdict"), ("time vs dense", "time verdict")
 
@@ -53,8 +53,8 @@ class Candidate:
     """One way to run the policy, measured without a simulator.
 
     Attributes:
-        family: a chain that draws noise in its steps ("stochastic"), one that does not ("deterministic"), a "cached" schedule
-            over a chain, or a learned "pruner".
+        family: a chain that draws noise in its steps ("stochastic") or does not ("deterministic"), the policy's own chain with
+            "rounded" weights, a "cached" schedule over a chain, or a learned "pruner".
         error: mean absolute difference of executed actions to demonstrated ones, normalised.
         latency_s: of a query, interleaved with all others.
     """
