@@ -12,6 +12,7 @@ from torchrl_sparse import Uniform
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
+from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.training.pruner.config import PrunerConfig
 
@@ -121,6 +122,8 @@ def test_finalists_are_played_until_they_are_decided_and_the_right_one_is_taken(
     results = load_results(tmp_path / "results.json")
     assert results.until_decided.max_episodes == 300
     assert results.methods["ddim4"].speedup_vs_dense == pytest.approx(4.5)
+    page = read_table(tmp_path / "acceleration.json", "played")
+    assert [page.name(row) for row in page.rows] == ["dense", "ddpm2_logsnr", "ddim4 (chosen)"]
 
 
 def test_a_pruner_is_one_more_candidate(go):

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
@@ -47,8 +48,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """Read a file of results, whose kind its name begins with.
 
     Args:
-        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json`` or
-            ``vla_latency*.json``.
+        path: ``results*.json``, ``acceleration*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``,
+            ``query*.json`` or ``vla_latency*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -170,9 +171,18 @@ def _aggregate(path: Path) -> dict[str, Table]:
     return {"methods": _table(", ".join(results.tasks), aggregate_rows(results))}
 
 
+def _acceleration(path: Path) -> dict[str, Table]:
+    found = load_acceleration(path)
+    rows = acceleration_rows(found)
+    played = [row for row in rows if row["method"].removesuffix(" (chosen)") in found.played]
+    tables = {"candidates": _table(found.task, rows)}
+    return tables | ({"played": _table(found.task, played)} if played else {})
+
+
 _OF_EPISODES = {"ways": _ways, "scores": _scores}
 _READERS = {
     "results": _results,
+    "acceleration": _acceleration,
     "aggregate": _aggregate,
     "realtime": _realtime,
     "engine": _engine,
