@@ -69,7 +69,8 @@ def test_dense_alone_is_played_to_the_end():
 
 def test_a_design_is_a_number_or_a_cap():
     assert make_design("decided", 5, 90).ends[-1] == 90
-    assert make_design("decided", 5, 10).looks == 10
+    assert make_design("decided", 5, 100).ends == tuple(range(10, 101, 10))  # not after every few episodes
+    assert make_design("decided", 5, 7).ends == (7,)
     with pytest.raises(ValueError, match="until: expected episodes or decided, got 'bored'"):
         make_design("bored", 5, 90)
     with pytest.raises(ValueError, match="looks: expected 1 to max_episodes = 0"):

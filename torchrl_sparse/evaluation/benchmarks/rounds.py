@@ -15,7 +15,8 @@ from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["episode_horizon", "make_design", "play_rounds"]
 
-_LOOKS = 30  # of a benchmark that goes on until it is decided
+_LOOKS = 30  # of a benchmark that goes on until it is decided, at most
+_BETWEEN = 10  # episodes from one look to the next, at least: each makes its environments anew
 _UNTIL = ("episodes", "decided")
 
 
@@ -32,12 +33,14 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
 
     >>> make_design("episodes", 400, 1300).ends, make_design("decided", 400, 1300).ends[:2]
     ((400,), (43, 86))
+    >>> make_design("decided", 1, 60).ends
+    (10, 20, 30, 40, 50, 60)
     """
     if until not in _UNTIL:
         raise ValueError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
     if until == "episodes":
         return Design(episodes)
-    return Design(max_episodes, min(_LOOKS, max_episodes))
+    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))
 
 
 def episode_horizon(make_env: Callable[..., EnvBase]) -> int:
