@@ -9,6 +9,7 @@ from pathlib import Path
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
+from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
@@ -47,8 +48,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """Read a file of results, whose kind its name begins with.
 
     Args:
-        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json`` or
-            ``vla_latency*.json``.
+        path: ``results*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``, ``query*.json``,
+            ``vla_latency*.json`` or ``offline_agreement*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -170,6 +171,12 @@ def _aggregate(path: Path) -> dict[str, Table]:
     return {"methods": _table(", ".join(results.tasks), aggregate_rows(results))}
 
 
+def _agreement(path: Path) -> dict[str, Table]:
+    agreement = load_agreement(path)
+    tasks = ", ".join(agreement.methods)
+    return {name: _table(tasks, rows) for name, rows in together_rows(agreement).items()}
+
+
 _OF_EPISODES = {"ways": _ways, "scores": _scores}
 _READERS = {
     "results": _results,
@@ -178,4 +185,5 @@ _READERS = {
     "engine": _engine,
     "query": _query,
     "vla_latency": _vla,
+    "offline_agreement": _agreement,
 }

@@ -1,0 +1,40 @@
+"""Draw which number of a method's answers says how its episodes go, task by task."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.figures.colors import method_colors
+from torchrl_sparse.evaluation.results.offline_agreement import OfflineAgreement
+
+__all__ = ["plot_agreement"]
+
+_TITLES = {"success": "with success", "time": "with time to success"}
+
+
+def plot_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path:
+    """Draw, for each measure, the rank correlation of each task as a dot and that of all as a bar.
+
+    Args:
+        agreement: content of an ``offline_agreement.json``.
+        path: of the PNG.
+    """
+    figure, (panels,) = make_figure(13, 5, columns=len(_TITLES))
+    colors = method_colors(agreement.methods)
+    for axes, (outcome, title) in zip(panels, _TITLES.items(), strict=True):
+        found = getattr(agreement, outcome)
+        for place, one in enumerate(found.values()):
+            axes.plot([place - 0.3, place + 0.3], [one.together] * 2, color="#333333", linewidth=2.5)
+            for number, (task, value) in enumerate(one.tasks.items()):
+                shift = 0.12 * (number - (len(one.tasks) - 1) / 2)
+                axes.plot(place + shift, value, "o", color=colors[task], label=None if place else task)
+        axes.set_xticks(
+            range(len(found)), [f"{name.replace('_', ' ')}\np = {one.p:.3f}" for name, one in found.items()]
+        )
+        axes.set_ylim(-1.08, 1.08)
+        axes.axhline(0, color="#9A9AA0", linewidth=1)
+        axes.set_title(f"rank correlation {title}", loc="left")
+    panels[0].legend(frameon=False, loc="lower left", fontsize=9)
+    return save_figure(figure, path)
