@@ -121,6 +121,9 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert "results.json, 4 methods: success" in output
     assert {path.suffix for path in (work / "offline").iterdir()} == {".json", ".png"}
     assert [*load_offline(work / "offline" / "offline_errors_Lift.json").errors] == methods
+    aggregate = f"aggregate=[{work}/offline/offline_errors_Lift.json]"
+    assert "few, 4 |" in run("offline_errors", aggregate, f"out={work}/together")
+    assert {path.suffix for path in (work / "together").iterdir()} == {".json", ".png"}
     refused = run(
         "offline_errors", *options[:2], "results=[assets/can/results.json]", f"out={work}/no", expect=2
     )

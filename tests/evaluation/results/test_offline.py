@@ -63,12 +63,12 @@ def test_outcomes_are_those_of_the_table():
     )
 
 
-def test_tasks_are_put_together_by_their_ranks(results, tmp_path):
-    """Of two tasks alike the mean is that of each; chance orders the methods of both so in 2 of 4! ** 2 cases."""
-    other = replace(results, task="Can")
+def test_tables_are_put_together_by_their_ranks(results, tmp_path):
+    """Of two tables alike the mean is that of each; chance orders the methods of both so in 2 of 4! ** 2 cases."""
+    other = replace(results, task="Can", played={"assets/can/results.json": results.played["a.json"]})
     agreement = agreement_of([results, other])
     error = agreement.success["error"]
-    assert error.tasks == pytest.approx({"Lift": 1.0, "Can": 1.0})
+    assert error.tables == pytest.approx({"a": 1.0, "can": 1.0})
     assert error.together == pytest.approx(1.0)
     assert error.p == pytest.approx(2 / 24**2, abs=2e-3)
     assert agreement.time["energy_score"].together == pytest.approx(-1.0)
@@ -76,15 +76,15 @@ def test_tasks_are_put_together_by_their_ranks(results, tmp_path):
     assert plot_agreement(agreement, tmp_path / "a.png").stat().st_size > 10_000
     assert together_rows(agreement)["success"][0] == {
         "measure": "error",
-        "Lift, 4": "+1.00",
-        "Can, 4": "+1.00",
+        "a, 4": "+1.00",
+        "can, 4": "+1.00",
         "together, 8": "+1.00",
         "p": f"{error.p:.4f}",
     }
     table = read_table(tmp_path / "offline_agreement.json", "time")
-    assert table.task == "Lift, Can"
+    assert table.task == "a, can"
     assert [table.name(row) for row in table.rows] == ["error", "energy score", "energy distance", "spread"]
-    with pytest.raises(ValueError, match="aggregate: expected one file of each task"):
+    with pytest.raises(ValueError, match="aggregate: expected every table once"):
         agreement_of([results, results])
 
 

@@ -1,4 +1,4 @@
-"""Draw which number of a method's answers says how its episodes go, task by task."""
+"""Draw which number of a method's answers says how its episodes go, table by table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TITLES = {"success": "with success", "time": "with time to success"}
 
 
 def plot_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path:
-    """Draw, for each measure, the rank correlation of each task as a dot and that of all as a bar.
+    """Draw, for each measure, the rank correlation of each table as a dot and that of all as a bar.
 
     Args:
         agreement: content of an ``offline_agreement.json``.
@@ -27,9 +27,9 @@ def plot_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path
         found = getattr(agreement, outcome)
         for place, one in enumerate(found.values()):
             axes.plot([place - 0.3, place + 0.3], [one.together] * 2, color="#333333", linewidth=2.5)
-            for number, (task, value) in enumerate(one.tasks.items()):
-                shift = 0.12 * (number - (len(one.tasks) - 1) / 2)
-                axes.plot(place + shift, value, "o", color=colors[task], label=None if place else task)
+            for number, (table, value) in enumerate(one.tables.items()):
+                shift = 0.12 * (number - (len(one.tables) - 1) / 2)
+                axes.plot(place + shift, value, "o", color=colors[table], label=None if place else table)
         axes.set_xticks(
             range(len(found)), [f"{name.replace('_', ' ')}\np = {one.p:.3f}" for name, one in found.items()]
         )

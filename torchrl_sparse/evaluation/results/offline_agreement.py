@@ -32,12 +32,12 @@ class Agreement:
     """How the order of methods by a measure agrees with their order by what episodes came to.
 
     Attributes:
-        tasks: task -> Spearman's rank correlation of its methods; 1 where less always went with better.
-        together: mean over tasks, each weighed by its methods.
-        p: how often methods in random order within each task would come to a mean as far from 0.
+        tables: table -> Spearman's rank correlation of its methods; 1 where less always went with better.
+        together: mean over tables, each weighed by its methods.
+        p: how often methods in random order within each table would come to a mean as far from 0.
     """
 
-    tasks: dict[str, float]
+    tables: dict[str, float]
     together: float
     p: float
 
@@ -47,7 +47,7 @@ class OfflineAgreement:
     """The content of an ``offline_agreement.json``.
 
     Attributes:
-        methods: task -> how many, without dense.
+        methods: table -> how many, without dense.
         success, time: measure -> how it agrees with that.
     """
 
@@ -73,36 +73,42 @@ def save_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path
 
 
 def agreement_of(results: Sequence[OfflineResults]) -> OfflineAgreement:
-    """Put several tasks together, of each its first table.
+    """Put all tables of several tasks together, by the errors of the file that holds them.
 
     Raises:
-        ValueError: for two of the same task.
+        ValueError: for a table that is in two files.
     """
-    tasks = {one.task: one for one in results}
-    if len(tasks) < len(results):
-        raise ValueError(f"aggregate: expected one file of each task, got {[one.task for one in results]}")
-    played = {task: next(iter(one.played.values())) for task, one in tasks.items()}
+    groups = [(_short(path), one, table) for one in results for path, table in one.played.items()]
+    methods = {name: len(table) for name, _, table in groups}
+    if len(methods) < len(groups):
+        raise ValueError(f"aggregate: expected every table once, got {[name for name, _, _ in groups]}")
 
     def agree(measure: str, outcome: str) -> Agreement:
-        groups = {
-            task: (
-                [getattr(tasks[task].errors[name], measure) for name in table],
-                [_COSTS[outcome](one) for one in table.values()],
+        ordered = {
+            name: (
+                [getattr(one.errors[method], measure) for method in table],
+                [_COSTS[outcome](played) for played in table.values()],
             )
-            for task, table in played.items()
+            for name, one, table in groups
         }
-        alone = {task: rank_correlation(*group) for task, group in groups.items()}
-        return Agreement(alone, *mean_rank_correlation([*groups.values()]))
+        alone = {name: rank_correlation(*pair) for name, pair in ordered.items()}
+        return Agreement(alone, *mean_rank_correlation([*ordered.values()]))
 
     found = ({measure: agree(measure, outcome) for measure in MEASURES} for outcome in _COSTS)
-    return OfflineAgreement(1, {task: len(table) for task, table in played.items()}, *found)
+    return OfflineAgreement(1, methods, *found)
+
+
+def _short(path: str) -> str:
+    return path.removeprefix("assets/").removesuffix(".json").removesuffix("/results")
 
 
 def together_rows(agreement: OfflineAgreement) -> dict[str, list[dict[str, str]]]:
     """Return two tables, ``"success"`` and ``"time"``, with a row for each measure."""
 
     def row(measure: str, found: Agreement) -> dict[str, str]:
-        cells = {f"{task}, {agreement.methods[task]}": f"{value:+.2f}" for task, value in found.tasks.items()}
+        cells = {
+            f"{name}, {agreement.methods[name]}": f"{value:+.2f}" for name, value in found.tables.items()
+        }
         total = sum(agreement.methods.values())
         more = {f"together, {total}": f"{found.together:+.2f}", "p": f"{found.p:.4f}"}
         return {"measure": measure.replace("_", " "), **cells, **more}

@@ -173,8 +173,9 @@ def _aggregate(path: Path) -> dict[str, Table]:
 
 def _agreement(path: Path) -> dict[str, Table]:
     agreement = load_agreement(path)
-    tasks = ", ".join(agreement.methods)
-    return {name: _table(tasks, rows) for name, rows in together_rows(agreement).items()}
+    return {
+        name: _table(", ".join(agreement.methods), rows) for name, rows in together_rows(agreement).items()
+    }
 
 
 _OF_EPISODES = {"ways": _ways, "scores": _scores}
