@@ -31,9 +31,12 @@ def test_chains_keep_the_budget_compute_the_first_step_and_fall(budget):
     assert len(set(chains)) > 100
 
 
-def test_what_fits_whole_is_begun_with():
-    starts = [*ChainSpace(WEIGHTS, 2.0, (2, 3)).starts(2, np.random.default_rng(0))]
-    assert [chain.rows for chain in starts] == [("0" * 6,) * 2, ("0" * 6, "1" * 6, "0" * 6)]
+def test_the_unpruned_chain_is_begun_with_and_widened():
+    first, second, third, fourth, fifth = ChainSpace(WEIGHTS, 2.0, (2, 3)).starts(5, np.random.default_rng(0))
+    assert first == third == PrunedChain((91, 41), ("0" * 6,) * 2)
+    assert second == PrunedChain((91, 90, 41), ("0" * 6, "1" * 6, "0" * 6))
+    assert fourth == PrunedChain((91, 41, 40), ("0" * 6, "0" * 6, "1" * 6))
+    assert fifth == PrunedChain((91, 41), ("0" * 6,) * 2)
 
 
 def test_a_random_chain_has_no_room_for_another_block():

@@ -221,7 +221,7 @@ def rivals(
         ``"searched"``; ``"unpruned"``, as many whole steps as the budget has, at searched timesteps; ``"unpruned logsnr"``, at
         those of the rule; ``"random masks"``; and ``"dense"``, the policy's own chain, None.
     """
-    whole = Sampler("ddpm", int(space.budget), space.num_train_timesteps, spacing="logsnr")
+    whole = Sampler("ddpm", space.whole_steps, space.num_train_timesteps, spacing="logsnr")
     start = tuple(whole.timesteps.tolist())
 
     def unpruned(timesteps: tuple[int, ...]) -> PrunedChain:

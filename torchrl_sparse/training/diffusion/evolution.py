@@ -122,10 +122,16 @@ class ChainSpace:
         return self._cost(chain.mask().numpy())
 
     def starts(self, count: int, rng: np.random.Generator) -> Iterator[PrunedChain]:
-        """Yield chains to begin with, of every length in turn: the first of whole steps, then of random masks."""
+        """Yield chains of every length in turn: unpruned ones with pruned steps added, then random ones."""
         for number in range(count):
             turn, which = divmod(number, len(self.lengths))
-            yield self._whole(self.lengths[which], rng) if not turn else self.random(rng, self.lengths[which])
+            length = self.lengths[which]
+            yield self._widened(length, turn, rng) if turn < self.whole_steps else self.random(rng, length)
+
+    @property
+    def whole_steps(self) -> int:
+        """How many unpruned steps the budget buys."""
+        return int(self.budget + _ROUNDING)
 
     def random(self, rng: np.random.Generator, length: int | None = None) -> PrunedChain:
         """Return a chain at the timesteps of the rule ``logsnr`` that computes random blocks until none fits."""
@@ -147,12 +153,17 @@ class ChainSpace:
         mask[0] = False
         return mask
 
-    def _whole(self, length: int, rng: np.random.Generator) -> PrunedChain:
-        """Compute the first step and the last ones as far as they fit whole, and of the others blocks at random."""
-        mask = self._all_but_first(length)
-        last = min(int(self.budget + _ROUNDING), length) - 1
-        mask[length - last :] = False
-        return PrunedChain.of(self._timesteps(length), self._filled(mask, rng))
+    def _widened(self, length: int, turn: int, rng: np.random.Generator) -> PrunedChain:
+        """Put pruned steps directly after one of an unpruned chain, which they hardly change, and fill the budget up."""
+        whole = self._timesteps(min(self.whole_steps, length))
+        at = turn % len(whole)
+        added = [whole[at] - 1 - number for number in range(length - len(whole))]
+        timesteps = [*whole[: at + 1], *added, *whole[at + 1 :]]
+        if not timesteps_fall(timesteps, self.num_train_timesteps):
+            return self.random(rng, length)
+        mask = np.zeros((length, len(self._shares)), dtype=bool)
+        mask[at + 1 : at + 1 + len(added)] = True
+        return PrunedChain.of(timesteps, self._filled(mask, rng))
 
     def _timesteps(self, length: int) -> list[int]:
         return Sampler("ddpm", length, self.num_train_timesteps, spacing="logsnr").timesteps.tolist()
