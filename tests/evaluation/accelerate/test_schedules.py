@@ -59,7 +59,7 @@ def all_chains():
 
 @pytest.mark.parametrize("fitness", ["energy_score", "error"])
 def test_evolution_finds_the_best_of_all_chains(search, judge, fitness):
-    by_hand = {chain: judge.scores(chain, fitness).mean().item() for chain in all_chains()}
+    by_hand = {chain: judge.scores(chain)[fitness].mean().item() for chain in all_chains()}
     space, tried = search(Evolution(16, 40), fitness)
     assert tried.items() <= by_hand.items()
     assert next(iter(tried)) == min(by_hand, key=by_hand.get)
@@ -70,7 +70,7 @@ def test_fitness_is_what_offline_errors_say(judge, policy, demos):  # noqa: F811
     unpruned = policy.with_plan(None, Sampler("ddpm", None, 6, timesteps=[4, 1]))
     answers = draw_answers(unpruned, judge.targets, draws=2, n_action_steps=4)
     errors = offline_errors(answers, judge.targets["target"][:, 1:5].flatten(1), answers)
-    found = judge.judge(PrunedChain((4, 1), ("000", "000")))
+    found = judge.scores(PrunedChain((4, 1), ("000", "000")))
     assert found["error"].mean().item() == pytest.approx(errors.error)
     assert found["energy_score"].mean().item() == pytest.approx(errors.energy_score)
 
@@ -101,11 +101,11 @@ def note_what_is_asked(monkeypatch, asked, *, last):
     monkeypatch.undo()
     real = Judge.scores
 
-    def scores(self, chain, fitness):
+    def scores(self, chain):
         asked.append(chain)
         if len(asked) == last:
             raise KeyboardInterrupt
-        return real(self, chain, fitness)
+        return real(self, chain)
 
     monkeypatch.setattr(Judge, "scores", scores)
 
@@ -121,7 +121,7 @@ def test_the_comparison_is_on_other_demonstrations(judge, search, policy, demos)
     assert len(chains["random masks"]) == 3
     judged = compare(unseen, space, chains)
     assert judged["searched"].over_searched == 0
-    assert judged["searched"].energy_score == pytest.approx(unseen.scores(best, "energy_score").mean().item())
+    assert judged["searched"].energy_score == pytest.approx(unseen.scores(best)["energy_score"].mean().item())
     for name, one in judged.items():
         assert one.cost == 6 if name == "dense" else one.cost <= BUDGET + 1e-9
         gap = one.energy_score - judged["searched"].energy_score
@@ -157,4 +157,4 @@ def test_what_was_made_for_something_else_or_is_damaged_is_refused(search, tmp_p
 def test_a_rule_of_reuse_is_one_of_three(judge, policy, tmp_path):
     judge.reuse = "magic"
     with pytest.raises(ValueError, match="reuse: expected one of"):
-        judge.scores(PrunedChain((4, 1), ("000", "101")), "error")
+        judge.scores(PrunedChain((4, 1), ("000", "101")))

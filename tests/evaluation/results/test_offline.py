@@ -80,6 +80,7 @@ def test_tables_are_put_together_by_their_ranks(results, tmp_path):
         "can, 4": "+1.00",
         "together, 8": "+1.00",
         "p": f"{error.p:.4f}",
+        "over the error": "",
     }
     table = read_table(tmp_path / "offline_agreement.json", "time")
     assert table.task == "a, can"

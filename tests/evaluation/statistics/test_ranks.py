@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from torchrl_sparse.evaluation.statistics.ranks import mean_rank_correlation, rank_correlation
+from torchrl_sparse.evaluation.statistics.ranks import (
+    difference_ci95,
+    mean_rank_correlation,
+    rank_correlation,
+)
 
 
 def test_it_is_spearmans():
@@ -28,6 +32,16 @@ def test_chance_is_called_chance():
     ]
     assert 0.4 < np.mean(ps) < 0.6
     assert np.mean(np.array(ps) <= 0.1) == pytest.approx(0.1, abs=0.06)
+
+
+def test_a_better_number_is_told_from_an_equal_one():
+    rng = np.random.default_rng(2)
+    y = rng.normal(size=40)
+    near, as_near, far = (y + noise * rng.normal(size=40) for noise in (0.1, 0.1, 2.0))
+    low, high = difference_ci95([(near, far, y)], draws=500)
+    assert 0.2 < low < high < 1.2
+    low, high = difference_ci95([(near, as_near, y)], draws=500)
+    assert -0.05 < low < 0 < high < 0.05
 
 
 def test_a_group_that_tells_nothing_apart_counts_as_nothing():

@@ -114,12 +114,8 @@ class Judge:
         first = policy.n_obs_steps - 1
         self._wanted = targets["target"][:, first : first + n_action_steps].flatten(1)
 
-    def scores(self, chain: PrunedChain | None, fitness: Fitness) -> Tensor:
-        """Return a measure of each query, f32 [N]; a chain of None is the policy's own, unpruned."""
-        return FITNESSES[fitness](self._answers(chain), self._wanted)
-
-    def judge(self, chain: PrunedChain | None) -> dict[Fitness, Tensor]:
-        """Return all measures of each query."""
+    def scores(self, chain: PrunedChain | None) -> dict[Fitness, Tensor]:
+        """Return all measures of each query, f32 [N]; a chain of None is the policy's own, unpruned."""
         answers = self._answers(chain)
         return {name: measure(answers, self._wanted) for name, measure in FITNESSES.items()}
 
@@ -191,7 +187,7 @@ def search_schedule(
         write_json(path, Tried("torchrl_sparse.schedule_search/1", made_for, costs, scored))
 
     def mean(chain: PrunedChain) -> float:
-        return judge.scores(chain, fitness).mean().item()
+        return judge.scores(chain)[fitness].mean().item()
 
     return space, evolve(space, mean, options, known=known, on_chain=on_chain, on_generation=keep)
 
@@ -229,7 +225,7 @@ def rivals(
 
     def mean(timesteps: tuple[int, ...]) -> float:
         on_chain()
-        return judge.scores(unpruned(timesteps), fitness).mean().item()
+        return judge.scores(unpruned(timesteps))[fitness].mean().item()
 
     moved, _ = search_timesteps(mean, start, num_train_timesteps=space.num_train_timesteps)
     rng = np.random.default_rng(seed)
@@ -262,7 +258,7 @@ def compare(
         found = []
         for chain in some:
             on_chain()
-            found.append(judge.judge(chain))
+            found.append(judge.scores(chain))
         return {name: torch.stack([one[name] for one in found]).mean(0) for name in FITNESSES}
 
     dense = judge.policy.num_inference_steps

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.evaluation.results.offline import MEASURES, OfflineResults, Outcome
-from torchrl_sparse.evaluation.statistics.ranks import mean_rank_correlation, rank_correlation
+from torchrl_sparse.evaluation.statistics.ranks import (
+    difference_ci95,
+    mean_rank_correlation,
+    rank_correlation,
+)
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -35,11 +39,13 @@ class Agreement:
         tables: table -> Spearman's rank correlation of its methods; 1 where less always went with better.
         together: mean over tables, each weighed by its methods.
         p: how often methods in random order within each table would come to a mean as far from 0.
+        over_error_ci95: of by how much ``together`` exceeds that of the error to demonstrations, methods drawn anew.
     """
 
     tables: dict[str, float]
     together: float
     p: float
+    over_error_ci95: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -84,18 +90,19 @@ def agreement_of(results: Sequence[OfflineResults]) -> OfflineAgreement:
         raise ValueError(f"aggregate: expected every table once, got {[name for name, _, _ in groups]}")
 
     def agree(measure: str, outcome: str) -> Agreement:
-        ordered = {
-            name: (
-                [getattr(one.errors[method], measure) for method in table],
-                [_COSTS[outcome](played) for played in table.values()],
-            )
-            for name, one, table in groups
-        }
-        alone = {name: rank_correlation(*pair) for name, pair in ordered.items()}
-        return Agreement(alone, *mean_rank_correlation([*ordered.values()]))
+        ours, errors = ([_errors(one, table, key) for _, one, table in groups] for key in (measure, "error"))
+        costs = [[_COSTS[outcome](played) for played in table.values()] for _, _, table in groups]
+        pairs = [*zip(ours, costs, strict=True)]
+        alone = {name: rank_correlation(*pair) for name, pair in zip(methods, pairs, strict=True)}
+        over = difference_ci95([*zip(ours, errors, costs, strict=True)])
+        return Agreement(alone, *mean_rank_correlation(pairs), over)
 
     found = ({measure: agree(measure, outcome) for measure in MEASURES} for outcome in _COSTS)
     return OfflineAgreement(1, methods, *found)
+
+
+def _errors(results: OfflineResults, table: Mapping[str, Outcome], measure: str) -> list[float]:
+    return [getattr(results.errors[method], measure) for method in table]
 
 
 def _short(path: str) -> str:
@@ -110,7 +117,9 @@ def together_rows(agreement: OfflineAgreement) -> dict[str, list[dict[str, str]]
             f"{name}, {agreement.methods[name]}": f"{value:+.2f}" for name, value in found.tables.items()
         }
         total = sum(agreement.methods.values())
-        more = {f"together, {total}": f"{found.together:+.2f}", "p": f"{found.p:.4f}"}
+        low, high = found.over_error_ci95
+        over = "" if measure == "error" else f"[{low:+.2f}, {high:+.2f}]"
+        more = {f"together, {total}": f"{found.together:+.2f}", "p": f"{found.p:.4f}", "over the error": over}
         return {"measure": measure.replace("_", " "), **cells, **more}
 
     tables = {"success": agreement.success, "time": agreement.time}
