@@ -30,11 +30,14 @@ def plot_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path
             for number, (table, value) in enumerate(one.tables.items()):
                 shift = 0.12 * (number - (len(one.tables) - 1) / 2)
                 axes.plot(place + shift, value, "o", color=colors[table], label=None if place else table)
-        axes.set_xticks(
-            range(len(found)), [f"{name.replace('_', ' ')}\np = {one.p:.3f}" for name, one in found.items()]
-        )
+        labels = [f"{name.replace('_', ' ')}\n{_chance(one.p)}" for name, one in found.items()]
+        axes.set_xticks(range(len(found)), labels)
         axes.set_ylim(-1.08, 1.08)
         axes.axhline(0, color="#9A9AA0", linewidth=1)
         axes.set_title(f"rank correlation {title}", loc="left")
     panels[0].legend(frameon=False, loc="lower left", fontsize=9)
     return save_figure(figure, path)
+
+
+def _chance(p: float) -> str:
+    return "p < 0.001" if p < 1e-3 else f"p = {p:.3f}"
