@@ -2,11 +2,15 @@
 
     python recipes/offline_errors.py task=can demos=data/can.h5 results=[assets/can/test_split/results.json]
 
-No simulator is needed: demonstrations are asked many times, and the tables of episodes were made before.
+No simulator is needed: demonstrations are asked many times, and the tables of episodes were made before. What was measured on
+several tasks is put together:
+
+    python recipes/offline_errors.py aggregate=[outputs/a/offline_errors_Lift.json,outputs/a/offline_errors_PickPlaceCan.json]
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +24,16 @@ from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.figures.offline import plot_offline
+from torchrl_sparse.evaluation.figures.offline_agreement import plot_agreement
 from torchrl_sparse.evaluation.results.offline import (
     OfflineResults,
     agreement_rows,
     error_rows,
+    load_offline,
     outcomes,
     save_offline,
 )
+from torchrl_sparse.evaluation.results.offline_agreement import agreement_of, save_agreement, together_rows
 from torchrl_sparse.evaluation.results.schema import DENSE, load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors, draw_answers, offline_errors
@@ -38,6 +45,9 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 
 @recipe("offline_errors")
 def main(config: DictConfig) -> None:
+    if config.aggregate:
+        put_together(config.aggregate, Path(config.out))
+        return
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
@@ -62,6 +72,15 @@ def main(config: DictConfig) -> None:
     plot_offline(results, next(iter(played)), path.with_suffix(".png"))
     for rows in (error_rows(results), agreement_rows(results)):
         print(f"\n{markdown_table(rows)}")
+
+
+def put_together(paths: Sequence[str], out: Path) -> None:
+    """Write and show, over several tasks, which measure says how episodes go."""
+    agreement = agreement_of([load_offline(path) for path in paths])
+    save_agreement(agreement, out / "offline_agreement.json")
+    plot_agreement(agreement, out / "offline_agreement.png")
+    for outcome, rows in together_rows(agreement).items():
+        print(f"\nrank correlation with {outcome}\n\n{markdown_table(rows)}")
 
 
 def read_tables(config: DictConfig, task: str) -> dict[str, Any]:

@@ -70,6 +70,10 @@ def test_a_policy_is_evaluated(work, policy):
     assert "task: expected one that tells its ways, got 'Lift', which does not" in refused
 
 
+def load_tried(folder):
+    return json.loads((folder / "tried.json").read_text())["chains"]
+
+
 def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedules):
     options = (
         f"policy={policy}",
@@ -91,6 +95,16 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
         "carried_noise_Lift.json",
         "carried_noise_Lift.png",
     }
+    search = ("lengths=[3]", "targets.share=0.1", "draws=3", "search.population=2", "random_masks=1")
+    searched = (*options[:2], *search, f"out={work}/searched")
+    assert "searched.json: ddpm_" in run("search_schedule", *searched, "search.generations=1")
+    tried = load_tried(work / "searched")
+    output = run("search_schedule", *searched, "search.generations=2")
+    assert f"planners={work}/searched methods=[dense,searched]" in output
+    assert load_tried(work / "searched")[: len(tried)] == tried
+    assert CacheSchedule.from_pretrained(work / "searched" / "searched.json").num_inference_steps == 3
+    refused = run("search_schedule", *searched, "search.generations=2", "budget=1", expect=2)
+    assert "tried.json: made with other settings: budget is 1 here and 2 there" in refused
     # Chains that end at timestep 0: this policy has learned too little to end anywhere else.
     methods = ["dense", "ddpm4", "ddim4_eta0.5", "uniform2_ddpm4", "bac_ddpm4"]
     run(
@@ -107,6 +121,9 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert "results.json, 4 methods: success" in output
     assert {path.suffix for path in (work / "offline").iterdir()} == {".json", ".png"}
     assert [*load_offline(work / "offline" / "offline_errors_Lift.json").errors] == methods
+    aggregate = f"aggregate=[{work}/offline/offline_errors_Lift.json]"
+    assert "few, 4 |" in run("offline_errors", aggregate, f"out={work}/together")
+    assert {path.suffix for path in (work / "together").iterdir()} == {".json", ".png"}
     refused = run(
         "offline_errors", *options[:2], "results=[assets/can/results.json]", f"out={work}/no", expect=2
     )

@@ -52,6 +52,11 @@ class Demonstrations:
         """Return the rows of one episode."""
         return self.data[int(self.starts[index]) : int(self.starts[index + 1])]
 
+    def between(self, first: int, last: int) -> Demonstrations:
+        """Return the episodes from ``first`` up to, not including, ``last``."""
+        starts = self.starts[first : last + 1]
+        return Demonstrations(self.data[int(starts[0]) : int(starts[-1])], starts - starts[0])
+
     def window_rows(
         self, horizon: int, n_obs_steps: int, n_action_steps: int, episodes: Sequence[int] | None = None
     ) -> Tensor:

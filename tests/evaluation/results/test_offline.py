@@ -1,8 +1,11 @@
 """Whether errors of answers say how episodes go."""
 
+from dataclasses import replace
+
 import pytest
 
 from torchrl_sparse.evaluation.figures.offline import plot_offline
+from torchrl_sparse.evaluation.figures.offline_agreement import plot_agreement
 from torchrl_sparse.evaluation.results.offline import (
     OfflineResults,
     Outcome,
@@ -13,6 +16,13 @@ from torchrl_sparse.evaluation.results.offline import (
     rank_agreement,
     save_offline,
 )
+from torchrl_sparse.evaluation.results.offline_agreement import (
+    agreement_of,
+    load_agreement,
+    save_agreement,
+    together_rows,
+)
+from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
 
@@ -51,6 +61,32 @@ def test_outcomes_are_those_of_the_table():
     assert found["sag"].time == pytest.approx(
         load_results("assets/can/test_split/results.json").methods["sag"].time_vs_dense.ratio
     )
+
+
+def test_tables_are_put_together_by_their_ranks(results, tmp_path):
+    """Of two tables alike the mean is that of each; chance orders the methods of both so in 2 of 4! ** 2 cases."""
+    other = replace(results, task="Can", played={"assets/can/results.json": results.played["a.json"]})
+    agreement = agreement_of([results, other])
+    error = agreement.success["error"]
+    assert error.tables == pytest.approx({"a": 1.0, "can": 1.0})
+    assert error.together == pytest.approx(1.0)
+    assert error.p == pytest.approx(2 / 24**2, abs=2e-3)
+    assert agreement.time["energy_score"].together == pytest.approx(-1.0)
+    assert load_agreement(save_agreement(agreement, tmp_path / "offline_agreement.json")) == agreement
+    assert plot_agreement(agreement, tmp_path / "a.png").stat().st_size > 10_000
+    assert together_rows(agreement)["success"][0] == {
+        "measure": "error",
+        "a, 4": "+1.00",
+        "can, 4": "+1.00",
+        "together, 8": "+1.00",
+        "p": f"{error.p:.4f}",
+        "over the error": "",
+    }
+    table = read_table(tmp_path / "offline_agreement.json", "time")
+    assert table.task == "a, can"
+    assert [table.name(row) for row in table.rows] == ["error", "energy score", "energy distance", "spread"]
+    with pytest.raises(ValueError, match="aggregate: expected every table once"):
+        agreement_of([results, results])
 
 
 def test_they_are_kept_and_drawn(results, tmp_path):

@@ -175,7 +175,7 @@ def acceleration_note(acceleration: Acceleration) -> str:
         f"{verdict_line(acceleration)} {acceleration.task}: {len(acceleration.candidates) - 1} candidates, of which "
         f"{len(acceleration.ranking)} are {allowed}, in the order in which they would be played: of every family in turn "
         f"{first}. Error: of executed actions to those of {acceleration.windows} windows of demonstrations, normalised; "
-        "whether it predicts success is to be measured, so episodes have the last word. Latency of a query, all candidates "
+        "it agrees with success in part alone, so episodes have the last word. Latency of a query, all candidates "
         f"interleaved in one process, on {machine.cpu}, {threads_text(machine.threads)}, PyTorch {machine.torch}, "
         f"{machine.date}."
     )

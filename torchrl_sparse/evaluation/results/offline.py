@@ -7,10 +7,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from scipy.stats import spearmanr
-
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
+from torchrl_sparse.evaluation.statistics.ranks import rank_correlation
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -105,7 +104,7 @@ def rank_agreement(results: OfflineResults, table: str, measure: str) -> Outcome
     played = results.played[table]
     errors = [getattr(results.errors[name], measure) for name in played]
     costs = [-one.success for one in played.values()], [one.time for one in played.values()]
-    return Outcome(*(float(spearmanr(errors, cost).statistic) for cost in costs))
+    return Outcome(*(rank_correlation(errors, cost) for cost in costs))
 
 
 def agreement_rows(results: OfflineResults) -> list[dict[str, str]]:

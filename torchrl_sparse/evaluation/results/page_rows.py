@@ -10,6 +10,7 @@ from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, lo
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
+from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
@@ -49,7 +50,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
 
     Args:
         path: ``results*.json``, ``acceleration*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``,
-            ``query*.json`` or ``vla_latency*.json``.
+            ``query*.json``, ``vla_latency*.json`` or ``offline_agreement*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -179,6 +180,13 @@ def _acceleration(path: Path) -> dict[str, Table]:
     return tables | ({"played": _table(found.task, played)} if played else {})
 
 
+def _agreement(path: Path) -> dict[str, Table]:
+    agreement = load_agreement(path)
+    return {
+        name: _table(", ".join(agreement.methods), rows) for name, rows in together_rows(agreement).items()
+    }
+
+
 _OF_EPISODES = {"ways": _ways, "scores": _scores}
 _READERS = {
     "results": _results,
@@ -188,4 +196,5 @@ _READERS = {
     "engine": _engine,
     "query": _query,
     "vla_latency": _vla,
+    "offline_agreement": _agreement,
 }

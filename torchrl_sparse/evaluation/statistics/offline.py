@@ -17,7 +17,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import planned_answers
 
-__all__ = ["OfflineErrors", "draw_answers", "offline_errors"]
+__all__ = ["OfflineErrors", "draw_answers", "energy_scores", "offline_errors"]
 
 
 @dataclass(frozen=True)
@@ -82,16 +82,25 @@ def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> Offl
         raise ValueError(
             f"draws: expected at least 2, got {answers.shape[1]} of the method and {dense.shape[1]} of dense"
         )
-    wanted, within = demonstrated[:, None], _mean_distance(answers)
+    across = torch.cdist(answers, dense).mean()
     return OfflineErrors(
-        (answers - wanted).abs().mean().item(),
-        (torch.cdist(answers, wanted).mean() - within / 2).item(),
-        (2 * torch.cdist(answers, dense).mean() - within - _mean_distance(dense)).item(),
+        (answers - demonstrated[:, None]).abs().mean().item(),
+        energy_scores(answers, demonstrated).mean().item(),
+        (2 * across - _mean_distances(answers).mean() - _mean_distances(dense).mean()).item(),
         answers.var(1).mean().sqrt().item(),
     )
 
 
-def _mean_distance(draws: Tensor) -> Tensor:
-    """Return the mean distance of two different draws of a query, [N, S, D] -> []."""
+def energy_scores(answers: Tensor, demonstrated: Tensor) -> Tensor:
+    """Return the energy score of each query, f32 [N]; arguments as of `offline_errors`.
+
+    >>> energy_scores(torch.tensor([[[0.0], [2.0]]]), torch.tensor([[5.0]]))
+    tensor([3.])
+    """
+    return torch.cdist(answers, demonstrated[:, None]).mean((1, 2)) - _mean_distances(answers) / 2
+
+
+def _mean_distances(draws: Tensor) -> Tensor:
+    """Return the mean distance of two different draws of each query, [N, S, D] -> [N]."""
     count = draws.shape[1]
-    return torch.cdist(draws, draws).sum() / (len(draws) * count * (count - 1))
+    return torch.cdist(draws, draws).sum((1, 2)) / (count * (count - 1))
