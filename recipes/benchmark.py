@@ -64,7 +64,7 @@ def main(config: DictConfig) -> None:
     actors = {name: make_executor(name, method, config.n_action_steps) for name, method in methods.items()}
     design = make_design(config.until, config.episodes, config.max_episodes)
     seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
-    terms = Terms(design, episode_horizon(make_env), task.early_cut, config.margin, config.time_margin)
+    terms = Terms(design, episode_horizon(make_env, seeds), task.early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon}
 
     def play(name: str, count: int) -> list[EpisodeResult]:
