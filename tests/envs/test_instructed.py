@@ -47,12 +47,20 @@ def test_images_of_libero_are_as_the_policy_was_trained(libero, images, as_relea
 @pytest.mark.parametrize(
     ("task", "policy", "message"),
     [
-        ("lift", {"task": "LiftNamed"}, "policy: expected one that was trained for Lift, got one for LiftNamed"),
+        (
+            "lift",
+            {"task": "LiftNamed"},
+            "policy: expected one that was trained for Lift, got one for LiftNamed",
+        ),
         ("libero_10", {"task": "LiftNamed"}, "trained for libero_10, got one for LiftNamed"),
         ("libero_10", {"task": "libero_goal"}, "trained for libero_10, got one for libero_goal"),
         ("lift_named", {"task": "libero_goal"}, "trained for LiftNamed, got one for libero_goal"),
         ("libero_10", {}, "one of 8 observed numbers and 7 of an action, for libero_10, got one of 9 and 10"),
-        ("transport", {"task": "my_own"}, "one of 18 observed numbers and 20 of an action, for TwoArmTransport"),
+        (
+            "transport",
+            {"task": "my_own"},
+            "one of 18 observed numbers and 20 of an action, for TwoArmTransport",
+        ),
         (
             "lift_named",
             {"cameras": {"image": "sideview_image"}},
