@@ -65,7 +65,7 @@ def main(config: DictConfig) -> None:
     design = make_design(config.until, config.episodes, config.max_episodes)
     seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
     margins = config.margin, config.time_margin
-    terms = Terms(design, episode_horizon(make_env), task.early_cut, *margins, task.by_degrees)
+    terms = Terms(design, episode_horizon(make_env, seeds), task.early_cut, *margins, task.by_degrees)
     settings = {"task": config.task, "horizon": config.horizon}
 
     def play(name: str, count: int) -> list[EpisodeResult]:

@@ -1,8 +1,10 @@
 """Benchmark a vision-language-action policy: dense against pruned visual tokens, paired, with a table, plots and videos.
 
     python recipes/benchmark_vla.py policy=runs/vla_lift_named/policy methods=[dense,specprune,fastv@specprune]
+    python recipes/benchmark_vla.py policy=FOLDER_OF_OPENVLA_OFT task=libero_spatial split=test episodes=500 num_envs=10
 
-Needs a GL library. Kill it and run it again to go on: finished episodes are read from OUT/episodes.
+Needs a GL library, and for LIBERO the extra libero, see `torchrl_sparse.envs.libero`. Kill it and run it again to go on:
+finished episodes are read from OUT/episodes.
 """
 
 from __future__ import annotations
@@ -15,9 +17,8 @@ from torchrl_sparse.cli.options import check_names
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.envs.for_policy import instructed_env
+from torchrl_sparse.envs.instructed import find_instructed_task, instructed_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
-from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.film import film_tokens
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
@@ -51,14 +52,14 @@ def main(config: DictConfig) -> None:
     check_matches(methods)
     filmed = filmed_methods(config.videos, methods)
     options = token_settings(OmegaConf.to_container(config, resolve=True))
-    dense = VLAPolicy.from_pretrained(config.policy).to(config.device)
+    task = find_instructed_task(config.task)  # before a policy is loaded that may be large
+    dense = load_policy(config)
     check_budgets(methods, dense.network.config.visual_spec, options)
-    cameras = chosen_cameras(config.cameras)
-    make_env = instructed_env(config.task, dense.network.config, cameras, config.horizon)
+    make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     design = make_design(config.until, config.episodes, config.max_episodes)
     seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
-    early_cut = find_task(config.task).early_cut
-    terms = Terms(design, episode_horizon(make_env), early_cut, config.margin, config.time_margin)
+    horizon = episode_horizon(make_env, seeds)
+    terms = Terms(design, horizon, task.early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}
     recorded = record_methods(methods, dense, make_env, **probed, settings=options)
@@ -111,6 +112,11 @@ def main(config: DictConfig) -> None:
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_table(results)}")
     print(f"\nFiles are in {out}")
+
+
+def load_policy(config: DictConfig) -> VLAPolicy:
+    published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
+    return VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
 
 
 if __name__ == "__main__":

@@ -44,7 +44,8 @@ def main(config: DictConfig) -> None:
     measures = {"action_error": errors, "success": lost_episodes}
     if config.measure not in measures:
         raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
-    policy = VLAPolicy.from_pretrained(config.policy).to(config.device)
+    published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
+    policy = VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
     points = tuple(measures[config.measure](policy, config))
     for point in points:
         print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
@@ -101,9 +102,9 @@ def seeds(config: DictConfig) -> range:
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
     # Here, since queries of demonstrations need no simulator.
-    from torchrl_sparse.envs.for_policy import instructed_env
+    from torchrl_sparse.envs.instructed import instructed_env
 
-    return instructed_env(config.task, policy.network.config, chosen_cameras(config.cameras), config.horizon)
+    return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ from torchrl_sparse.evaluation.figures.tokens import draw_tokens, plot_token_str
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft
 from torchrl_sparse.tokens.specprune import SpecPrune
 
 _SHOWN = 6
@@ -41,10 +40,9 @@ def main(config: DictConfig) -> None:
 
 def play(suite: str, config: DictConfig) -> str:
     """Step and draw one suite, and tell what happened; a policy is loaded for each, and none while another is in memory."""
-    published = config.policy is not None and is_openvla_oft(config.policy)
-    policy = load_published(suite, config) if published else make_policy(config)
+    policy = make_policy(suite, config).to(config.device)
     policy.pruner = SpecPrune(config.preset, alpha=config.alpha)
-    steps = rollout(policy.to(config.device), suite, config, as_released=published)
+    steps = rollout(policy, suite, config)
     queries = steps[steps[keys.QUERIED].squeeze(-1)]
     path = draw(policy, queries, Path(config.out) / f"{suite}.png")
     return (
@@ -53,22 +51,18 @@ def play(suite: str, config: DictConfig) -> str:
     )
 
 
-def load_published(suite: str, config: DictConfig) -> VLAPolicy:
-    """Load a folder of OpenVLA-OFT with the suite's own range of actions."""
-    return VLAPolicy.from_openvla_oft(config.policy, unnorm_key=suite, heads=tuple(config.heads))
-
-
-def make_policy(config: DictConfig) -> VLAPolicy:
-    """Load the policy in a folder, or make a small one with random weights."""
+def make_policy(suite: str, config: DictConfig) -> VLAPolicy:
+    """Load the policy in a folder, with the suite's own range of actions, or make a small one with random weights."""
     if config.policy is not None:
-        return VLAPolicy.from_pretrained(config.policy)
+        return VLAPolicy.from_pretrained(config.policy, unnorm_key=suite, heads=tuple(config.heads))
     torch.manual_seed(0)
     return VLAPolicy(VLANetwork(VLAConfig.small()))
 
 
-def rollout(policy: VLAPolicy, suite: str, config: DictConfig, *, as_released: bool) -> TensorDictBase:
+def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase:
     """Run ``steps`` steps of the suite's task, [T]."""
     size = policy.network.config.image_size
+    as_released = policy.source.images == "openvla_oft"
     env = make_libero_env(suite, config.task_id, image_size=size, as_released=as_released)
     actor = ChunkExecutor(policy, config.n_action_steps, ActionAwareController())
     collector = Collector(

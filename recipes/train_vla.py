@@ -24,6 +24,7 @@ from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import VLASource
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
@@ -63,6 +64,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         )
     else:
         policy = VLAPolicy.from_pretrained(config.init)
+    policy.source = VLASource(find_robosuite_task(config.task).name, cameras)
     trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), stages)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
@@ -87,7 +89,9 @@ def export(trainer: VLATrainer, config: DictConfig) -> Path:
 
 
 def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
-    return VLAPolicy(trainer.averaged(), trainer.policy.normalizer, trainer.policy.tokenizer)
+    policy = VLAPolicy(trainer.averaged(), trainer.policy.normalizer, trainer.policy.tokenizer)
+    policy.source = trainer.policy.source
+    return policy
 
 
 def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None:
@@ -95,14 +99,14 @@ def closed_loop_success(trainer: VLATrainer, config: DictConfig) -> float | None
     if importlib.util.find_spec("robosuite") is None:
         return None
     from torchrl_sparse.control.chunk_executor import ChunkExecutor
-    from torchrl_sparse.envs.for_policy import instructed_env
+    from torchrl_sparse.envs.instructed import instructed_env
     from torchrl_sparse.evaluation.rollouts.evaluate import evaluate, success_rate
 
     policy = averaged_policy(trainer)
     episodes = evaluate(
         "dense",
         ChunkExecutor(policy, config.n_action_steps),
-        instructed_env(config.task, policy.network.config, chosen_cameras(config.cameras)),
+        instructed_env(config.task, policy, policy.source.cameras),
         tuning_seeds(DEVELOPMENT_SEED, config.eval_episodes),
         num_envs=min(5, config.eval_episodes),
         policy_device=config.device,

@@ -1,3 +1,4 @@
+import hashlib
 import pickle
 
 import pytest
@@ -7,7 +8,7 @@ from tensordict import TensorDict
 from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES
-from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
+from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner, tensors_fingerprint
 from torchrl_sparse.keys import COND, PRUNE_MASK, REUSE
 
 SPEC = PlanSpec(NUM_STEPS, NUM_LAYERS, policy="a policy")
@@ -142,3 +143,12 @@ def test_a_bound_planner_travels_between_processes_and_adds_nothing_to_a_checkpo
     copy = pickle.loads(pickle.dumps(planner))
     assert torch.equal(copy(observations(2))[PRUNE_MASK], planner(observations(2))[PRUNE_MASK])
     assert planner.state_dict() == {}
+
+
+def test_a_fingerprint_is_of_names_and_bytes_of_any_type():
+    values = {"b": torch.tensor(2), "a": torch.tensor([[1.5, -2.0]]).T}
+    parts = [b"a", values["a"].numpy().tobytes(), b"b", values["b"].numpy().tobytes()]
+    assert tensors_fingerprint(values) == hashlib.sha256(b"".join(parts)).hexdigest()[:16]
+    half = {name: value.bfloat16() for name, value in values.items()}
+    assert tensors_fingerprint(half) == tensors_fingerprint(dict(reversed(half.items())))
+    assert tensors_fingerprint(half) != tensors_fingerprint({**half, "b": half["b"] + 1})

@@ -1,14 +1,17 @@
 """What stands between LIBERO and a policy; LIBERO itself where it is installed."""
 
 import importlib.util
+import io
 
 import hydra
 import imageio.v3 as iio
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
+from torchrl.data.vla import preprocessing
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -18,6 +21,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
 from torchrl_sparse.envs.release_images import ReleaseImages, as_released
+from torchrl_sparse.networks.vla.vision import center_crop
 
 needs_libero = pytest.mark.skipif(importlib.util.find_spec("libero") is None, reason="no LIBERO")
 
@@ -119,6 +123,23 @@ def test_images_go_the_way_of_the_release():
     steps, raw = env.rollout(2), Rendered(256).reset()
     for camera in (keys.IMAGE, keys.WRIST_IMAGE):
         assert torch.equal(steps[camera][0], as_released(raw[camera], 28))
+
+
+def test_images_are_those_of_torchrls_preprocessor():
+    """The parts of `OpenVLAImagePreprocessor` that follow TensorFlow, on a picture with noise in every pixel."""
+    torch.manual_seed(0)
+    image = torch.rand(3, 16, 16).repeat_interleave(16, 1).repeat_interleave(16, 2)
+    image = ((image + torch.rand(3, 256, 256) / 4) * 200).byte()
+    file = io.BytesIO()
+    Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=95)
+    decoded = torch.from_numpy(iio.imread(file.getvalue(), extension=".jpg")).permute(2, 0, 1)
+    whole = preprocessing._lanczos3_resize(decoded[None].float(), (224, 224)).round().clamp(0, 255).byte()
+    cropped = preprocessing._fractional_center_crop(whole, (224, 224))
+    ours = as_released(image, 224)[None]
+    for mine, theirs in ((ours, whole), (center_crop(ours, 0.9), cropped)):
+        difference = (mine.float() - theirs.float()).abs()
+        assert difference.max() <= 2
+        assert difference.mean() < 0.3  # Pillow rounds between its two passes
 
 
 def test_a_published_folder_is_played_on_its_images(tmp_path, monkeypatch, capsys):

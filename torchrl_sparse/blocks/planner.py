@@ -173,7 +173,8 @@ def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
     """Return sixteen hexadecimal digits that name the values of named tensors."""
     digest = hashlib.sha256()
     for name, value in sorted(tensors.items()):
-        digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().flatten().view(torch.uint8).numpy())  # as bytes: numpy has no bf16
     return digest.hexdigest()[:16]
 
 

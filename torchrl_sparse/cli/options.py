@@ -46,7 +46,7 @@ OPTIONS: dict[str, Any] = {
     "task": Word,
     "policy": Word,
     **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy"), Word | None),
-    "libero_smoke.heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
+    "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
     "planners": Word,
     "demos": Word | None,
     "out": Word,

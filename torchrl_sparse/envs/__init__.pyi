@@ -1,7 +1,5 @@
-from .for_policy import (
-    diffusion_env as diffusion_env,
-    instructed_env as instructed_env,
-)
+from .for_policy import diffusion_env as diffusion_env
+from .instructed import instructed_env as instructed_env
 from .robosuite import RobosuiteEnv as RobosuiteEnv
 from .transforms import (
     EndEffectorVelocity as EndEffectorVelocity,

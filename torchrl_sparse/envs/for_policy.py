@@ -1,4 +1,4 @@
-"""Environments that show exactly what a given policy observes."""
+"""Environments that show exactly what a given diffusion policy observes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from torchrl_sparse.envs.conventions import source_convention
-from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask, Task, find_robosuite_task, find_task
+from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask, Task, find_task
 from torchrl_sparse.envs.transforms import make_env
-from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["diffusion_env", "instructed_env", "observed_keys"]
+__all__ = ["camera_options", "diffusion_env", "named_task", "observed_keys"]
 
 _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 
@@ -65,32 +64,9 @@ def observed_keys(task: str, policy: DiffusionPolicy) -> tuple[str, ...]:
     return tuple(policy.source.get("state_keys") or own)
 
 
-def instructed_env(
-    task: str, config: VLAConfig, cameras: Mapping[str, str], horizon: int | None = None
-) -> Callable[..., EnvBase]:
-    """Return a maker of environments that show and say what a `VLAPolicy` reads; its keywords are those of `make_env`.
-
-    Args:
-        task: of robosuite, see `make_env`.
-        config: of the policy's network; decides the size of the images.
-        cameras: as in demonstrations: name of an observation here -> name of the images in the file.
-        horizon: steps until an episode is truncated; None for the task's own.
-    """
-    return partial(
-        make_env,
-        find_robosuite_task(task).name,
-        n_obs_steps=1,
-        image_size=config.image_size,
-        object_state=False,
-        instruction=True,
-        horizon=horizon,
-        **_camera_options(cameras),
-    )
-
-
 def _check_task(task: Task, policy: DiffusionPolicy) -> None:
     trained = policy.source.get("task")
-    if trained is not None and _named_task(trained) not in (None, task.name):
+    if trained is not None and named_task(trained) not in (None, task.name):
         raise ValueError(f"policy: expected one that was trained for {task.name}, got one for {trained}")
     found = (policy.normalizer.state_scale.numel(), policy.normalizer.action_scale.numel())
     expected = (_state_size(task, policy), task.action_dim)
@@ -101,10 +77,10 @@ def _check_task(task: Task, policy: DiffusionPolicy) -> None:
         )
 
 
-def _named_task(trained: str) -> str | None:
+def named_task(trained: str) -> str | None:
     """Return the name of the task that a published name, such as "lift_lowdim" or "blockpush_image", means.
 
-    >>> _named_task("tool_hang_image_abs"), _named_task("my_own")
+    >>> named_task("tool_hang_image_abs"), named_task("my_own")
     ('ToolHang', None)
     """
     plain = trained.lower().replace("_", "")
@@ -150,13 +126,13 @@ def _image_options(policy: DiffusionPolicy) -> dict[str, Any]:
     cameras = {name: named.get(name, "") for name in policy.vision.cameras}
     if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
         raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
-    return {**_camera_options(cameras), "image_size": policy.vision.image_size[0], "object_state": False}
+    return {**camera_options(cameras), "image_size": policy.vision.image_size[0], "object_state": False}
 
 
-def _camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
+def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
     """Translate names of images, here and in demonstrations, into arguments of `make_env`.
 
-    >>> _camera_options({"image": "agentview_image"})
+    >>> camera_options({"image": "agentview_image"})
     {'camera': 'agentview'}
     """
     return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}

@@ -8,10 +8,12 @@ An optional extra, as it brings 350 MB of scenes::
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -25,10 +27,12 @@ from torchrl_sparse.envs.simulator import import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask
 from torchrl_sparse.envs.transforms import EndEffectorVelocity
 
-__all__ = ["SUITES", "RotationVectorState", "make_libero_env"]
+__all__ = ["SUITES", "RotationVectorState", "make_libero_env", "require_libero", "suite_horizon"]
 
 SUITES = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520}
 """The suites, and the steps after which OpenVLA-OFT's evaluation gives up an episode of each."""
+
+MISSING = "LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]'"
 
 _POSE = ("observation", "pose")
 _TASK = RobosuiteTask(
@@ -66,38 +70,74 @@ def make_libero_env(
         >>> env.reset()["language_instruction"]  # doctest: +SKIP
         'pick up the black bowl between the plate and the ramekin and place it on the plate'
     """
-    if suite not in SUITES:
-        raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    horizon = suite_horizon(suite)
     rendered = RENDERED_SIZE if as_released else image_size
     options = {
         "camera_height": rendered,
         "camera_width": rendered,
         "wrist_camera": "robot0_eye_in_hand",
-        "max_episode_steps": SUITES[suite] if max_episode_steps is None else max_episode_steps,
+        "max_episode_steps": horizon if max_episode_steps is None else max_episode_steps,
         "init_state_mode": init_state_mode,
     }
     try:
         with _base_of_floor_robots():
             env = _MountedLibero(suite, task_id, **options, **kwargs)
     except ImportError as error:
-        raise ImportError(
-            f"LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]': {error}"
-        ) from error
+        raise ImportError(f"{MISSING}: {error}") from error
     pose = RenameTransform([keys.STATE], [_POSE])
     images = [ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], image_size)] if as_released else []
     state = [pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState()]
     return TransformedEnv(env, Compose(InitTracker(), *images, *state))
 
 
+def suite_horizon(suite: str) -> int:
+    """Return the steps of `SUITES`.
+
+    Raises:
+        ValueError: on an unknown suite.
+    """
+    if suite not in SUITES:
+        raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    return SUITES[suite]
+
+
+def require_libero() -> None:
+    """Raise ImportError, with the command that installs it, unless LIBERO is there."""
+    if importlib.util.find_spec("libero") is None:
+        raise ImportError(MISSING)
+
+
 class _MountedLibero(LiberoEnv):
     """`LiberoEnv` in robosuite 1.5, which does not know the base of the robots in LIBERO's floor scenes: None.
 
     Robots are made anew at every reset. robosuite's table has the entry only meanwhile.
+
+    Attributes:
+        scene_seed: what a reset draws comes of it; None leaves that to numpy's global generator, as LIBERO does. Cabinets and
+            stoves are drawn even where there is an initial state, which is of what can move.
+        init_state_id: None draws everything.
     """
 
+    scene_seed: int | None = None
+    init_state_id: int | None
+
     def _reset(self, *args: Any, **kwargs: Any) -> TensorDictBase:
-        with _base_of_floor_robots():
+        with _base_of_floor_robots(), _numpy_seeded(self.scene_seed):
             return super()._reset(*args, **kwargs)
+
+    def _select_init_state(self) -> np.ndarray | None:
+        return None if self.init_state_id is None else super()._select_init_state()
+
+
+@contextmanager
+def _numpy_seeded(seed: int | None) -> Iterator[None]:
+    before = np.random.get_state()  # noqa: NPY002 - LIBERO draws from this one
+    if seed is not None:
+        np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002
 
 
 @contextmanager

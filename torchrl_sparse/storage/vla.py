@@ -4,7 +4,8 @@
 
     {"format": "torchrl_sparse.vla_policy/1",
      "network": {fields of VLAConfig},
-     "tokenizer": {"kind": "words", "words": [...]} or {"kind": "llama", "definition": {content of a tokenizer.json}}}
+     "tokenizer": {"kind": "words", "words": [...]} or {"kind": "llama", "definition": {content of a tokenizer.json}},
+     "source": {fields of VLASource; only where one is known}}
 
 Network weights are fp16, normalisation constants as they are.
 """
@@ -12,7 +13,7 @@ Network weights are fp16, normalisation constants as they are.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,9 +27,25 @@ from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_fro
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
-__all__ = ["StoredVLA", "read_vla", "write_vla"]
+__all__ = ["StoredVLA", "VLASource", "read_vla", "write_vla"]
 
 _NETWORK, _NORMALIZER = "network.", "normalizer."
+
+
+@dataclass(frozen=True)
+class VLASource:
+    """What a vision-language-action policy was trained for.
+
+    Attributes:
+        task: a task, a suite of LIBERO or a data set, by its name; None where nobody noted it.
+        cameras: name of an image here -> its name in the demonstrations; empty where nobody noted them.
+        images: ``"rendered"`` at the policy's size, or as ``"openvla_oft"``'s evaluation prepares them, see
+            `torchrl_sparse.envs.release_images`.
+    """
+
+    task: str | None = None
+    cameras: dict[str, str] = field(default_factory=dict)
+    images: Literal["rendered", "openvla_oft"] = "rendered"
 
 
 @dataclass(frozen=True)
@@ -38,6 +55,7 @@ class _Config:
     format: Literal["torchrl_sparse.vla_policy/1"]
     network: dict[str, Any]
     tokenizer: dict[str, Any]
+    source: VLASource | None = None
 
 
 @dataclass(frozen=True)
@@ -48,11 +66,13 @@ class StoredVLA:
         network: the network, in evaluation mode.
         normalizer: of states and actions.
         tokenizer: of instructions.
+        source: what it was trained for.
     """
 
     network: VLANetwork
     normalizer: QuantileNormalizer
     tokenizer: InstructionTokenizer
+    source: VLASource = VLASource()
 
 
 def write_vla(path: Path, policy: StoredVLA) -> None:
@@ -60,9 +80,9 @@ def write_vla(path: Path, policy: StoredVLA) -> None:
     weights = {name: value.half() for name, value in policy.network.state_dict().items()}
     tensors = _prefixed(_NETWORK, weights) | _prefixed(_NORMALIZER, policy.normalizer.state_dict())
     write_tensors(path / "model.safetensors", tensors)
-    config = _Config(
-        "torchrl_sparse.vla_policy/1", policy.network.config.to_dict(), policy.tokenizer.to_config()
-    )
+    network, tokenizer = policy.network.config.to_dict(), policy.tokenizer.to_config()
+    source = None if policy.source == VLASource() else policy.source
+    config = _Config("torchrl_sparse.vla_policy/1", network, tokenizer, source)
     write_json(path / "config.json", config)
 
 
@@ -96,7 +116,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
         normalizer = QuantileNormalizer(**take(tensors, _NORMALIZER))
     except ValueError as error:
         raise ValueError(f"{path / 'model.safetensors'}: normalizer: {error}") from error
-    return StoredVLA(network.eval(), normalizer, tokenizer)
+    return StoredVLA(network.eval(), normalizer, tokenizer, stored.source or VLASource())
 
 
 def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig) -> None:

@@ -111,7 +111,7 @@ def test_a_larger_grid_extends_what_is_there(go, monkeypatch):
 def test_finalists_are_played_until_they_are_decided_and_the_right_one_is_taken(go, monkeypatch, tmp_path):
     times = {"dense": 90, "ddim4": 20, "ddpm2_logsnr": 10}
     monkeypatch.setattr(run, "time_queries", fixed_times({name: times.get(name, 200) for name in METHODS}))
-    monkeypatch.setattr(run, "episode_horizon", lambda make_env: HORIZON)
+    monkeypatch.setattr(run, "episode_horizon", lambda make_env, seeds: HORIZON)
     monkeypatch.setattr(run, "evaluate", episodes_of({"dense": 20, "ddim4": 20}))
     found, _ = go(episodes=300, grid=replace(GRID, searched=()))
     assert set(found.played) == {"dense", "ddim4", "ddpm2_logsnr"}

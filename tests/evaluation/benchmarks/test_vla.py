@@ -2,16 +2,23 @@
 
 import pytest
 import torch
+import yaml
 
 pytest.importorskip("transformers")
 
 from torchrl.envs import InitTracker, StepCounter, Transform, TransformedEnv
 from torchrl.envs.custom import ToyVLAEnv
 
+from tests.recipe_modules import RECIPES
 from torchrl_sparse import keys
-from torchrl_sparse.evaluation.benchmarks.vla import filmed_methods, record_methods
+from torchrl_sparse.evaluation.benchmarks.vla import (
+    check_budgets,
+    filmed_methods,
+    record_methods,
+    token_settings,
+)
 from torchrl_sparse.evaluation.benchmarks.vla_measure import replay_all, time_methods
-from torchrl_sparse.methods.vla import TOKEN_METHODS, TokenMethod, make_pruner
+from torchrl_sparse.methods.vla import TOKEN_METHODS, TokenMethod, make_controller, make_pruner
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -107,6 +114,32 @@ def test_random_tokens_are_the_same_each_time(policy):
     first, again = (replay_all(worker, recorded)[keys.TOKEN_DEPTH] for _ in range(2))
     assert torch.equal(first, again)
     assert len({*map(tuple, first.tolist())}) > 1
+
+
+def test_the_defaults_run_on_the_shipped_policy():
+    options = yaml.safe_load((RECIPES / "benchmark_vla.yaml").read_text())
+    settings = token_settings(options)
+    assert settings["specprune"]["alpha"] == 0.17
+    spec = VLAPolicy.from_pretrained(options["policy"]).network.config.visual_spec
+    check_budgets(options["methods"], spec, settings)
+    with pytest.raises(ValueError, match=r"specprune: alpha \* budget: .* 36 tokens per camera, got 40"):
+        check_budgets(options["methods"], spec, token_settings(options | {"calibrated": False}))
+
+
+@pytest.mark.parametrize(
+    ("motion", "given", "steps"),
+    [("measured", {}, None), ("commanded", {}, 4), ("commanded", {"chunk_steps": 2}, 2)],
+)
+def test_a_chunk_is_used_up_when_its_executed_actions_are(motion, given, steps):
+    controller = {"motion": motion, **given}
+    options = {
+        "policy": "none",
+        "calibrated": True,
+        "specprune": {},
+        "controller": controller,
+        "n_action_steps": 4,
+    }
+    assert make_controller("specprune", token_settings(options)).chunk_steps == steps
 
 
 def test_videos_are_those_of_methods():

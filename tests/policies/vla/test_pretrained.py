@@ -9,14 +9,17 @@ from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import VLASource
 
 
 @torch.no_grad()
 def test_round_trip_at_half_precision(policy, query, tmp_path):
+    policy.source = VLASource("LiftNamed", {"image": "sideview_image"})
     policy.save_pretrained(tmp_path)
     again = VLAPolicy.from_pretrained(tmp_path)
     assert again.network.config == policy.network.config
     assert again.tokenizer.words == policy.tokenizer.words
+    assert again.source == again.with_pruner(None).source == policy.source
     for name, value in again.network.state_dict().items():
         assert torch.equal(value, policy.network.state_dict()[name].half().float()), name
     torch.testing.assert_close(
@@ -36,6 +39,8 @@ def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
         ("format", "other", "format: expected"),
         ("tokenizer", {"kind": "pickle"}, "tokenizer: expected kind"),
         ("network", {}, "expected the fields"),
+        ("source", {"cameras": ["image"]}, "source.cameras: expected an object"),
+        ("source", {"images": "mine"}, "source.images: expected 'rendered' or 'openvla_oft', got 'mine'"),
     ],
 )
 def test_a_wrong_config_is_named(policy, tmp_path, field, value, message):

@@ -6,12 +6,11 @@ from pathlib import Path
 import pytest
 
 from torchrl_sparse import ChunkExecutor
-from torchrl_sparse.envs.for_policy import instructed_env
+from torchrl_sparse.envs.instructed import instructed_env
 from torchrl_sparse.envs.named_lift import COLOURS
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 ASSET = Path(__file__).parents[3] / "assets/vla"
-CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 LIFTED, STEPS, SEEDS = 0.04, 60, (200001, 200002, 200003)
 
 
@@ -22,7 +21,7 @@ def policy():
 
 @pytest.fixture(scope="module")
 def env(policy):
-    env = instructed_env("lift_named", policy.network.config, CAMERAS)(seeds=SEEDS)
+    env = instructed_env("lift_named", policy, policy.source.cameras)(seeds=SEEDS)
     try:
         env.reset()
     except RuntimeError as error:  # no GL library

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,8 +11,10 @@ from tensordict import TensorDict
 
 from tests.storage.published import openvla as published
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.published.faults import CheckpointError
+from torchrl_sparse.storage.vla import VLASource
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +75,36 @@ def test_what_was_imported_can_be_saved(folder, tmp_path):
     policy = load(folder)
     policy.save_pretrained(tmp_path / "ours")
     again = type(policy).from_pretrained(tmp_path / "ours")
+    assert again.source == policy.source == VLASource("libero_spatial", images="openvla_oft")
     assert again.tokenizer.definition is not None
     assert torch.equal(again.normalizer.action_low, policy.normalizer.action_low)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@torch.no_grad()
+def test_weights_keep_their_type_and_stay_in_the_file(weights, tmp_path, dtype):
+    parts = ({name: value.to(dtype) for name, value in part.items()} for part in weights)
+    published.write(tmp_path, *parts)
+    policy = VLAPolicy.from_pretrained(tmp_path, heads=published.SIZES["heads"])
+    assert {value.dtype for value in policy.network.parameters()} == {dtype}
+    shards = {str(path.resolve()) for path in tmp_path.glob("*.safetensors")}
+    embedding = policy.network.decoder.llama.embed_tokens.weight
+    layers = [layer.mlp.up_proj.weight for layer in policy.network.decoder.llama.layers]
+    assert {mapped_file(weight) for weight in (embedding, *layers)} <= shards
+    observation = {name: torch.zeros(1, 3, 28, 28, dtype=torch.uint8) for name in ("image", "wrist_image")}
+    observation |= {"state": torch.zeros(1, 8)}
+    td = policy(TensorDict({"observation": observation, "language_instruction": ["pick"]}, [1]))
+    assert td[keys.CHUNK].isfinite().all()
+    assert tensors_fingerprint(policy.state_dict()) != tensors_fingerprint(load(tmp_path).state_dict())
+
+
+def mapped_file(tensor):
+    """The file that holds a tensor's memory, None where it is the process' own."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        span, *_, last = line.split(maxsplit=5)
+        first, end = (int(address, 16) for address in span.split("-"))
+        if first <= tensor.data_ptr() < end:
+            return last if last.startswith("/") else None
 
 
 def edit(folder, name, change):

@@ -9,6 +9,7 @@ from tests.training.runs import stop_and_go_on, train_unbroken
 from tests.training.vla.rendered import COLOURS, write_demos
 from torchrl_sparse import keys
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import VLASource
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,9 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
 
 
 def check_policy(policy):
-    """It knows the instructions' words, and grippers as such."""
+    """It knows the instructions' words, grippers as such, and what it was trained for."""
+    cameras = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+    assert policy.source == VLASource("LiftNamed", cameras)
     assert set(COLOURS) <= set(policy.tokenizer.words)
     image = torch.zeros(2, 3, 28, 28, dtype=torch.uint8)
     observation = {"image": image, "wrist_image": image, "state": torch.zeros(2, 9)}

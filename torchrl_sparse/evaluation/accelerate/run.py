@@ -240,10 +240,10 @@ def _play(
     request: Request,
 ) -> Results:
     """Play the finalists against dense until their verdicts are reached, and write ``results.json``."""
-    horizon, task = episode_horizon(make_env), find_task(request.task)
+    seeds = evaluation_seeds("development", request.seed, request.episodes)
+    horizon, task = episode_horizon(make_env, seeds), find_task(request.task)
     design = make_design("decided", request.episodes, request.episodes)
     terms = Terms(design, horizon, task.early_cut, request.margin, request.time_margin, task.by_degrees)
-    seeds = evaluation_seeds("development", request.seed, request.episodes)
     settings = {"task": task.name, "horizon": horizon, "n_action_steps": request.n_action_steps}
 
     def play(name: str, count: int) -> list[EpisodeResult]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 
 from torchrl.envs import EnvBase
@@ -43,9 +43,14 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
     return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))
 
 
-def episode_horizon(make_env: Callable[..., EnvBase]) -> int:
-    """Return the steps after which the environment that `make_env` makes truncates an episode."""
-    with closing(make_env(seeds=[0])) as env:
+def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> int:
+    """Return the steps after which the environment that `make_env` makes truncates an episode.
+
+    Args:
+        make_env: called as ``make_env(seeds=seeds)``.
+        seeds: of all episodes that may be played; an environment may refuse some.
+    """
+    with closing(make_env(seeds=seeds)) as env:
         return env.base_env.horizon
 
 

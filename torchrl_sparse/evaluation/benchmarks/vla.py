@@ -78,7 +78,8 @@ def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
     Args:
         options: with ``policy``, its folder; ``calibrated``, whether to read ``specprune.json`` in it, if there is one;
-            ``specprune``, fields of `SpecPruneOptions` that go before; and ``controller``, see `ControllerOptions`.
+            ``specprune``, fields of `SpecPruneOptions` that go before; ``controller``, see `ControllerOptions`; and
+            ``n_action_steps``, of a chunk that are executed.
 
     Examples:
         >>> options = {"policy": "assets/vla", "calibrated": True, "specprune": {"keep_share": 0.9}, "controller": {}}
@@ -89,7 +90,10 @@ def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     if options["calibrated"] and path.is_file():
         budget = TokenBudget.from_pretrained(path)
         changes = {"preset": budget.preset, "alpha": budget.alpha, **budget.options, **changes}
-    return {"specprune": dict(changes), "controller": dict(options["controller"])}
+    controller = dict(options["controller"])
+    if controller.get("motion") == "commanded":  # whose rule asks whether a chunk is used up
+        controller.setdefault("chunk_steps", options["n_action_steps"])
+    return {"specprune": dict(changes), "controller": controller}
 
 
 def skipped_layers(dense: VLAPolicy, recorded: Recorded, count: int) -> list[int]:

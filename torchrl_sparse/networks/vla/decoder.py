@@ -60,6 +60,7 @@ class BidirectionalLlama(nn.Module):
                 initializer_range=config.llm.dim**-0.5,
             )
         )
+        self.llama.rotary_emb = nn.Identity()  # angles are computed here
         self._head_dim = config.llm.dim // config.llm.heads
 
     def embed(self, ids: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ last prompt token and all slots but the last.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
 from torchrl_sparse.networks.vla.text import BOS_ID, STOP_ID, Prompts
 from torchrl_sparse.networks.vla.vision import FusedProjector, VisionTowers
 
-__all__ = ["VLANetwork", "make_network"]
+__all__ = ["VLANetwork", "make_network", "network_of"]
 
 
 class VLANetwork(nn.Module):
@@ -135,6 +135,24 @@ def make_network(
     """
     with torch.device(device), _default_dtype(dtype):
         return VLANetwork(config)
+
+
+def network_of(config: VLAConfig, weights: Mapping[str, Tensor]) -> VLANetwork:
+    """Make a network, in evaluation mode, whose weights are these very tensors: none is drawn first, and none copied.
+
+    Args:
+        config: its sizes.
+        weights: all of ``VLANetwork(config).state_dict()``.
+
+    >>> weights = make_network(VLAConfig.tiny()).state_dict()
+    >>> network_of(VLAConfig.tiny(), weights).head.fc2.bias.data_ptr() == weights["head.fc2.bias"].data_ptr()
+    True
+    """
+    network = make_network(config, device="meta")
+    network.load_state_dict(weights, assign=True)
+    patches = network.vision.siglip.embeddings
+    patches.position_ids = torch.arange(patches.num_patches)[None]  # the one tensor that is no weight
+    return network.eval()
 
 
 @contextmanager

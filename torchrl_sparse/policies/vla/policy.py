@@ -21,8 +21,8 @@ from torchrl_sparse.networks.vla.text import InstructionTokenizer, WordTokenizer
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
 from torchrl_sparse.runtime.clock import synchronised_clock
-from torchrl_sparse.storage.published.openvla_oft import read_openvla_oft
-from torchrl_sparse.storage.vla import StoredVLA, read_vla, write_vla
+from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft, read_openvla_oft
+from torchrl_sparse.storage.vla import StoredVLA, VLASource, read_vla, write_vla
 from torchrl_sparse.tokens.base import TokenPruner
 
 __all__ = ["VLAPolicy"]
@@ -42,6 +42,7 @@ class VLAPolicy(VLAWrapperBase):
         tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
 
     Attributes:
+        source: what it was trained for.
         pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense
             policy.
 
@@ -86,7 +87,7 @@ class VLAPolicy(VLAWrapperBase):
             raise ValueError(
                 f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
             )
-        self.pruner = None
+        self.pruner, self.source = None, VLASource()
         self.eval()
 
     # -- the shape of a query ------------------------------------------------------------------------------------------
@@ -113,7 +114,7 @@ class VLAPolicy(VLAWrapperBase):
             ValueError: if the pruner does not fit the network.
         """
         policy = VLAPolicy(self.network, self.normalizer, self.tokenizer)
-        policy.pruner = pruner
+        policy.pruner, policy.source = pruner, self.source
         return policy
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -210,19 +211,24 @@ class VLAPolicy(VLAWrapperBase):
 
     def save_pretrained(self, path: str | Path) -> None:
         """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
-        write_vla(Path(path), StoredVLA(self.network, self.normalizer, self.tokenizer))
+        write_vla(Path(path), StoredVLA(self.network, self.normalizer, self.tokenizer, self.source))
 
     @classmethod
-    def from_pretrained(cls, path: str | Path, *, config: VLAConfig | None = None) -> VLAPolicy:
-        """Load what `save_pretrained` wrote. Nothing in the files is executed.
+    def from_pretrained(
+        cls, path: str | Path, *, config: VLAConfig | None = None, **published: Any
+    ) -> VLAPolicy:
+        """Load what `save_pretrained` wrote, or a folder as OpenVLA-OFT is published. Nothing in the files is executed.
 
         Args:
             path: the folder.
             config: the architecture that it must hold, for instance with two cameras; any by default.
+            published: arguments of `from_openvla_oft`, which only such a folder takes.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
+        if is_openvla_oft(path):
+            return cls.from_openvla_oft(path, **published)
         return cls._assemble(read_vla(Path(path), config))
 
     @classmethod
@@ -233,14 +239,17 @@ class VLAPolicy(VLAWrapperBase):
         unnorm_key: str | None = None,
         cameras: int = 2,
         heads: Sequence[int] = (16, 16, 32),
-        dtype: torch.dtype = torch.bfloat16,
+        dtype: torch.dtype | None = None,
     ) -> VLAPolicy:
         """Load a published OpenVLA-OFT checkpoint, a folder as on the Hugging Face hub. Nothing in its files is executed.
 
         The policy reads upright images of the published size and crops them itself. What the published evaluation did to
-        LIBERO's images before that belongs to the environment, ``make_libero_env(..., as_released=True)``: a turn by 180
-        degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers of the
+        LIBERO's images before that belongs to the environment, see `torchrl_sparse.envs.instructed.instructed_env`: a turn by
+        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers of the
         gripper.
+
+        Weights stay in the shards, of which the system reads what is used and keeps what there is room for, unless another
+        ``dtype`` is asked for or the policy goes to another device. So the files have to stay as they are.
 
         Args:
             path: the folder, see `torchrl_sparse.storage.published.openvla_oft`.
@@ -248,7 +257,7 @@ class VLAPolicy(VLAWrapperBase):
                 the file has it so); not needed where the file has one only.
             cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
             heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
-            dtype: of the network.
+            dtype: of the network; by default that of the embeddings in the shards, bf16 where they are as published.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
@@ -263,4 +272,6 @@ class VLAPolicy(VLAWrapperBase):
 
     @classmethod
     def _assemble(cls, stored: StoredVLA) -> VLAPolicy:
-        return cls(stored.network, stored.normalizer, stored.tokenizer)
+        policy = cls(stored.network, stored.normalizer, stored.tokenizer)
+        policy.source = stored.source
+        return policy

@@ -20,19 +20,20 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
-from torchrl_sparse.networks.vla.network import make_network
+from torchrl_sparse.networks.vla.network import make_network, network_of
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
 from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.published.faults import naming_faults
 from torchrl_sparse.storage.published.torch_archive import TorchArchive
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, shapes_of, take
-from torchrl_sparse.storage.vla import StoredVLA
+from torchrl_sparse.storage.vla import StoredVLA, VLASource
 
 __all__ = ["is_openvla_oft", "read_openvla_oft"]
 
 _DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 _LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
+_EMBEDDING, _NO_NOOPS = "decoder.llama.embed_tokens.weight", "_no_noops"
 _FIXED_TEXT = {"rms_norm_eps": 1e-6, "rope_theta": 10000.0, "hidden_act": "silu"}
 
 _DINO_NAMES = {
@@ -67,7 +68,7 @@ def is_openvla_oft(path: str | Path) -> bool:
 
 
 def read_openvla_oft(
-    path: Path, *, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype
+    path: Path, *, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype | None
 ) -> StoredVLA:
     """Read the policy in the folder ``path``; see `VLAPolicy.from_openvla_oft`.
 
@@ -80,22 +81,23 @@ def read_openvla_oft(
 
 
 def _read(
-    path: Path, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype
+    path: Path, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype | None
 ) -> StoredVLA:
     if list(path.glob("vision_backbone*checkpoint*")):
         raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
     image_size = _image_size(path / "config.json")
     tensors = _read_shards(path) | _read_part(path, _HEAD) | _read_part(path, _PROPRIO)
     config = _config(path, tensors, heads, image_size, VLAConfig().cameras[:cameras])
-    statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
+    data_set, statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
     normalizer = _normalizer(path / "dataset_statistics.json", statistics, config)
     weights = _rename(tensors, config)
     expected = make_network(config, device="meta").state_dict()  # compared before memory is taken for it
     check_shapes(str(path), shapes_of(weights), shapes_of(expected))
     check_finite(str(path), weights)
-    network = make_network(config, dtype=dtype)
-    network.load_state_dict(weights)
-    return StoredVLA(network.eval(), normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"))
+    dtype = weights[_EMBEDDING].dtype if dtype is None else dtype
+    network = network_of(config, {name: value.to(dtype) for name, value in weights.items()})
+    source = VLASource(data_set.removesuffix(_NO_NOOPS), images="openvla_oft")
+    return StoredVLA(network, normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"), source)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -145,13 +147,14 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
     return {prefix + name.removeprefix("module."): value for name, value in tensors.items()}
 
 
-def _statistics(path: Path, unnorm_key: str | None) -> dict[str, Any]:
+def _statistics(path: Path, unnorm_key: str | None) -> tuple[str, dict[str, Any]]:
+    """Return the name of the data set, and its statistics."""
     every = read_json(path, dict[str, dict[str, Any]])
-    wanted = [unnorm_key, f"{unnorm_key}_no_noops"] if unnorm_key is not None else list(every)
+    wanted = [unnorm_key, f"{unnorm_key}{_NO_NOOPS}"] if unnorm_key is not None else list(every)
     found = [name for name in wanted if name in every]
     if not found or (unnorm_key is None and len(found) > 1):
         raise ValueError(f"{path}: unnorm_key: expected one of {sorted(every)}, got {unnorm_key!r}")
-    return every[found[0]]
+    return found[0], every[found[0]]
 
 
 def _normalizer(path: Path, statistics: dict[str, Any], config: VLAConfig) -> QuantileNormalizer:

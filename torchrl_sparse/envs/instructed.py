@@ -1,0 +1,116 @@
+"""Environments that show and say what a given vision-language-action policy reads: tasks of robosuite, and suites of LIBERO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from torchrl.envs import EnvBase
+
+from torchrl_sparse.envs.for_policy import camera_options, named_task
+from torchrl_sparse.envs.libero import SUITES, require_libero
+from torchrl_sparse.envs.libero_suite import make_suite_env
+from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
+from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+
+__all__ = ["InstructedTask", "find_instructed_task", "instructed_env"]
+
+
+@dataclass(frozen=True)
+class InstructedTask:
+    """A task that words can ask for.
+
+    Attributes:
+        name: of the task in results.
+        state_dim, action_dim: numbers that a policy reads beside images, and of an action.
+        early_cut: see `torchrl_sparse.envs.tasks.Task`.
+    """
+
+    name: str
+    state_dim: int
+    action_dim: int
+    early_cut: int | None = None
+
+
+def find_instructed_task(name: str) -> InstructedTask:
+    """Find a task of robosuite by its name or alias, or a suite of LIBERO.
+
+    Raises:
+        ImportError: for a suite without LIBERO, with the command that installs it.
+        ValueError: if there is none; the message lists those there are.
+
+    >>> find_instructed_task("lift_named").state_dim
+    9
+    """
+    if name in SUITES:
+        require_libero()
+        return InstructedTask(name, state_dim=8, action_dim=7)
+    tasks = [task for task in TASKS.values() if isinstance(task, RobosuiteTask)]
+    for task in tasks:
+        if name in (task.name, task.alias):
+            state_dim = task.state_size(task.proprioception_keys)
+            return InstructedTask(task.name, state_dim, task.action_dim, task.early_cut)
+    names, suites = ", ".join(task.name for task in tasks), ", ".join(SUITES)
+    raise ValueError(
+        f"task: expected one of {names}, their aliases or a suite of LIBERO ({suites}), got {name!r}"
+    )
+
+
+def instructed_env(
+    task: str, policy: VLAPolicy, cameras: Mapping[str, str], horizon: int | None = None
+) -> Callable[..., EnvBase]:
+    """Return a maker of environments that show and say what ``policy`` reads; it is called with ``seeds``, as `make_env`.
+
+    Args:
+        task: see `find_instructed_task`, which says what it raises.
+        policy: decides the size of the images and, by its ``source``, whether LIBERO's are prepared as for published policies.
+        cameras: as in demonstrations: name of an observation here -> name of the images in the file. LIBERO has its own.
+        horizon: steps until an episode is truncated; None for the task's own.
+
+    Raises:
+        ValueError: if the policy was trained for another task, with other cameras, or reads or acts in other sizes than the
+            task's; the message names both.
+
+    Examples:
+        >>> policy = VLAPolicy.from_pretrained("assets/vla")
+        >>> instructed_env("lift", policy, policy.source.cameras)
+        Traceback (most recent call last):
+        ...
+        ValueError: policy: expected one that was trained for Lift, got one for LiftNamed
+    """
+    found = find_instructed_task(task)
+    _check_policy(found, policy)
+    options = {"image_size": policy.network.config.image_size, "horizon": horizon}
+    if found.name in SUITES:
+        return partial(
+            make_suite_env, found.name, as_released=policy.source.images == "openvla_oft", **options
+        )
+    _check_cameras(cameras, policy.source.cameras)
+    shown = {"n_obs_steps": 1, "object_state": False, "instruction": True, **camera_options(cameras)}
+    return partial(make_env, found.name, **shown, **options)
+
+
+def _check_policy(task: InstructedTask, policy: VLAPolicy) -> None:
+    trained, config = policy.source.task, policy.network.config
+    if trained is not None and _known(trained) not in (None, task.name):
+        raise ValueError(f"policy: expected one that was trained for {task.name}, got one for {trained}")
+    if (config.state_dim, config.action_dim) != (task.state_dim, task.action_dim):
+        raise ValueError(
+            f"policy: expected one of {task.state_dim} observed numbers and {task.action_dim} of an action, for {task.name}, "
+            f"got one of {config.state_dim} and {config.action_dim}"
+        )
+
+
+def _known(trained: str) -> str | None:
+    return trained if trained in SUITES else named_task(trained)
+
+
+def _check_cameras(cameras: Mapping[str, str], trained: Mapping[str, str]) -> None:
+    """Refuse other cameras than the policy's own; those that it has not do no harm."""
+    for name, key in trained.items():
+        if cameras.get(name) != key:
+            raise ValueError(
+                f"cameras.{name}: expected {key}, which the policy was trained with, got {cameras.get(name)}"
+            )
