@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM, check_whole, query_seed
+from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
@@ -115,4 +115,4 @@ class ObservationEncoder(TensorDictModuleBase):
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
         check_whole(keys.EPISODE_SEED, seed)
         check_whole(keys.EPISODE_STEP, step)
-        return query_seed(seed.long() + self.noise_stream * NOISE_STREAM, step.long())
+        return query_seed(seed, step, self.noise_stream)

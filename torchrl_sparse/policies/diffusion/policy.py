@@ -181,7 +181,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def device(self) -> torch.device:
         """Where the networks are, and queries and their noise must be; ``policy.to("cuda")`` moves it."""
-        return next(self.network.parameters()).device
+        return self.network.pos_emb.device
 
     @property
     def n_obs_steps(self) -> int:
@@ -244,15 +244,16 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        start = synchronised_clock(self.device)
+        device = self.device
+        start = synchronised_clock(device)
         try:
             if not answer_directly(tensordict, *self.module.values()):
                 tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error
-        seconds = synchronised_clock(self.device) - start
+        seconds = synchronised_clock(device) - start
         batch = *tensordict.batch_size, 1
-        return tensordict.set(keys.LATENCY, torch.full(batch, seconds, device=self.device))
+        return tensordict.set(keys.LATENCY, torch.full(batch, seconds, device=device))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.

@@ -55,7 +55,8 @@ def answer_directly(
     cond, chunk = answered
     tensordict.set(keys.COND, cond.view(state.shape))
     tensordict.set(keys.SEED, seed)
-    tensordict.set(keys.PRUNE_MASK, mask.repeat(*batch, 1, 1) if batch else mask.clone())
+    masks = mask.expand(*batch, *mask.shape).clone(memory_format=torch.contiguous_format)
+    tensordict.set(keys.PRUNE_MASK, masks)
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
     tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
@@ -80,7 +81,7 @@ def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise:
         and encode.condition.vision is None
         and type(denoise.normalizer) is Normalizer
         and encode.condition.normalizer is denoise.normalizer
-        and all(map(_is_plain, denoise.normalizer.buffers()))
+        and all(map(_is_plain, denoise.normalizer._buffers.values()))
         and not denoise.network.training
         and not any(_is_watched(stage) for stage in stages)
     )
