@@ -44,22 +44,21 @@ def answer_directly(
     batch = tensordict.batch_size
     if state.shape != (*batch, *encode.state_shape):
         return False
-    network, mask = denoise.network, plan.static_mask
-    seed = encode.seed(tensordict)
+    cond = engine.condition(state.reshape(-1, *encode.state_shape), denoise.normalizer)
+    if cond is None:  # the encoder says what is wrong with the state
+        return False
+    network, mask, seed = denoise.network, plan.static_mask, encode.seed(tensordict)
     shape = (network.horizon, network.input_dim)
     noise = NOISES[denoise.noise](seed.reshape(-1), denoise.sampler.num_inference_steps, shape)
-    rows = state.reshape(-1, *encode.state_shape)
-    answered = engine.answer(noise, rows, encode.condition.normalizer, mask, plan.reuse)
-    if answered is None:  # the encoder says what is wrong with the state
-        return False
-    cond, chunk = answered
+    # Before the engine's call, which leaves nothing of what writes keys in the caches.
     tensordict.set(keys.COND, cond.view(state.shape))
     tensordict.set(keys.SEED, seed)
     masks = mask.expand(*batch, *mask.shape).clone(memory_format=torch.contiguous_format)
     tensordict.set(keys.PRUNE_MASK, masks)
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
-    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
+    chunk = engine.answer(noise, cond, denoise.normalizer, mask, plan.reuse)
+    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
     return True
 
 
