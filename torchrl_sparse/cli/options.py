@@ -141,7 +141,7 @@ OPTIONS: dict[str, Any] = {
     "latency_repeats": Count,
     "repeats": Count,
     "warmup": Whole,
-    **dict.fromkeys(("quick", "compile", "calibrated"), bool),
+    **dict.fromkeys(("quick", "compile", "instruction_sets", "calibrated"), bool),
     "batch": Count,
     **dict.fromkeys(("cases", "gpu_cases"), Annotated[list[Section], Field(min_length=1)]),
     "shape": Word,

@@ -43,7 +43,7 @@ class WeightWatch:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self._network = network
+        self.network = network
         self._members = _Members.of(network)
         self._places: tuple[list[int], Any] = ([], None)
         self._refreshed = 0
@@ -60,14 +60,14 @@ class WeightWatch:
         """
         members = self._members
         if members.identities() != members.known:
-            members = self._members = _Members.of(self._network)
+            members = self._members = _Members.of(self.network)
         # By `map`, which does not come back to the interpreter: all of this has left the caches since it was asked last.
         addresses = [*map(Tensor.data_ptr, members.parameters)]
         addresses += map(Tensor.is_contiguous, members.parameters)  # a matrix may be turned where it lies
         versions = [*map(_VERSION, members.counted)]
         known, places = self._places  # read and replaced in one go: other threads may do the same
         if known != addresses:
-            check_weights(self._network)
+            check_weights(self.network)
             places = self.locate([_first_values(p.detach()) for p in members.parameters])
             self._places = addresses, places
         return members.known, addresses, versions, self.read(places), self._refreshed

@@ -158,7 +158,7 @@ class DiffusionPolicy(TensorDictSequential):
         shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
         policy.start, policy.source = start, self.source
-        policy.module["encode"].noise_stream = self.noise_stream
+        policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy
 
@@ -231,6 +231,7 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
+        self.module["encode"].refresh()
         self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
