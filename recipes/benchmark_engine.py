@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.latency import plot_engine_times
-from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
 from torchrl_sparse.evaluation.latency.first_calls import first_calls
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
 from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, image_query_seconds
@@ -73,9 +73,8 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
         instruction_sets=config.instruction_sets,
     )
     variants = case.variants()
-    if compiled:
-        drop_uncompilable(variants)
     first = first_calls(case, variants)
+    variants = {variant: variants[variant] for variant in first}
     repeats = 1 if config.quick else entry.repeats
     with progress(name, "round", repeats) as show:
         latency = measure_latency(
@@ -105,15 +104,6 @@ def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
     policy = DiffusionPolicy.from_pretrained(folder)
     policy.plan = BAC.from_pretrained(folder / "bac.json")
     return policy.network, policy.plan.schedule.mask()
-
-
-def drop_uncompilable(variants: dict[str, Variant]) -> None:
-    """Compile what is to be compiled; without a compiler, a line that says so takes its place."""
-    try:
-        variants["eager-compiled dense"].call()
-    except RuntimeError as error:
-        del variants["eager-compiled dense"]
-        print(f"no eager-compiled: {str(error).splitlines()[0]}")
 
 
 if __name__ == "__main__":

@@ -127,6 +127,19 @@ def test_a_variant_that_answers_otherwise_is_never_timed(case):
         first_calls(case, {"torch dense": wrong})
 
 
+def test_a_baseline_that_cannot_be_compiled_is_left_out_and_says_so(case, capsys):
+    def fail():
+        raise RuntimeError("no compiler\nand more")
+
+    variant = case.variants()["torch dense"]
+    broken = replace(variant, call=fail)
+    found = first_calls(case, {"eager-compiled dense": broken, "torch dense": variant})
+    assert list(found) == ["torch dense"]
+    assert capsys.readouterr().out == "no eager-compiled dense: no compiler\n"
+    with pytest.raises(RuntimeError, match="no compiler"):
+        first_calls(case, {"torch dense": broken})
+
+
 def test_a_peak_of_a_gpu_is_what_the_variant_took_beside_the_weights(case, monkeypatch):
     """A stand-in for the GPU's memory, of which 1000 bytes are taken: nobody is charged for what others hold."""
     calls = []
