@@ -1,9 +1,9 @@
-"""A whole query in one call of compiled code, where nothing between its state and its chunk is asked for.
+"""A whole query in two calls of compiled code, where nothing between its state and its chunk is asked for.
 
 Stages that only move tensors cost as much as a denoising step: after a query, the caches have lost what Python and PyTorch
 run on, and each operation has to fetch it anew. So where the stages are those of the library, the state is all that the
-policy reads and the mask is known, the native engine takes the state and gives the chunk. The keys are the same, and so is
-every bit of them.
+policy reads and the mask is known, the native engine takes the state and gives the condition, all other keys are written, and
+then it gives the chunk. The keys are the same, and so is every bit of them.
 """
 
 from __future__ import annotations
