@@ -2,6 +2,8 @@
 
     python recipes/benchmark_engine.py out=outputs/engine threads=1
     python recipes/benchmark_engine.py out=outputs/engine_gpu device=cuda
+    python recipes/benchmark_engine.py out=outputs/sets instruction_sets=true
+    python recipes/benchmark_engine.py out=outputs/images "cases=[{shape: image, batch: 1, repeats: 15}]"
 
 Writes OUT/engine.json, a table and a bar chart per case. Times are medians, all variants of a case interleaved in one process.
 """
@@ -18,10 +20,10 @@ from torch import Tensor
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.latency import plot_engine_times
-from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant, make_network
+from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
 from torchrl_sparse.evaluation.latency.first_calls import first_calls
 from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
-from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, stage_seconds
+from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, image_query_seconds
 from torchrl_sparse.evaluation.results.engine_report import (
     SCHEMA,
     EngineResults,
@@ -68,11 +70,11 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
         num_steps=QUICK_STEPS if config.quick else 100,
         compiled=compiled,
         bac_mask=bac_mask,
+        instruction_sets=config.instruction_sets,
     )
     variants = case.variants()
-    if compiled:
-        drop_uncompilable(variants)
     first = first_calls(case, variants)
+    variants = {variant: variants[variant] for variant in first}
     repeats = 1 if config.quick else entry.repeats
     with progress(name, "round", repeats) as show:
         latency = measure_latency(
@@ -84,9 +86,17 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
         )
     shape = shape_results(case, variants, latency, config.threads, first)
     if entry.shape == "image":
-        policy = image_policy(network, width=16 if config.quick else 64)
-        shape = replace(shape, stage_s=stage_seconds(policy, image_query(policy, entry.batch), repeats))
+        shape = replace(shape, image_parts_s=image_parts(case, config.quick, repeats))
     return shape
+
+
+def image_parts(case: EngineCase, quick: bool, repeats: int) -> dict[str, dict[str, float]]:
+    """Time whole queries of an image policy, dense and of few steps."""
+    policy, seconds = image_policy(case.network, width=16 if quick else 64), {}
+    for kind in ("dense", "ddim10", "ddim2"):
+        policy.sampler = case.queries[kind].sampler
+        seconds[kind] = image_query_seconds(policy, image_query(policy, case.batch), repeats)
+    return seconds
 
 
 def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
@@ -94,15 +104,6 @@ def load_trained(folder: Path) -> tuple[TransformerForDiffusion, Tensor]:
     policy = DiffusionPolicy.from_pretrained(folder)
     policy.plan = BAC.from_pretrained(folder / "bac.json")
     return policy.network, policy.plan.schedule.mask()
-
-
-def drop_uncompilable(variants: dict[str, Variant]) -> None:
-    """Compile what is to be compiled; without a compiler, a line that says so takes its place."""
-    try:
-        variants["eager-compiled dense"].call()
-    except RuntimeError as error:
-        del variants["eager-compiled dense"]
-        print(f"no eager-compiled: {str(error).splitlines()[0]}")
 
 
 if __name__ == "__main__":

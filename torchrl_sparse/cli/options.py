@@ -141,7 +141,7 @@ OPTIONS: dict[str, Any] = {
     "budget": Positive,
     "latency_repeats": Count,
     "repeats": Count,
-    **dict.fromkeys(("quick", "compile", "calibrated"), bool),
+    **dict.fromkeys(("quick", "compile", "instruction_sets", "calibrated"), bool),
     "batch": Count,
     **dict.fromkeys(("cases", "gpu_cases"), Annotated[list[Section], Field(min_length=1)]),
     "shape": Word,

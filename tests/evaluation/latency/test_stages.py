@@ -3,17 +3,21 @@
 import pytest
 import torch
 
+from torchrl_sparse import Sampler
 from torchrl_sparse.evaluation.latency.engine_cases import make_network
-from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, stage_seconds
+from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, image_query_seconds
 
 
 def test_a_whole_query_of_the_image_shape_is_timed_by_parts():
     torch.manual_seed(0)
     policy = image_policy(make_network("image", quick=True), width=16)
+    policy.sampler = Sampler("ddim", 2)
     query = image_query(policy, batch=2)
-    seconds = stage_seconds(policy, query, repeats=2)
-    assert list(seconds) == ["encode", "plan", "denoise"]
-    assert min(seconds.values()) > 0
+    seconds = image_query_seconds(policy, query, repeats=2)
+    cameras = ["camera image", "camera wrist_image"]
+    assert list(seconds) == ["query", "encode", "pixels", *cameras, "denoise", "rest", "encode, plain"]
+    assert min(seconds[name] for name in seconds if name != "rest") > 0
+    assert seconds["query"] == pytest.approx(seconds["encode"] + seconds["denoise"] + seconds["rest"])
     assert set(query.keys()) == {"history", "episode"}
     assert policy(query)["vla_action", "chunk"].shape[0] == 2
 

@@ -2,13 +2,15 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import pytest
 import torch
 
 from tests.recipe_modules import RECIPES, load_recipe, run
-from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse.blocks.engine import TorchEngine, native_available
+from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, make_network
 from torchrl_sparse.evaluation.latency.first_calls import first_calls
@@ -19,6 +21,8 @@ from torchrl_sparse.evaluation.results.engine_report import (
     load_engine_results,
     shape_results,
 )
+from torchrl_sparse.evaluation.results.page_rows import read_table
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 ASSETS = RECIPES.parent / "assets"
 
@@ -121,6 +125,74 @@ def test_a_variant_that_answers_otherwise_is_never_timed(case):
         ValueError, match=r"^torch dense: expected the actions of the reference up to 0\.0001, got"
     ):
         first_calls(case, {"torch dense": wrong})
+
+
+def test_a_baseline_that_cannot_be_compiled_is_left_out_and_says_so(case, capsys):
+    def fail():
+        raise RuntimeError("no compiler\nand more")
+
+    variant = case.variants()["torch dense"]
+    broken = replace(variant, call=fail)
+    found = first_calls(case, {"eager-compiled dense": broken, "torch dense": variant})
+    assert list(found) == ["torch dense"]
+    assert capsys.readouterr().out == "no eager-compiled dense: no compiler\n"
+    with pytest.raises(RuntimeError, match="no compiler"):
+        first_calls(case, {"torch dense": broken})
+
+
+def test_a_peak_of_a_gpu_is_what_the_variant_took_beside_the_weights(case, monkeypatch):
+    """A stand-in for the GPU's memory, of which 1000 bytes are taken: nobody is charged for what others hold."""
+    calls = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: calls.append("reset"))
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: calls.append("before") or 1000)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: calls.append("peak") or 1700)
+    made = TorchEngine.__init__
+
+    def make(engine, *args):
+        calls.append("engine")
+        made(engine, *args)
+
+    monkeypatch.setattr(TorchEngine, "__init__", make)
+    variants = case.variants()
+    monkeypatch.setattr(case, "device", torch.device("cuda"))
+    first = first_calls(case, {name: variants[name] for name in ("torch dense", "torch random91")})
+    assert calls == ["reset", "before", "engine", "peak", "reset", "before", "peak"]
+    weights = 4 * sum(p.numel() for p in case.network.parameters())
+    assert {found.peak_bytes for found in first.values()} == {weights + 700}
+
+
+@pytest.mark.parametrize(("device", "mode"), [("cpu", "default"), ("cuda", "reduce-overhead")])
+def test_the_compiled_baseline_has_graphs_where_there_are_any(device, mode, monkeypatch):
+    modes = []
+    monkeypatch.setattr(torch, "compile", lambda function, mode: modes.append(mode))
+    network = SimpleNamespace(pos_emb=SimpleNamespace(device=torch.device(device)))
+    EagerBaseline(network, Sampler("ddpm", 4), compiled=True)
+    assert modes == [mode]
+
+
+@pytest.mark.skipif(not native_available()[0], reason=native_available()[1])
+def test_every_instruction_set_can_have_rows_of_its_own():
+    case = EngineCase(make_network("low_dim", quick=True), batch=1, num_steps=20, instruction_sets=True)
+    variants = case.variants()
+    for name in native_available()[1].split(", "):
+        for kind in ("dense", "random91", "bac10", "ddim2"):
+            variant = variants[f"native-{name} {kind}"]
+            assert variant.dense == f"native-{name} dense"
+            assert (variant.call() - case.reference(kind)).abs().max() < 1e-5
+    widest = native_available()[1].split(", ")[-1]
+    assert torch.equal(variants["native dense"].call(), variants[f"native-{widest} dense"].call())
+
+
+def test_whole_queries_of_images_have_a_table_of_their_own(tmp_path):
+    options = ("quick=true", "cases=[{shape: image, batch: 2}]", f"out={tmp_path}")
+    printed = run("benchmark_engine", *options)
+    assert "Whole queries, cameras included." in printed
+    table = read_table(tmp_path / "engine.json", "image_b2_parts")
+    rows = {table.name(row): row for row in table.rows}
+    assert list(rows)[:2] == ["query", "encode"]
+    assert rows["query"]["ddim2, share"] == "100%"
+    assert float(rows["camera image"]["dense, ms"]) > 0
 
 
 def test_recipe_writes_results_and_charts(tmp_path):

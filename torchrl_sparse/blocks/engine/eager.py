@@ -50,7 +50,7 @@ class EagerBaseline:
     Args:
         network: the denoiser, in eval mode.
         sampler: the sampler.
-        compiled: put :func:`published_forward` through ``torch.compile``.
+        compiled: put :func:`published_forward` through ``torch.compile``; on a GPU with CUDA graphs, which make it fastest.
 
     Raises:
         ValueError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down
@@ -70,7 +70,8 @@ class EagerBaseline:
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler, *, compiled: bool = False) -> None:
         self._network, self._scheduler = network, _diffusers_scheduler(sampler)
         self._timesteps, self._eta = sampler.timesteps, sampler.eta
-        self._forward = torch.compile(published_forward) if compiled else published_forward
+        mode = "reduce-overhead" if network.pos_emb.device.type == "cuda" else "default"
+        self._forward = torch.compile(published_forward, mode=mode) if compiled else published_forward
 
     @torch.no_grad()
     def denoise(

@@ -8,6 +8,8 @@ each parameter are compared besides, because diffusers' weight average writes th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -16,6 +18,7 @@ from torch import Tensor, nn
 __all__ = ["WeightWatch", "check_weights"]
 
 _SAMPLES = 4
+_VERSION = attrgetter("_version")
 
 
 class WeightWatch:
@@ -40,7 +43,7 @@ class WeightWatch:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self._network = network
+        self.network = network
         self._members = _Members.of(network)
         self._places: tuple[list[int], Any] = ([], None)
         self._refreshed = 0
@@ -57,13 +60,14 @@ class WeightWatch:
         """
         members = self._members
         if members.identities() != members.known:
-            members = self._members = _Members.of(self._network)
-        addresses = [p.data_ptr() for p in members.parameters]
-        addresses += [p.is_contiguous() for p in members.parameters]  # a matrix may be turned where it lies
-        versions = [p._version for p in members.counted]
+            members = self._members = _Members.of(self.network)
+        # By `map`, which does not come back to the interpreter: all of this has left the caches since it was asked last.
+        addresses = [*map(Tensor.data_ptr, members.parameters)]
+        addresses += map(Tensor.is_contiguous, members.parameters)  # a matrix may be turned where it lies
+        versions = [*map(_VERSION, members.counted)]
         known, places = self._places  # read and replaced in one go: other threads may do the same
         if known != addresses:
-            check_weights(self._network)
+            check_weights(self.network)
             places = self.locate([_first_values(p.detach()) for p in members.parameters])
             self._places = addresses, places
         return members.known, addresses, versions, self.read(places), self._refreshed
@@ -97,7 +101,7 @@ class _Members:
         return cls(holders, held, known, parameters, [p for p in parameters if not p.is_inference()])
 
     def identities(self) -> list[int]:
-        return [id(member) for holder in self.holders for member in holder.values()]
+        return [*map(id, chain.from_iterable(map(dict.values, self.holders)))]
 
 
 def _first_values(weight: Tensor) -> Tensor:

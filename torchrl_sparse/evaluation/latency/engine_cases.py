@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from torchrl_sparse.blocks.calibration import calibrate
 from torchrl_sparse.blocks.engine import Engine, NativeEngine, ReferenceEngine, TorchEngine
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.native.engine import native_supports
+from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.training.diffusion.published import published_network
@@ -32,13 +33,14 @@ QUICK = {"n_layer": 2, "n_emb": 32}
 _PRUNE_RATE = 0.91
 _SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
 _NUM_UPDATES = 10
+_RUNNERS = {"torch": TorchEngine, "native": NativeEngine}
 # By runner, its weights and their bytes.
 _ROUNDED_RUNNERS = {
     "native-fp16": ("float16", 2),
     "native-bf16": ("bfloat16", 2),
     "native-int8": ("int8", 1),
 }
-_ROUNDED_KINDS = ("dense", "random91", "bac10", "ddim2")
+_FEW_KINDS = ("dense", "random91", "bac10", "ddim2")
 _DRAWN_SEED = 1
 
 
@@ -111,6 +113,7 @@ class EngineCase:
         compiled: also run the eager baseline through ``torch.compile``.
         bac_mask: of a schedule of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
             first of the case's own queries, whose observation is noise.
+        instruction_sets: also run the native engine on each of those that this CPU has.
     """
 
     def __init__(
@@ -121,8 +124,10 @@ class EngineCase:
         num_steps: int = 100,
         compiled: bool = False,
         bac_mask: Tensor | None = None,
+        instruction_sets: bool = False,
     ) -> None:
         self.network, self.batch, self._compiled = network, batch, compiled
+        self._instruction_sets = instruction_sets
         self.device = network.pos_emb.device
         self._ddpm = Sampler("ddpm", num_steps, num_steps)
         generator = torch.Generator().manual_seed(0)
@@ -141,34 +146,42 @@ class EngineCase:
     def reference(self, kind: str) -> Tensor:
         """Return the reference engine's answer to a query, [B, H, A]."""
         query = self.queries[kind]
-        return self._call(ReferenceEngine(self.network, query.sampler), query)()
+        return self._call(partial(ReferenceEngine, self.network, query.sampler), query)()
 
     def variants(self) -> dict[str, Variant]:
         """Return all ways of answering all kinds of queries, by name."""
         variants = self._eager_variants()
         variants["reference dense"] = Variant(partial(self.reference, "dense"), "dense", "reference dense")
-        runners = {"torch": TorchEngine}
-        if native_supports(self.network)[0]:
-            runners["native"] = NativeEngine
-            runners |= {
-                name: partial(NativeEngine, weights=dtype) for name, (dtype, _) in _ROUNDED_RUNNERS.items()
-            }
-        for runner, make in runners.items():
-            engines = {}
+        for runner, make in self._runners().items():
+            # Made in its first call, which so takes all that is done once.
+            engine = cache(partial(make, self.network))
+            dtype, weight_bytes = _ROUNDED_RUNNERS.get(runner, ("float32", 4))
+            in_f32 = dtype in ("float32", "float16")
             for kind, query in self.queries.items():
-                if runner in _ROUNDED_RUNNERS and kind not in _ROUNDED_KINDS:
-                    continue
-                if query.sampler not in engines:
-                    engines[query.sampler] = make(self.network, query.sampler)
-                call = self._call(engines[query.sampler], query)
-                dtype, weight_bytes = _ROUNDED_RUNNERS.get(runner, ("float32", 4))
-                in_f32 = dtype in ("float32", "float16")
-                variants[f"{runner} {kind}"] = Variant(call, kind, f"{runner} dense", weight_bytes, in_f32)
+                if runner in _RUNNERS or kind in _FEW_KINDS:
+                    call = self._call(partial(engine, query.sampler), query)
+                    variants[f"{runner} {kind}"] = Variant(
+                        call, kind, f"{runner} dense", weight_bytes, in_f32
+                    )
         return variants
 
-    def _call(self, engine: Engine, query: QueryKind) -> Callable[[], Tensor]:
+    def _runners(self) -> dict[str, Callable[[TransformerForDiffusion, Sampler], Engine]]:
+        """Return by name what makes the engines; all but `_RUNNERS` answer few kinds of queries."""
+        if not native_supports(self.network)[0]:
+            return {"torch": TorchEngine}
+        rounded = {
+            name: partial(NativeEngine, weights=dtype) for name, (dtype, _) in _ROUNDED_RUNNERS.items()
+        }
+        sets = native_available()[1].split(", ") if self._instruction_sets else []
+        return (
+            _RUNNERS
+            | rounded
+            | {f"native-{name}": partial(NativeEngine, instruction_set=name) for name in sets}
+        )
+
+    def _call(self, engine: Callable[[], Engine], query: QueryKind) -> Callable[[], Tensor]:
         noise = self.noise[:, : query.sampler.num_inference_steps].contiguous()
-        return partial(engine.denoise, noise, self.cond, query.mask)
+        return lambda: engine().denoise(noise, self.cond, query.mask)
 
     def _eager_variants(self) -> dict[str, Variant]:
         kinds = [kind for kind, query in self.queries.items() if query.mask is None]

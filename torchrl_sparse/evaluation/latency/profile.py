@@ -92,7 +92,9 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
             "query": policy_call(policy),
             "noise": partial(policy.sample_noise, seed),
             "weights": watch.state,
-            "answer": lambda: engine.answer(noise, state, policy.normalizer, mask, policy.plan.reuse),
+            "answer": lambda: engine.answer(
+                noise, engine.condition(state, policy.normalizer), policy.normalizer, mask, policy.plan.reuse
+            ),
         },
         repeats,
         warmup,

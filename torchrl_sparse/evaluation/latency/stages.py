@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import statistics
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.runtime.clock import synchronised_clock
 
-__all__ = ["image_policy", "image_query", "stage_seconds"]
+__all__ = ["image_policy", "image_query", "image_query_seconds"]
 
 _CAMERAS, _IMAGE = ("image", "wrist_image"), 84
 
@@ -51,16 +53,30 @@ def image_query(policy: DiffusionPolicy, batch: int) -> TensorDict:
 
 
 @torch.no_grad()
-def stage_seconds(policy: DiffusionPolicy, query: TensorDictBase, repeats: int) -> dict[str, float]:
-    """Measure the median seconds of ``"encode"``, ``"plan"`` and ``"denoise"`` within a query, after one that warms up."""
-    device = policy.network.pos_emb.device
-    # a cold start has no out_keys and does nothing
-    stages = {name: stage for name, stage in policy.module.items() if stage.out_keys}
-    samples: dict[str, list[float]] = {name: [] for name in stages}
-    for _ in range(repeats + 1):
-        data = query.copy()
-        for name, stage in stages.items():
-            start = synchronised_clock(device)
-            stage(data)
-            samples[name].append(synchronised_clock(device) - start)
-    return {name: statistics.median(seconds[1:]) for name, seconds in samples.items()}
+def image_query_seconds(
+    policy: DiffusionPolicy, query: TensorDictBase, repeats: int, warmup: int = 1
+) -> dict[str, float]:
+    """Measure the median seconds of a whole query of images, and of what happens in it, interleaved.
+
+    Returns:
+        ``"query"``, the whole of it; ``"encode"``, of which ``"pixels"`` (crop and units of all images) and, by camera,
+        ``"camera <name>"`` (its network) are parts; ``"denoise"``, with all its steps; ``"rest"``, what is neither encoding
+        nor denoising: the plan, keys and Python. ``"encode, plain"`` is what the cameras' networks take on weights that are
+        not packed, for comparison.
+    """
+    stages, vision = dict(policy.module.items()), policy.vision
+    encoded = policy(query.copy())
+    images = {name: query["history", name].flatten(0, 1) for name in vision.cameras}
+    used = stages["encode"].condition.cameras.get(vision, policy.n_obs_steps)
+    calls: dict[str, Callable[[], Any]] = {
+        "query": lambda: policy(query.copy()),
+        "encode": lambda: stages["encode"](query.copy()),
+        "pixels": lambda: [used.encoders[name].pixels(images[name]) for name in vision.cameras],
+        **{f"camera {name}": partial(used.encoders[name], images[name]) for name in vision.cameras},
+        "denoise": lambda: stages["denoise"](encoded.copy()),
+        "encode, plain": lambda: vision(images),
+    }
+    latency = measure_latency(calls, repeats, warmup, device=policy.device)
+    seconds = {name: found.p50 for name, found in latency.items()}
+    plain = {"encode, plain": seconds.pop("encode, plain")}
+    return seconds | {"rest": seconds["query"] - seconds["encode"] - seconds["denoise"]} | plain

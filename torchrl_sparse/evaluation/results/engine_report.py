@@ -29,6 +29,7 @@ __all__ = [
     "EngineShape",
     "engine_rows",
     "format_engine_table",
+    "image_part_rows",
     "load_engine_results",
     "save_engine_results",
     "shape_results",
@@ -53,7 +54,7 @@ class EngineRow:
         f32_limit_s: what multiplying with these weights takes, for every row that computes them, at the shape's rate of
             products; None for bf16 and int8.
         first_s: of the first call, with everything that is done once; None in older files.
-        peak_bytes: of a GPU's memory; None on a CPU.
+        peak_bytes: that the first call took of a GPU's memory, with the weights; None on a CPU.
     """
 
     p50_s: float
@@ -81,7 +82,8 @@ class EngineShape:
         rows: by the name of the variant, ``"<runner> <kind>"``.
         program_build_s: that the program of a new mask takes to build.
         all_pruned_step_s: of a step that computes nothing, by runner.
-        stage_s: of the parts of a whole dense query of an image policy, by the policy's stages; None elsewhere.
+        image_parts_s: of whole queries of an image policy: sampler -> part -> seconds, see `image_query_seconds`; None
+            elsewhere.
     """
 
     threads: int
@@ -91,7 +93,7 @@ class EngineShape:
     rows: dict[str, EngineRow]
     program_build_s: float
     all_pruned_step_s: dict[str, float]
-    stage_s: dict[str, float] | None = None
+    image_parts_s: dict[str, dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -201,10 +203,21 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
     table = markdown_table(select_columns(engine_rows(shape), COLUMNS + GPU_COLUMNS * on_gpu))
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape.all_pruned_step_s.items()]
     text = [head, table, f"A step that computes nothing takes {', '.join(steps)}."]
-    if shape.stage_s:
-        stages = [f"{name} {1e3 * seconds:.2f} ms" for name, seconds in shape.stage_s.items()]
-        text.append(f"A whole dense query, cameras included: {', '.join(stages)}.")
+    if shape.image_parts_s:
+        text += ["Whole queries, cameras included.", markdown_table(image_part_rows(shape.image_parts_s))]
     return "\n\n".join(text)
+
+
+def image_part_rows(parts_s: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
+    """Return one row of text per part of a whole query of images: its time and its share by sampler."""
+    rows = []
+    for part in next(iter(parts_s.values())):
+        row = {"part": part}
+        for sampler, seconds in parts_s.items():
+            row[f"{sampler}, ms"] = f"{1e3 * seconds[part]:.2f}"
+            row[f"{sampler}, share"] = f"{seconds[part] / seconds['query']:.0%}"
+        rows.append(row)
+    return rows
 
 
 def engine_rows(shape: EngineShape) -> list[dict[str, str]]:

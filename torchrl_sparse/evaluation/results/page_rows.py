@@ -9,7 +9,12 @@ from pathlib import Path
 from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
-from torchrl_sparse.evaluation.results.engine_report import COLUMNS, engine_rows, load_engine_results
+from torchrl_sparse.evaluation.results.engine_report import (
+    COLUMNS,
+    engine_rows,
+    image_part_rows,
+    load_engine_results,
+)
 from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
@@ -119,7 +124,9 @@ def _realtime(path: Path) -> dict[str, Table]:
 
 def _engine(path: Path) -> dict[str, Table]:
     shapes = load_engine_results(path).shapes
-    return {name: _table(name, engine_rows(shape), len(COLUMNS)) for name, shape in shapes.items()}
+    tables = {name: _table(name, engine_rows(shape), len(COLUMNS)) for name, shape in shapes.items()}
+    images = {name: shape.image_parts_s for name, shape in shapes.items() if shape.image_parts_s}
+    return tables | {f"{name}_parts": _table(name, image_part_rows(parts)) for name, parts in images.items()}
 
 
 def _query(path: Path) -> dict[str, Table]:

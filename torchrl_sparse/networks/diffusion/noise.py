@@ -10,21 +10,25 @@ from torch import Tensor
 NOISE_STREAM = 2**32
 """Between the seeds of two noises that an episode could have had; no seed of an episode is as large."""
 
+_BITS = 2**64 - 1
 _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
-def query_seed(episode_seed: Tensor, episode_step: Tensor) -> Tensor:
+def query_seed(episode_seed: Tensor, episode_step: Tensor, stream: int = 0) -> Tensor:
     """Return one seed, i64 and non-negative, for each step of each episode, the same in every process and batch.
 
-    A SplitMix64 round spreads neighbouring inputs over all 64 bits (Steele et al., OOPSLA 2014).
-
     Args:
-        episode_seed, episode_step: i64 of one shape.
+        episode_seed, episode_step: whole numbers of one shape.
+        stream: which of the noises that an episode could have had.
+
+    >>> query_seed(torch.tensor([[7]]), torch.tensor([[0]])).tolist()
+    [[3017209365954019450]]
     """
-    mixed = episode_seed * 1_000_003 + episode_step + _signed(0x9E3779B97F4A7C15)
-    mixed = (mixed ^ _shift(mixed, 30)) * _signed(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ _shift(mixed, 27)) * _signed(0x94D049BB133111EB)
-    return (mixed ^ _shift(mixed, 31)) & (2**63 - 1)
+    # In Python's numbers: for a few rows, torch's first operation takes longer than all of this.
+    begin = stream * NOISE_STREAM
+    pairs = zip(episode_seed.flatten().tolist(), episode_step.flatten().tolist(), strict=True)
+    seeds = [_mix((seed + begin) * 1_000_003 + step) for seed, step in pairs]
+    return torch.tensor(seeds, dtype=torch.int64, device=episode_seed.device).view(episode_seed.shape)
 
 
 def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
@@ -58,11 +62,9 @@ def check_whole(name: Any, tensor: Tensor) -> None:
         raise ValueError(f"{name}: expected whole numbers, got {tensor.dtype}")
 
 
-def _signed(unsigned: int) -> int:
-    """Return the int64 with the same bits: torch has no unsigned arithmetic."""
-    return unsigned - 2**64 if unsigned >= 2**63 else unsigned
-
-
-def _shift(value: Tensor, bits: int) -> Tensor:
-    """Shift to the right logically; torch's own is arithmetic."""
-    return (value >> bits) & ((1 << (64 - bits)) - 1)
+def _mix(value: int) -> int:
+    """Spread neighbouring numbers over all bits by a round of SplitMix64 (Steele et al., OOPSLA 2014); return 63 of them."""
+    value = value + 0x9E3779B97F4A7C15 & _BITS
+    value = (value ^ value >> 30) * 0xBF58476D1CE4E5B9 & _BITS
+    value = (value ^ value >> 27) * 0x94D049BB133111EB & _BITS
+    return (value ^ value >> 31) & _BITS >> 1

@@ -95,11 +95,14 @@ class CameraEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Encode images u8 [N, 3, h, w]."""
-        crop = crop_random if self.training else crop_centre
-        pixels = crop(images, self.crop_size).to(self.linear.weight.dtype) / 255 * 2 - 1
-        points = spatial_softmax(self.keypoints(self.trunk(pixels)))
+        points = spatial_softmax(self.keypoints(self.trunk(self.pixels(images))))
         # robomimic, whose encoder the published policies use, ends with a rectifier.
         return self.linear(points.flatten(1)).relu()
+
+    def pixels(self, images: Tensor) -> Tensor:
+        """Return what the network sees of images u8 [N, 3, h, w]: a crop of each, in [-1, 1]."""
+        crop = crop_random if self.training else crop_centre
+        return crop(images, self.crop_size).to(self.linear.weight.dtype) / 255 * 2 - 1
 
 
 class VisionEncoder(nn.Module):

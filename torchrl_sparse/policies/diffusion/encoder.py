@@ -8,10 +8,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
-from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM, check_whole, query_seed
+from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.policies.diffusion.cameras import CameraSlot
 
 __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
@@ -31,6 +32,7 @@ class ConditionEncoder(nn.Module):
     def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
         super().__init__()
         self.normalizer, self.vision = normalizer, vision
+        self.cameras = CameraSlot()
         self.in_keys: list[NestedKey] = [keys.HISTORY_STATE]
         if vision is not None:
             self.in_keys += [keys.history(name) for name in vision.cameras]
@@ -46,7 +48,8 @@ class ConditionEncoder(nn.Module):
         if self.vision is None:
             return state
         images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
-        return torch.cat([self.vision(images), state], dim=-1)
+        encode = self.cameras.get(self.vision, frames=state.shape[-2])
+        return torch.cat([encode(images), state], dim=-1)
 
 
 class ObservationEncoder(TensorDictModuleBase):
@@ -92,6 +95,14 @@ class ObservationEncoder(TensorDictModuleBase):
             tensordict.set(keys.COND, self.condition(tensordict))
         return tensordict.set(keys.SEED, self.seed(tensordict))
 
+    def take_over(self, other: ObservationEncoder) -> None:
+        """Draw the noise that ``other`` does, and share what it has made of the cameras' weights."""
+        self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
+
+    def refresh(self) -> None:
+        """Read the cameras' weights anew in the next query."""
+        self.condition.cameras.refresh()
+
     def _check(self, state: Tensor) -> None:
         if tuple(state.shape[-2:]) != self.state_shape:
             raise ValueError(
@@ -115,4 +126,4 @@ class ObservationEncoder(TensorDictModuleBase):
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)
         check_whole(keys.EPISODE_SEED, seed)
         check_whole(keys.EPISODE_STEP, step)
-        return query_seed(seed.long() + self.noise_stream * NOISE_STREAM, step.long())
+        return query_seed(seed, step, self.noise_stream)

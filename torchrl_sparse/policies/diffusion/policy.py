@@ -158,7 +158,7 @@ class DiffusionPolicy(TensorDictSequential):
         shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
         policy.start, policy.source = start, self.source
-        policy.module["encode"].noise_stream = self.noise_stream
+        policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy
 
@@ -181,7 +181,7 @@ class DiffusionPolicy(TensorDictSequential):
     @property
     def device(self) -> torch.device:
         """Where the networks are, and queries and their noise must be; ``policy.to("cuda")`` moves it."""
-        return next(self.network.parameters()).device
+        return self.network.pos_emb.device
 
     @property
     def n_obs_steps(self) -> int:
@@ -231,6 +231,7 @@ class DiffusionPolicy(TensorDictSequential):
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
+        self.module["encode"].refresh()
         self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
@@ -244,15 +245,16 @@ class DiffusionPolicy(TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        start = synchronised_clock(self.device)
+        device = self.device
+        start = synchronised_clock(device)
         try:
             if not answer_directly(tensordict, *self.module.values()):
                 tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error
-        seconds = synchronised_clock(self.device) - start
+        seconds = synchronised_clock(device) - start
         batch = *tensordict.batch_size, 1
-        return tensordict.set(keys.LATENCY, torch.full(batch, seconds, device=self.device))
+        return tensordict.set(keys.LATENCY, torch.full(batch, seconds, device=device))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
         """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.

@@ -1,9 +1,9 @@
-"""A whole query in one call of compiled code, where nothing between its state and its chunk is asked for.
+"""A whole query in two calls of compiled code, where nothing between its state and its chunk is asked for.
 
 Stages that only move tensors cost as much as a denoising step: after a query, the caches have lost what Python and PyTorch
 run on, and each operation has to fetch it anew. So where the stages are those of the library, the state is all that the
-policy reads and the mask is known, the native engine takes the state and gives the chunk. The keys are the same, and so is
-every bit of them.
+policy reads and the mask is known, the native engine takes the state and gives the condition, all other keys are written, and
+then it gives the chunk. The keys are the same, and so is every bit of them.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ def answer_directly(
     batch = tensordict.batch_size
     if state.shape != (*batch, *encode.state_shape):
         return False
-    network, mask = denoise.network, plan.static_mask
-    seed = encode.seed(tensordict)
+    cond = engine.condition(state.reshape(-1, *encode.state_shape), denoise.normalizer)
+    if cond is None:  # the encoder says what is wrong with the state
+        return False
+    network, mask, seed = denoise.network, plan.static_mask, encode.seed(tensordict)
     shape = (network.horizon, network.input_dim)
     noise = NOISES[denoise.noise](seed.reshape(-1), denoise.sampler.num_inference_steps, shape)
-    rows = state.reshape(-1, *encode.state_shape)
-    answered = engine.answer(noise, rows, encode.condition.normalizer, mask, plan.reuse)
-    if answered is None:  # the encoder says what is wrong with the state
-        return False
-    cond, chunk = answered
+    # Before the engine's call, which leaves nothing of what writes keys in the caches.
     tensordict.set(keys.COND, cond.view(state.shape))
     tensordict.set(keys.SEED, seed)
-    tensordict.set(keys.PRUNE_MASK, mask.repeat(*batch, 1, 1) if batch else mask.clone())
+    masks = mask.expand(*batch, *mask.shape).clone(memory_format=torch.contiguous_format)
+    tensordict.set(keys.PRUNE_MASK, masks)
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
-    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
+    chunk = engine.answer(noise, cond, denoise.normalizer, mask, plan.reuse)
+    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
     return True
 
 
@@ -80,7 +80,7 @@ def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise:
         and encode.condition.vision is None
         and type(denoise.normalizer) is Normalizer
         and encode.condition.normalizer is denoise.normalizer
-        and all(map(_is_plain, denoise.normalizer.buffers()))
+        and all(map(_is_plain, denoise.normalizer._buffers.values()))
         and not denoise.network.training
         and not any(_is_watched(stage) for stage in stages)
     )

@@ -189,41 +189,47 @@ class NativeEngine:
             library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
-    def answer(
-        self, noise: Tensor, state: Tensor, normalizer: Normalizer, mask: Tensor, reuse: Reuse = "block"
-    ) -> tuple[Tensor, Tensor] | None:
-        """Return condition f32 [B, To, D] and chunk f32 [B, H - To + 1, A] of states, both as PyTorch rounds them, in one call.
+    def condition(self, state: Tensor, normalizer: Normalizer) -> Tensor | None:
+        """Return condition f32 [B, To, D] of states in the units of the environment, as PyTorch rounds it.
 
         Args:
-            noise: f32 [B, K, H, A].
-            state: f32 [B, To, D] in the units of the environment.
+            state: f32 [B, To, D].
             normalizer: with f32 buffers on the CPU.
-            mask: bool [K, 3L], valid, of every row.
-            reuse: see :meth:`denoise`.
 
         Returns:
             None if a state is not finite.
         """
-        packed, rows = self._current(), len(state)
-        packed.check(noise=noise, cond=state)
-        noise, state, mask = noise.contiguous(), state.contiguous(), mask.contiguous()
-        threads, horizon, past = self._num_threads(rows), noise.shape[2], state.shape[1] - 1
-        cond, actions = torch.empty_like(state), noise.new_empty(rows, *noise.shape[2:])
-        chunk = noise.new_empty(rows, horizon - past, noise.shape[3])
+        state = state.contiguous()
+        cond, (rows, steps, dim) = torch.empty_like(state), state.shape
+        where = state.data_ptr(), cond.data_ptr()
+        finite = library().sparse_normalise(_units(normalizer), rows * steps, dim, *where)
+        return cond if finite else None
+
+    def answer(
+        self, noise: Tensor, cond: Tensor, normalizer: Normalizer, mask: Tensor, reuse: Reuse = "block"
+    ) -> Tensor:
+        """Return chunks f32 [B, H - To + 1, A] in the units of the environment, as PyTorch rounds them, in one call.
+
+        Args:
+            noise: f32 [B, K, H, A].
+            cond: f32 [B, To, D], see :meth:`condition`.
+            normalizer: with f32 buffers on the CPU.
+            mask: bool [K, 3L], valid, of every row.
+            reuse: see :meth:`denoise`.
+        """
+        packed, rows = self._current(), len(cond)
+        packed.check(noise=noise, cond=cond)
+        noise, cond, mask = noise.contiguous(), cond.contiguous(), mask.contiguous()
+        threads, (_, _, horizon, dim) = self._num_threads(rows), noise.shape
+        actions = noise.new_empty(rows, horizon, dim)
+        chunk = noise.new_empty(rows, horizon - cond.shape[1] + 1, dim)
         slots = num_buffers(reuse, self._dense.shape[1])
-        vectors = (
-            normalizer.state_scale,
-            normalizer.state_offset,
-            normalizer.action_scale,
-            normalizer.action_offset,
-        )
-        units = (c_void_p * 4)(*(vector.data_ptr() for vector in vectors))
-        tensors = (tensor.data_ptr() for tensor in (state, cond, actions, chunk))
+        tensors = (tensor.data_ptr() for tensor in (cond, actions, chunk))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            query = rows, mask.data_ptr(), slots, noise.data_ptr(), units, *tensors
-            finite = library().sparse_answer(*where, *query, scratch.data_ptr())
-        return (cond, chunk) if finite else None
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), _units(normalizer), *tensors
+            library().sparse_answer(*where, *query, scratch.data_ptr())
+        return chunk
 
     def _num_threads(self, rows: int) -> int:
         """Return how many threads a batch of ``rows`` uses; more than there are panels in the narrowest product would wait."""
@@ -283,3 +289,9 @@ class NativeEngine:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
         if mask is not None and not mask.is_cpu:
             raise ValueError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")
+
+
+def _units(normalizer: Normalizer) -> ctypes.Array:
+    """Return ``struct Units`` of units.h, which points to the buffers of ``normalizer``."""
+    names = ("state_scale", "state_offset", "action_scale", "action_offset")
+    return (c_void_p * len(names))(*(normalizer._buffers[name].data_ptr() for name in names))

@@ -26,10 +26,8 @@ _SIGNATURES = {
     "sparse_model_size": (c_int64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
     "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 4]),
-    "sparse_answer": (
-        c_int32,
-        [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 7],
-    ),
+    "sparse_normalise": (c_int32, [c_void_p, c_int32, c_int32, *[c_void_p] * 2]),
+    "sparse_answer": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_blocks": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p]),
     "sparse_gather": (None, [c_int32, *[c_void_p] * 2]),
     "sparse_prune": (None, [c_int32, c_int32, c_void_p, c_int32, *[c_void_p] * 3]),

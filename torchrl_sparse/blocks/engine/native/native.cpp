@@ -66,19 +66,21 @@ void sparse_denoise(int32_t level, int32_t threads, const Model* m, int32_t n, c
     run(threads, task);
 }
 
-// The same from states to chunks [horizon - obs_steps + 1][action_dim] in the units of the environment, with one mask for all
-// rows; cond and actions are written too. Returns 0, and nothing else happens, if a state is not finite.
-int32_t sparse_answer(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
-                      const float* noise, const Units* units, const float* states, float* cond, float* actions, float* chunks,
-                      float* scratch) {
-    if (!normalise(*units, states, (size_t)n * m->obs_steps, m->cond_dim, cond)) return 0;
+// states [n][dim] in the units of the environment -> those of the policy. Returns whether all of them are finite.
+int32_t sparse_normalise(const Units* units, int32_t n, int32_t dim, const float* states, float* cond) {
+    return normalise(*units, states, n, dim, cond);
+}
+
+// The same as sparse_denoise to chunks [horizon - obs_steps + 1][action_dim] in the units of the environment, with one mask for all rows;
+// actions are written too.
+void sparse_answer(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
+                   const float* noise, const Units* units, const float* cond, float* actions, float* chunks, float* scratch) {
     Batch batch{LEVELS[level], *m, n, slots, pruned, 0, noise, cond, actions, scratch};
     auto task = [&](const Member& who) { batch.work(who); };
     run(threads, task);
     const size_t past = m->obs_steps - 1, steps = m->horizon - past, dim = m->action_dim;
     for (size_t row = 0; row < (size_t)n; row++)
         unnormalise(*units, actions + (row * m->horizon + past) * dim, steps, dim, chunks + row * steps * dim);
-    return 1;
 }
 
 // To be timed by the caller: runs the blocks of `kind` (0 SA, 1 CA, 2 FFN) of all layers.

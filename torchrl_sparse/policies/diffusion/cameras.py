@@ -1,0 +1,58 @@
+"""The cameras' encoder in use: packed where that is faster and gives the same, the module itself elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.engine.weights import WeightWatch
+from torchrl_sparse.networks.diffusion.packed_vision import can_pack_vision, pack_vision
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+
+__all__ = ["CameraSlot"]
+
+
+class CameraSlot:
+    """Holds what computes the features of the cameras: made when it is first needed, and anew when weights change.
+
+    Copies and pickles carry nothing.
+    """
+
+    def __init__(self) -> None:
+        self._watch: WeightWatch | None = None
+        self._made: tuple[Any, VisionEncoder | None] = (None, None)
+
+    def get(self, vision: VisionEncoder, frames: int) -> Callable[[Mapping[str, Tensor]], Tensor]:
+        """Return what encodes ``frames`` images of each camera as ``vision`` does, up to rounding.
+
+        That is `pack_vision`'s copy of it, where no gradient can be asked for and nobody looks at its layers.
+        """
+        watched = any(module._forward_hooks or module._forward_pre_hooks for module in vision.modules())
+        if (
+            torch.is_grad_enabled()
+            or watched
+            or type(vision) is not VisionEncoder
+            or not can_pack_vision(vision)
+        ):
+            return vision
+        watch, (known, packed) = (
+            self._watch,
+            self._made,
+        )  # read and replaced in one go: other threads may do the same
+        if watch is None or watch.network is not vision:
+            watch = self._watch = WeightWatch(vision)
+        state = id(vision), watch.state()
+        if packed is None or known != state:
+            packed = pack_vision(vision, frames)
+            self._made = state, packed
+        return packed
+
+    def refresh(self) -> None:
+        """Pack the weights anew in the next query."""
+        self._made = (None, None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_watch": None, "_made": (None, None)}
