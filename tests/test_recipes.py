@@ -1,5 +1,7 @@
 """Every recipe, at toy size, in the order in which a user runs them."""
 
+# ruff: noqa: F811, what is imported are fixtures
+
 import json
 import shutil
 from pathlib import Path
@@ -9,6 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.fixtures.recipes import demos, policy, schedules, work  # noqa: F401
 from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, SAGPruner
 from torchrl_sparse.blocks.mask import prune_rate
@@ -20,37 +23,6 @@ from torchrl_sparse.evaluation.results.offline import load_offline
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
-
-
-@pytest.fixture(scope="module")
-def work(tmp_path_factory):
-    return tmp_path_factory.mktemp("recipes")
-
-
-@pytest.fixture(scope="module")
-def demos(work):
-    output = run("collect_demos", "task=lift", "episodes=2", f"out={work}/demos.h5")
-    assert "successes/attempts 2/2" in output
-    return work / "demos.h5"
-
-
-@pytest.fixture(scope="module")
-def policy(work, demos):
-    small = ("network.n_layer=2", "network.n_emb=16", "network.n_head=2", "train.val_ratio=0")
-    run("train_policy", f"demos={demos}", f"out={work}/run", "max_steps=4", "batch_size=8", *small)
-    return work / "run" / "policy"
-
-
-@pytest.fixture(scope="module")
-def schedules(work, policy):
-    output = run("calibrate_bac", f"policy={policy}", f"out={work}/schedules", "num_updates=7")
-    assert "bac.json: prune rate 0." in output
-    found = f"planners={work}/schedules methods=[dense,bac,bac_blockwise,bac_unified]"
-    assert f"next: torchrl-sparse benchmark task=lift policy={policy} {found}" in output
-    options = (f"policy={policy}", f"out={work}/schedules", "methods=[bac]")
-    output = run("calibrate_bac", *options, "num_updates=2", "sampler=ddpm4")
-    assert "bac_ddpm4.json: prune rate 0." in output
-    return work / "schedules"
 
 
 def test_a_policy_is_evaluated(work, policy):

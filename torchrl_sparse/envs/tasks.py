@@ -277,10 +277,7 @@ TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}
 
 
 def find_task(name: str) -> Task:
-    """Find a task by its name or alias.
-
-    Raises:
-        ValueError: if there is none; the message lists those there are.
+    """Find a task by its name or alias; ValueError if there is none.
 
     >>> find_task("pusht").state_dim, find_task("can").state_dim
     (20, 23)
@@ -289,11 +286,7 @@ def find_task(name: str) -> Task:
 
 
 def find_robosuite_task(name: str) -> RobosuiteTask:
-    """Find a task that robosuite simulates, by its name or alias.
-
-    Raises:
-        ValueError: if there is none; the message lists those there are.
-    """
+    """Find a task that robosuite simulates, as `find_task` does."""
     return _find(name, [task for task in TASKS.values() if isinstance(task, RobosuiteTask)])
 
 

@@ -32,13 +32,14 @@ from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
+from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
 
-class DiffusionPolicy(TensorDictSequential):
+class DiffusionPolicy(PolicySizes, TensorDictSequential):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
     Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise
@@ -177,30 +178,6 @@ class DiffusionPolicy(TensorDictSequential):
     def noise(self) -> str:
         """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
-
-    @property
-    def device(self) -> torch.device:
-        """Where the networks are, and queries and their noise must be; ``policy.to("cuda")`` moves it."""
-        return self.network.pos_emb.device
-
-    @property
-    def n_obs_steps(self) -> int:
-        return self.network.n_obs_steps
-
-    @property
-    def num_inference_steps(self) -> int:
-        """Denoising steps K."""
-        return self.sampler.num_inference_steps
-
-    @property
-    def num_blocks(self) -> int:
-        """Blocks of a denoising step, 3L."""
-        return self.network.num_blocks
-
-    @property
-    def horizon(self) -> int:
-        """Actions that the network denoises, H; a chunk leaves out those before the present step."""
-        return self.network.horizon
 
     @property
     def fingerprint(self) -> str:
