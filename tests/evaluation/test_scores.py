@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_1samp, ttest_rel
+from scipy.stats import norm, ttest_1samp, ttest_rel
 
 from tests.evaluation.synthetic import MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.benchmarks.rounds import play_rounds
@@ -101,3 +101,12 @@ def test_episodes_of_such_a_task_go_on_until_the_score_is_decided():
     episodes = play_rounds(["far", "close"], lambda name, count: played[name][:count], terms)
     assert len(episodes["far"]) < 100
     assert mean_z(np.zeros(1), -0.05) == 0  # one episode says nothing
+
+
+@pytest.mark.parametrize("n", [3, 10, 200])
+def test_a_score_is_decided_where_its_interval_says_so(n):
+    gains = np.random.default_rng(n).normal(0.0, 0.1, n)
+    for confidence in (0.9, 0.95, 0.999):
+        low, high = mean_interval(gains, confidence)[1]
+        assert mean_z(gains, low) == pytest.approx(norm.ppf((1 + confidence) / 2))
+        assert mean_z(gains, high) == pytest.approx(-norm.ppf((1 + confidence) / 2))

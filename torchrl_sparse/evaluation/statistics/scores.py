@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import t
+from scipy.stats import norm, t
 
 __all__ = ["mean_interval", "mean_z"]
 
@@ -34,11 +34,15 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
 def mean_z(values: ArrayLike, bound: float) -> float:
     """Return by how many standard errors the mean of ``values`` lies above ``bound``; 0 of fewer than two, which say nothing.
 
+    Student's statistic as the normal one that is as unlikely, so that `mean_interval` excludes ``bound`` where this is beyond
+    the normal quantile.
+
     >>> round(mean_z([0.5, 0.7, 0.9], 0.5), 3), mean_z([0.5, 0.5], 0.6)
-    (1.732, -inf)
+    (1.212, -inf)
     """
     values = np.asarray(values, np.float64)
     if len(values) < 2:
         return 0.0
     above, error = float(values.mean()) - bound, float(values.std(ddof=1)) / len(values) ** 0.5
-    return above / error if error > 0 else math.copysign(math.inf, above)
+    tail = t.sf(abs(above) / error, len(values) - 1) if error > 0 else 0.0
+    return math.copysign(float(norm.isf(tail)), above)
