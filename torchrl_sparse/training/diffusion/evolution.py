@@ -4,6 +4,9 @@ Evolution of the kind (mu + lambda) with mu = lambda: of all chains that were tr
 differ from them in some cells of the mask, in a timestep, or in both, and none costs more than the budget. (For timesteps and
 layers searched so for pictures, with another fitness: AutoDiffusion, arXiv:2309.10438.)
 
+A step that is pruned is not for nothing: a stochastic chain draws noise before it, with a standard deviation of 0.15 from
+timestep 41 to 40 of DDPM's hundred, and blocks that are not computed cannot take it away.
+
 What was tried is all that a search has to remember: run again with it, it asks nothing twice and ends where it would have.
 """
 
@@ -154,7 +157,7 @@ class ChainSpace:
         return mask
 
     def _widened(self, length: int, turn: int, rng: np.random.Generator) -> PrunedChain:
-        """Put pruned steps directly after one of an unpruned chain, which they hardly change, and fill the budget up."""
+        """Put pruned steps directly after one of an unpruned chain, and fill the budget up."""
         whole = self._timesteps(min(self.whole_steps, length))
         at = turn % len(whole)
         added = [whole[at] - 1 - number for number in range(length - len(whole))]
