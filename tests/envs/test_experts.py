@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_sparse.data.demos import demonstrate
+from torchrl_sparse.data.demonstrate import demonstrate
 from torchrl_sparse.envs.experts.base import DOWNWARD, Hand, downward, nearest
 from torchrl_sparse.envs.experts.disturbance import Disturbance
 from torchrl_sparse.envs.experts.nut_assembly_square import grasp_yaw
