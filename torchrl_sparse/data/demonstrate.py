@@ -36,6 +36,7 @@ def demonstrate(
         ValueError: if the task has no expert or the quality is unknown.
 
     Examples:
+        >>> from torchrl_sparse.envs.tasks import find_task
         >>> task = find_task("lift")
         >>> episode = demonstrate(task, task.make(), seed=0)
         >>> episode.success, episode.actions.shape[1]

@@ -41,7 +41,7 @@ class Demonstrations:
             memory-mapped: ``data.memmap(folder)``.
         starts: i64 [E + 1]; episode e is rows ``starts[e]`` up to, not including, ``starts[e + 1]``.
         driven: i64 [E]; so many first rows of an episode a policy drove before the expert took over, see
-            `torchrl_sparse.data.dagger`. They are history of the windows that follow. None by default.
+            `torchrl_sparse.data.dagger`. They are history of the windows that follow. No row by default.
     """
 
     data: TensorDict
