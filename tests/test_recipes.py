@@ -103,6 +103,18 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert not (work / "no").exists()
 
 
+def test_a_policy_drives_and_is_trained_on_with_what_it_was_taught(work, demos, policy):
+    driven = (f"policy={policy}", "method=ddim2", "mixing=1", f"out={work}/driven.h5")
+    assert "kept 2" in run("collect_demos", "task=lift", "episodes=2", "seed=9", *driven)
+    options = (f"init={policy}", f"out={work}/taught", "max_steps=2", "batch_size=8", "train.val_ratio=0")
+    output = run("train_policy", f"demos=[{demos},{work}/driven.h5]", *options)
+    assert "4 demonstrations" in output
+    refused = run("collect_demos", f"policy={policy}", "mixing=2", f"out={work}/no.h5", expect=2)
+    assert "mixing: expected less than or equal to 1, got 2" in refused
+    cameras = ("cameras.image=agentview_image", f"demos=[{demos},{demos}]", f"out={work}/no")
+    assert "demos: expected one file with cameras" in run("train_policy", *cameras, expect=2)
+
+
 def test_training_exports_a_policy(policy):
     assert DiffusionPolicy.from_pretrained(policy).num_inference_steps == 100
 

@@ -15,7 +15,8 @@ import torch
 
 from torchrl_sparse import keys
 from torchrl_sparse.data import demos
-from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_initial_state
+from torchrl_sparse.data.demonstrate import demonstrate
+from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.hdf5_writer import Episode
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
@@ -49,7 +50,7 @@ class FakeExpert:
     def __init__(self, fails=()):
         self.seeds, self.fails = [], fails
 
-    def __call__(self, task, env, seed, quality="proficient"):
+    def __call__(self, task, env, seed, quality="proficient", driver=None):
         self.seeds.append(seed)
         length = 3 + seed % 4
         arrays = np.random.default_rng(seed).standard_normal((length, 7))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_sparse.data.demos import demonstrate
+from torchrl_sparse.data.demonstrate import demonstrate
 from torchrl_sparse.envs.experts.base import DOWNWARD, Hand, downward, nearest
 from torchrl_sparse.envs.experts.disturbance import Disturbance
 from torchrl_sparse.envs.experts.nut_assembly_square import grasp_yaw
@@ -233,3 +233,18 @@ def test_miss_closes_the_fingers_once_before_a_grasp_and_lifts_them_empty():
 def test_hesitation_stops_the_hand():
     paused = disturbed(replace(STILL, hesitation=0.1))[:, 0] < CLEAN[0]
     assert 0.1 < paused.mean() < 0.8
+
+
+@pytest.mark.parametrize("place", [(0.18, -0.055), (0.2, 0.081)])
+def test_a_can_that_was_dropped_beside_a_wall_is_grasped(envs, place):
+    env = envs["PickPlaceCan"]
+    start(env, 3)
+    expert = find_task("PickPlaceCan").load_expert()(env.sim_env, style())
+    can = env.sim_env.objects[env.sim_env.object_id]
+    upright = [*place, 0.87, 1.0, 0.0, 0.0, 0.0]
+    env.sim_env.sim.data.set_joint_qpos(can.joints[0], upright)
+    for _ in range(250):
+        td = execute(env, expert.command())
+        if td["success"]:
+            return
+    pytest.fail(f"not solved, the can is at {expert.body(can.root_body)[0]}")

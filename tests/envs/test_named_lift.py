@@ -10,7 +10,8 @@ from torchrl.envs import SerialEnv
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.realtime_executor import HoldPose
-from torchrl_sparse.data.demos import Collection, collect, demonstrate, read_initial_state
+from torchrl_sparse.data.demonstrate import demonstrate
+from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.envs.named_lift import COLOURS, SPACING, X_RANGE, Y_RANGE
 from torchrl_sparse.envs.robosuite import RobosuiteEnv

@@ -22,9 +22,8 @@ __all__ = ["OPEN_SECTIONS", "OPTIONS", "check_names", "check_options"]
 
 
 def _path_or_paths(value: Any) -> Any:
-    if not isinstance(value, str) and not (
-        isinstance(value, list) and all(isinstance(v, str) for v in value)
-    ):
+    paths = [value] if isinstance(value, str) else value
+    if not (isinstance(paths, list) and paths and all(isinstance(path, str) for path in paths)):
         raise ValueError(f"expected a path or a list of them, got {value!r}")
     return value
 
@@ -45,10 +44,11 @@ OPTIONS: dict[str, Any] = {
     # what is done, on what, where to
     "task": Word,
     "policy": Word,
-    **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy"), Word | None),
+    **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy", "collect_demos.policy"), Word | None),
     "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
     "planners": Word,
     "demos": Word | None,
+    "train_policy.demos": Annotated[Any, AfterValidator(_path_or_paths)],
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,
@@ -135,6 +135,7 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("task_id", "skipped_layers", "warmup"), Whole),
     "quality": Word,
     "keep_failures": bool,
+    "mixing": Annotated[float, Field(ge=0, le=1)],
     # what is measured, and how
     **dict.fromkeys(("margin", "time_margin", "held_out"), Between),
     "budget_ms": Positive | None,
@@ -218,8 +219,7 @@ OPTIONS: dict[str, Any] = {
     "hidden": Count,
     "n_layer": Count,
     "n_head": Count,
-    "n_emb": Count | None,
-    "n_obs_steps": Count | None,
+    **dict.fromkeys(("n_emb", "n_obs_steps"), Count | None),
     "n_cond_layers": Whole,
     "p_drop_emb": BelowOne,
     "p_drop_attn": BelowOne | None,

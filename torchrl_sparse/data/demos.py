@@ -1,7 +1,8 @@
 """Collecting scripted demonstrations: run experts, keep what succeeded, survive being killed.
 
 The demonstrations are scripted, never human. Episode ``i`` is fixed by ``seed + i`` alone, so a file can be
-made again, and continued after a kill, to the same bytes on the same machine.
+made again, and continued after a kill, to the same bytes on the same machine. A policy may drive first, see
+`torchrl_sparse.data.dagger`.
 """
 
 from __future__ import annotations
@@ -13,33 +14,22 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import torch
 from torchrl.envs import EnvBase
 
-from torchrl_sparse import keys
+from torchrl_sparse.data.dagger import Driver, Driving, load_driver
 from torchrl_sparse.data.demo_workers import in_order
-from torchrl_sparse.data.hdf5_writer import (
-    Episode,
-    episode_length,
-    merge_episodes,
-    split_episodes,
-    write_episode,
-)
+from torchrl_sparse.data.demonstrate import demonstrate
+from torchrl_sparse.data.hdf5_writer import episode_outcome, merge_episodes, split_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
-from torchrl_sparse.envs.tasks import Task, find_task
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.runtime.backends import check_backend
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.json import parse_json
-
-# Keeps the operator's random numbers apart from those of the initial state, which has the same seed.
-_EXPERT_STREAM = 1
-_OBSERVED = "obs/"
 
 
 @dataclass(frozen=True)
@@ -51,7 +41,8 @@ class Collection:
         episodes: demonstrations to keep; with ``keep_failures``, episodes to attempt.
         quality: "proficient", "recovering" or "mixed", see `torchrl_sparse.envs.experts.operators`.
         seed: the first episode's; the others follow in order.
-        keep_failures: keep failed episodes too.
+        keep_failures: keep failed episodes too, and those that the policy solved alone.
+        driving: the policy that drives first, of an episode that the expert finishes; None for the expert alone.
 
     Raises:
         ValueError: if a value is out of its range, or the task has no expert or not of that quality.
@@ -62,6 +53,7 @@ class Collection:
     quality: str = "proficient"
     seed: int = 0
     keep_failures: bool = False
+    driving: Driving | None = None
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
@@ -78,16 +70,26 @@ class Collection:
 
 @dataclass(frozen=True)
 class Summary:
-    """Tally of a collection: episodes attempted, successes among them, episodes kept and their mean steps."""
+    """Tally of a collection.
+
+    Attributes:
+        attempts: episodes.
+        successes: those of them that succeeded.
+        kept: episodes in the file.
+        mean_length: steps of those.
+        alone: successes of the policy that drove, before the expert took over: they teach nothing.
+    """
 
     attempts: int
     successes: int
     kept: int
     mean_length: float
+    alone: int = 0
 
     def __str__(self) -> str:
+        alone = f" ({self.alone} by the policy alone)" if self.alone else ""
         return (
-            f"successes/attempts {self.successes}/{self.attempts}, kept {self.kept}, "
+            f"successes/attempts {self.successes}/{self.attempts}{alone}, kept {self.kept}, "
             f"mean length {self.mean_length:.1f} steps"
         )
 
@@ -97,60 +99,6 @@ class _Finished(Collection):
     """The attribute ``collection`` of a file."""
 
     summary: Summary
-
-
-def demonstrate(task: Task, env: EnvBase, seed: int, quality: str = "proficient") -> Episode:
-    """Act out one scripted episode, to success or to the environment's horizon.
-
-    Args:
-        task: what is demonstrated.
-        env: its environment; in robosuite one of absolute actions.
-        seed: fixes the initial state, the operator, their style and every disturbance.
-        quality: "proficient", "recovering" or "mixed".
-
-    Raises:
-        ValueError: if the task has no expert or the quality is unknown.
-
-    Examples:
-        >>> task = find_task("lift")
-        >>> episode = demonstrate(task, task.make(), seed=0)
-        >>> episode.success, episode.actions.shape[1]
-        (True, 7)
-    """
-    rng = np.random.default_rng([seed, _EXPERT_STREAM])
-    env.set_seed(seed)
-    present = env.reset()
-    demonstrator = task.demonstrator(task, env, rng, quality)
-    steps: list[dict[str, Any]] = []
-    done = False
-    while not done:
-        state, observed = demonstrator.record(present)
-        clean, executed = demonstrator.act(present)
-        command = torch.as_tensor(demonstrator.command(executed), dtype=torch.float32)
-        present = env.step(present.set(keys.ACTION, command))["next"]
-        done = bool(present["done"])
-        steps.append(
-            {"state": state, "clean": clean, "executed": executed, "success": bool(present[keys.SUCCESS])}
-            | {_OBSERVED + name: value for name, value in observed.items()}
-        )
-    arrays = {name: np.stack([step[name] for step in steps]) for name in steps[0]}
-    return Episode(
-        seed=seed,
-        operator=demonstrator.operator,
-        instruction=demonstrator.instruction,
-        success=bool(arrays["success"][-1]),
-        model_file=demonstrator.model_file,
-        states=arrays["state"],
-        actions=arrays["clean"],
-        executed_actions=arrays["executed"],
-        rewards=arrays["success"].astype(np.float64),
-        dones=arrays["success"].astype(np.int64),
-        observations={
-            name.removeprefix(_OBSERVED): array
-            for name, array in arrays.items()
-            if name.startswith(_OBSERVED)
-        },
-    )
 
 
 def collect(
@@ -177,10 +125,12 @@ def collect(
         on_episode: called with the tally so far, after episodes found on disk and after each new one.
 
     Raises:
-        ValueError: if ``path`` or its parts were collected with other settings, or an option is out of range.
+        ValueError: if ``path`` or its parts were collected with other settings, an option is out of range, or the policy that
+            is to drive cannot, see `load_driver`.
     """
     path = Path(path)
     check_backend(backend, workers)
+    _load_driver(collection)  # before anything is written
     settings = asdict(collection)
     extendable = {name: value for name, value in settings.items() if name != "episodes"}
     shorter = False
@@ -228,9 +178,13 @@ def _part(parts: Path, seed: int) -> Path:
 def _make_part(parts: Path, collection: Collection, environment: Callable[[], EnvBase], seed: int) -> int:
     """Make the episode of a seed, unless it is there; return the seed."""
     if not _part(parts, seed).exists():
-        task = find_task(collection.task)
-        write_episode(_part(parts, seed), demonstrate(task, environment(), seed, collection.quality))
+        task, driver = find_task(collection.task), _load_driver(collection)
+        write_episode(_part(parts, seed), demonstrate(task, environment(), seed, collection.quality, driver))
     return seed
+
+
+def _load_driver(collection: Collection) -> Driver | None:
+    return load_driver(collection.task, collection.driving) if collection.driving is not None else None
 
 
 @cache
@@ -259,8 +213,9 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
 
 
 def _check_yield(tally: Summary) -> None:
-    if tally.attempts >= 20 and tally.successes * 20 < tally.attempts:
-        raise RunFailed(f"the expert fails: {tally}; keep_failures=true collects its episodes")
+    if tally.attempts >= 20 and tally.kept * 20 < tally.attempts:
+        whose = "the expert fails" if tally.alone * 2 < tally.attempts else "the policy needs no expert"
+        raise RunFailed(f"{whose}: {tally}; keep_failures=true collects such episodes")
 
 
 def _read_finished(path: Path) -> _Finished:
@@ -269,9 +224,11 @@ def _read_finished(path: Path) -> _Finished:
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:
-    length, success = episode_length(part)
+    made = episode_outcome(part)
+    alone = made.success and made.driven == made.length
     total = tally.mean_length * tally.kept
-    if success or keep_failures:
+    if keep_failures or (made.success and not alone):
         kept.append(part)
-        total += length
-    return Summary(tally.attempts + 1, tally.successes + success, len(kept), total / max(len(kept), 1))
+        total += made.length
+    counts = tally.attempts + 1, tally.successes + made.success, len(kept)
+    return Summary(*counts, total / max(len(kept), 1), tally.alone + alone)

@@ -7,12 +7,14 @@ in the file                   shape, type            meaning
                               ``total`` int          demonstrations; ``collection`` json, how they were made
 ``data/demo_<i>`` attributes  int, str, bool         ``num_samples``, ``model_file`` (MuJoCo xml), ``seed``,
                                                      ``operator``, ``success``; ``ep_meta`` json, its ``lang`` is
-                                                     the instruction (the convention of RoboCasa's files)
+                                                     the instruction (the convention of RoboCasa's files);
+                                                     ``driven`` int, first steps that a policy drove; absent for none
 ``states``                    f64 [T, S]             simulator state before each action; the first restores
                                                      the episode's start
 ``actions``                   f64 [T, 7 * arms]      the expert's clean absolute command: position, m;
                                                      rotation vector, rad; gripper, -1 open to 1 closed
-``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance
+``executed_actions``          f64 [T, 7 * arms]      what was executed: the same with the injected disturbance, or what
+                                                     the policy commanded
 ``rewards``, ``dones``        f64, i64 [T]           1 where the task succeeded
 ``obs/<key>``                 f64 [T, n]             observations before each action: the task's state and, of robosuite's
                                                      tasks, ``robot<i>_eef_quat``, which published policies observe
@@ -52,6 +54,7 @@ class Episode:
     rewards: np.ndarray
     dones: np.ndarray
     observations: Mapping[str, np.ndarray]
+    driven: int = 0
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -63,10 +66,20 @@ def write_episode(path: Path, episode: Episode) -> None:
         _fill(file.create_group("demo"), episode)
 
 
-def episode_length(path: Path) -> tuple[int, bool]:
-    """Number of steps of an episode written by `write_episode`, and whether it succeeded."""
+@dataclass(frozen=True)
+class Outcome:
+    """How an episode went: its steps, whether it succeeded, and how many of its first steps a policy drove."""
+
+    length: int
+    success: bool
+    driven: int
+
+
+def episode_outcome(path: Path) -> Outcome:
+    """Return the outcome of an episode written by `write_episode`."""
     with h5py.File(path, "r") as file:
-        return int(file["demo"].attrs["num_samples"]), bool(file["demo"].attrs["success"])
+        told = file["demo"].attrs
+        return Outcome(int(told["num_samples"]), bool(told["success"]), int(told.get("driven", 0)))
 
 
 def merge_episodes(
@@ -77,7 +90,7 @@ def merge_episodes(
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
     parts = {f"demo_{index}": part for index, part in enumerate(parts)}
-    total = sum(episode_length(part)[0] for part in parts.values())
+    total = sum(episode_outcome(part).length for part in parts.values())
     attributes = {"total": total, "env_args": env_args, "collection": collection}
     with new_hdf5(path) as file:
         data = lay_out(file, parts, attributes)
@@ -124,6 +137,8 @@ def _fill(group: h5py.Group, episode: Episode) -> None:
     group.attrs["operator"] = episode.operator
     group.attrs["ep_meta"] = json.dumps({"lang": episode.instruction})
     group.attrs["success"] = episode.success
+    if episode.driven:
+        group.attrs["driven"] = episode.driven
     for name in ("states", "actions", "executed_actions", "rewards", "dones"):
         group[name] = getattr(episode, name)
     for key, value in episode.observations.items():

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -22,12 +22,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.data.hdf5_bounds import count_attribute
 from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
 from torchrl_sparse.data.images import read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
-__all__ = ["Demonstrations", "read_demos"]
+__all__ = ["Demonstrations", "join_demos", "read_demos"]
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,17 @@ class Demonstrations:
             they were asked for, and ``"action"`` f32 [N, 10 * arms], the action taken in that state. It can be
             memory-mapped: ``data.memmap(folder)``.
         starts: i64 [E + 1]; episode e is rows ``starts[e]`` up to, not including, ``starts[e + 1]``.
+        driven: i64 [E]; so many first rows of an episode a policy drove before the expert took over, see
+            `torchrl_sparse.data.dagger`. They are history of the windows that follow. No row by default.
     """
 
     data: TensorDict
     starts: Tensor
+    driven: Tensor = field(default=None)  # type: ignore[assignment]  # never None once made
+
+    def __post_init__(self) -> None:
+        if self.driven is None:
+            object.__setattr__(self, "driven", torch.zeros(len(self), dtype=torch.int64))
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -63,7 +71,8 @@ class Demonstrations:
         """Return rows of all training windows, i64 [W, horizon], as Diffusion Policy's sampler cuts them.
 
         A window may begin up to ``n_obs_steps - 1`` rows before its episode and end up to
-        ``n_action_steps - 1`` after it; rows outside repeat the first or last one. None crosses episodes.
+        ``n_action_steps - 1`` after it; rows outside repeat the first or last one. None crosses episodes. The present row,
+        the last of the observations, is the first that the expert drove or later; rows before it have the expert's labels too.
 
         Args:
             horizon: rows of a window; the first ``n_obs_steps`` are also its observations.
@@ -79,7 +88,8 @@ class Demonstrations:
         windows = []
         for index in range(len(self)) if episodes is None else episodes:
             first, last = int(self.starts[index]), int(self.starts[index + 1]) - 1
-            earliest, end = first - (n_obs_steps - 1), last + 1 - horizon + n_action_steps
+            earliest = first + int(self.driven[index]) - (n_obs_steps - 1)
+            end = last + 1 - horizon + n_action_steps
             begin = torch.arange(earliest, max(earliest, end))
             windows.append((begin[:, None] + torch.arange(horizon)).clamp(first, last))
         rows = torch.cat(windows) if windows else torch.empty(0, horizon, dtype=torch.int64)
@@ -150,18 +160,41 @@ def read_demos(
         episodes = [
             _read_episode(f"{path}, {name}", reader, data, name, state_keys, convert) for name in names
         ]
-        lengths = [len(action) for _, action in episodes]
+        lengths = [len(action) for _, action, _ in episodes]
         steps = dict(zip(names, lengths, strict=True))
         images = {
             ("observation", name): read_images(path, data, steps, key, image_folder)
             for name, key in (cameras or {}).items()
         }
-    widths = sorted({(state.shape[1], action.shape[1]) for state, action in episodes})
+    widths = sorted({(state.shape[1], action.shape[1]) for state, action, _ in episodes})
     if len(widths) > 1:
         raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
-    state, action = (torch.from_numpy(np.concatenate(part)) for part in zip(*episodes, strict=True))
+    states, actions, driven = zip(*episodes, strict=True)
+    state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
     data = TensorDict({keys.STATE: state, keys.ACTION: action, **images}, batch_size=[len(state)])
-    return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0))
+    return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0), torch.tensor(driven))
+
+
+def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """Lay several sets of demonstrations end to end, in memory, such as those of DAgger's rounds.
+
+    Raises:
+        ValueError: if there is none, or they differ in what they observe or in sizes.
+    """
+    shapes = sorted(
+        {str({key: part.data[key].shape[1:] for key in part.data.keys(True, True)}) for part in parts}
+    )
+    if len(shapes) != 1:
+        raise ValueError(
+            f"demos: expected one set of observations and sizes, got {'; '.join(shapes) or 'none'}"
+        )
+    if len(parts) == 1:
+        return parts[0]
+    lengths = torch.cat([part.starts.diff() for part in parts])
+    starts = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+    return Demonstrations(
+        torch.cat([part.data for part in parts]), starts, torch.cat([part.driven for part in parts])
+    )
 
 
 def _read_episode(
@@ -171,12 +204,15 @@ def _read_episode(
     name: str,
     state_keys: Sequence[str],
     convert: Callable[[str, np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32, and how many steps were driven."""
     demo, length = open_demo(where, data, name)
+    driven = count_attribute(where, demo, "driven") if "driven" in demo.attrs else 0
+    if not 0 <= driven <= length:
+        raise ValueError(f"{where}, driven: expected 0 to {length} steps, got {driven}")
     action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
     state = [reader.numbers(where, demo, f"obs/{key}", length) for key in state_keys]
-    return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32)
+    return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32), driven
 
 
 def _absolute_poses(where: str, pose: np.ndarray, control: RecordedControl | None) -> np.ndarray:

@@ -18,7 +18,7 @@ from torchrl_sparse.envs.experts.operators import OPERATORS, draw_operator
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.simulator import controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask, StateTask
-from torchrl_sparse.rotations import pose_to_absolute
+from torchrl_sparse.rotations import absolute_to_pose, pose_to_absolute
 
 __all__ = ["Demonstrator", "RobosuiteDemonstrator", "StateDemonstrator", "StateExpert"]
 
@@ -41,11 +41,17 @@ class Demonstrator(Protocol):
     def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
         """Return the simulator's state, f64 [S], and the observations by name, each f64 [n], before an action."""
 
-    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
-        """Return the action that the expert means and the one that is executed, as they are recorded."""
+    def label(self, present: TensorDictBase) -> np.ndarray:
+        """Return the action that the expert means in this state, whoever led there, as it is recorded."""
+
+    def disturb(self, clean: np.ndarray) -> np.ndarray:
+        """Return what is executed, as it is recorded, where the expert means ``clean`` and acts itself."""
 
     def command(self, executed: np.ndarray) -> np.ndarray:
         """Convert a recorded action to the environment's."""
+
+    def recorded(self, command: np.ndarray) -> np.ndarray:
+        """Convert an action of the environment to what is recorded of it."""
 
 
 class RobosuiteDemonstrator:
@@ -76,15 +82,21 @@ class RobosuiteDemonstrator:
         observed = self._env.raw_observation(self._env.recorded_keys)
         return self._env.sim_env.sim.get_state().flatten(), observed
 
-    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
-        """See `Demonstrator.act`; f64 [7 * arms] each."""
-        clean = self._expert.command()
-        hands = np.stack([self._expert.hand(arm).position for arm in self._arms])
-        return clean, self._disturb(clean, hands)
+    def label(self, present: TensorDictBase) -> np.ndarray:
+        """See `Demonstrator.label`; f64 [7 * arms]."""
+        return self._expert.command()
+
+    def disturb(self, clean: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.disturb`; f64 [7 * arms]."""
+        return self._disturb(clean, np.stack([self._expert.hand(arm).position for arm in self._arms]))
 
     def command(self, executed: np.ndarray) -> np.ndarray:
         """See `Demonstrator.command`."""
         return pose_to_absolute(executed)
+
+    def recorded(self, command: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.recorded`."""
+        return absolute_to_pose(command)
 
     @staticmethod
     def env_args(task: RobosuiteTask) -> dict[str, Any]:
@@ -150,15 +162,22 @@ class StateDemonstrator:
         state = _state(present)
         return state, {"state": state}
 
-    def act(self, present: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
-        """See `Demonstrator.act`; f64 [A] each."""
-        clean = self._expert.command(_state(present))
+    def label(self, present: TensorDictBase) -> np.ndarray:
+        """See `Demonstrator.label`; f64 [A]."""
+        return self._expert.command(_state(present))
+
+    def disturb(self, clean: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.disturb`; f64 [A]."""
         self._noise = next_noise(self._noise, self._rng)
-        return clean, clean + self._expert.noise * self._noise
+        return clean + self._expert.noise * self._noise
 
     def command(self, executed: np.ndarray) -> np.ndarray:
         """See `Demonstrator.command`."""
         return executed
+
+    def recorded(self, command: np.ndarray) -> np.ndarray:
+        """See `Demonstrator.recorded`."""
+        return command
 
     @staticmethod
     def env_args(task: StateTask) -> dict[str, Any]:

@@ -12,11 +12,12 @@ _WIDTH = 0.05  # m, the can's diameter
 _WALLS = 0.92  # m, the can's height from which it may travel sideways
 _CARRY = 0.13  # m over the place of release
 _PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
+_BESIDE = 0.07  # m from a wall across y, within which open fingers that move along y would meet it; no episode begins there
 _RELEASE = 0.12  # m over the bin's floor, the can's height when let go: half of it below the walls' top
 
 
 class PickPlaceCanExpert(Expert):
-    """Grasps the can upright with an unturned hand, or across its axis where it has toppled."""
+    """Grasps the can upright with an unturned hand, a turned one beside a wall, or across its axis where it has toppled."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -42,11 +43,17 @@ class PickPlaceCanExpert(Expert):
     def _grasp_pose(self, hand: Hand, can: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axis = rotation[:, 2]
         if abs(axis[2]) > 0.7:
-            aligned = downward(0.0)
+            aligned = downward(nearest(np.pi / 2, hand.yaw, np.pi) if self._beside_wall(can) else 0.0)
             return can + np.array([0.0, 0.0, 0.012]) + self.style.offset * aligned[:, 1], aligned
         # Fingers move along the world's y axis at yaw 0; across a lying can, square to the can's own axis.
         aligned = downward(nearest(np.arctan2(axis[1], axis[0]), hand.yaw, np.pi))
         return can + self.style.offset * aligned[:, 1], aligned
+
+    def _beside_wall(self, can: np.ndarray) -> bool:
+        """Tell whether the can stands near a wall across y, of either bin or in the middle of the second."""
+        first, second, half = self.sim_env.bin1_pos[1], self.sim_env.bin2_pos[1], self.sim_env.bin_size[1] / 2
+        walls = np.array([first - half, first + half, second - half, second, second + half])
+        return bool(np.abs(can[1] - walls).min() < _BESIDE)
 
     def _carry(self, hand: Hand, can: np.ndarray) -> Waypoint:
         place = np.array([*(self._bin[:2] + _PLACE), self._bin[2] + _RELEASE])

@@ -1,0 +1,147 @@
+"""DAgger for policies that act in chunks: the policy drives, the expert takes over from where that led and finishes.
+
+DAgger (arXiv:1011.0686) visits states under the mixture ``beta * expert + (1 - beta) * policy``, drawn at every step, asks the
+expert for one action in each of them, and trains on all. A policy that acts in chunks needs more than that: its target in a
+state are the H actions that the expert would take from there on. Labels along a path that the policy drives are not those.
+Each is right where it is given, but none follows from the one before, and an absolute pose, which aims a step ahead of the
+hand, would follow the policy's hand. So the mixture is drawn once a query, and who takes over stays: before each query after
+the first the expert takes over with probability ``mixing``, and at the latest half-way to the horizon, which leaves it an
+episode's time. From there on an episode is a demonstration, disturbed like any other, that begins at a query of the policy's.
+HG-DAgger (arXiv:1810.02890) hands over like that, where a person finds it necessary; here chance does, so that the states are
+those that the policy visits, its failures among them. With rounds, each driven by the policy of the round before, ``mixing``
+falls, which lets the policy drive longer.
+
+Steps that the policy drove stay in the file: they are the history of the first queries, and an episode can be replayed from its
+start. Their label is the expert's action in that state. No window has its present among them (`Demonstrations.window_rows`).
+Episodes that the policy solves before the expert takes over teach nothing, and those that the expert does not solve teach what
+fails: both are dropped and counted. An expert that plans ahead, as Push-T's does, first ends the plan that it last made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDictBase
+
+from torchrl_sparse import keys
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.envs.conventions import source_convention
+from torchrl_sparse.envs.for_policy import observed_keys
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.methods.diffusion import make_method
+from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+
+__all__ = ["Driver", "Driving", "load_driver"]
+
+# Keeps the moment of taking over apart from the operator's random numbers and the initial state's, of the same seed.
+_TAKE_OVER_STREAM = 2
+
+
+@dataclass(frozen=True)
+class Driving:
+    """Who drives before the expert does, and for how long.
+
+    Attributes:
+        policy: folder of a `DiffusionPolicy` that observes the task's state as demonstrations record it.
+        fingerprint: of its weights, so that a collection is not continued with others.
+        method: how it is sampled, see `torchrl_sparse.methods.diffusion`; none that needs a calibration.
+        n_action_steps: actions executed of a chunk.
+        mixing: probability that the expert takes over before a query that is not the episode's first.
+
+    Raises:
+        ValueError: if a value is out of its range.
+    """
+
+    policy: str
+    fingerprint: str
+    method: str = "dense"
+    n_action_steps: int = 8
+    mixing: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.n_action_steps < 1:
+            raise ValueError(f"n_action_steps: expected at least 1, got {self.n_action_steps}")
+        if not 0 <= self.mixing <= 1:
+            raise ValueError(f"mixing: expected a probability, got {self.mixing}")
+
+    def draw_steps(self, seed: int, longest: int) -> int:
+        """Draw how many steps the policy drives in the episode of a seed, ``longest`` at most.
+
+        >>> driving = Driving("assets/lift", "", mixing=0.5)
+        >>> [driving.draw_steps(seed, 100) for seed in range(4)]
+        [8, 8, 24, 8]
+        """
+        if not self.mixing:
+            return longest
+        queries = int(np.random.default_rng([seed, _TAKE_OVER_STREAM]).geometric(self.mixing))
+        return min(queries * self.n_action_steps, longest)
+
+
+class Driver:
+    """Drives the first steps of an episode.
+
+    Args:
+        driving: decides how many.
+        actor: the policy's executor.
+
+    Examples:
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> driver = load_driver("lift", Driving("assets/lift", policy.fingerprint, "ddim2", mixing=1.0))
+        >>> env = find_task("lift").make(seeds=[0])  # doctest: +SKIP
+        >>> driver.begin(0, env), driver.act(env.reset()).shape  # doctest: +SKIP
+        (8, (10,))
+    """
+
+    def __init__(self, driving: Driving, actor: ChunkExecutor):
+        self._driving, self._actor = driving, actor
+
+    def begin(self, seed: int, env: Any) -> int:
+        """Begin the episode of a seed; return how many of its steps the policy drives, half of the environment's at most."""
+        self._actor.reset(seed)
+        return self._driving.draw_steps(seed, env.horizon // 2)
+
+    def act(self, present: TensorDictBase) -> np.ndarray:
+        """Return the environment's action, f64 [A], for this step."""
+        return self._actor.act({"state": present[keys.STATE].numpy()}).astype(np.float64)
+
+
+@cache
+def load_driver(task: str, driving: Driving) -> Driver:
+    """Load the policy that drives, once in a process.
+
+    Raises:
+        FileNotFoundError, ValueError: if it cannot be read, is of other weights than ``driving`` says or of another task,
+            observes anything but the task's state, or the method is unknown or needs a calibration.
+    """
+    path = Path(driving.policy)
+    policy = DiffusionPolicy.from_pretrained(path)
+    _check_policy(task, policy, driving)
+    method = make_method(
+        driving.method,
+        policy,
+        num_updates=1,
+        planners=path.with_suffix("") if path.suffix == ".ckpt" else path,
+        calibration=_refuse_calibration,
+    )
+    return Driver(driving, ChunkExecutor(method, driving.n_action_steps))
+
+
+def _check_policy(task: str, policy: DiffusionPolicy, driving: Driving) -> None:
+    if policy.fingerprint != driving.fingerprint:
+        raise ValueError(
+            f"policy: expected the weights {driving.fingerprint} in {driving.policy}, got {policy.fingerprint}"
+        )
+    seen, recorded = observed_keys(task, policy), find_task(task).state_keys
+    if policy.vision is not None or seen != recorded or source_convention(policy.source) != "1.5":
+        raise ValueError(
+            f"policy: expected one that observes {', '.join(recorded)} as demonstrations record them, "
+            f"got {driving.policy}"
+        )
+
+
+def _refuse_calibration() -> Any:
+    raise ValueError("method: expected one that needs no calibration while demonstrations are collected")
