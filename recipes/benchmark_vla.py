@@ -3,8 +3,7 @@
     python recipes/benchmark_vla.py policy=runs/vla_lift_named/policy methods=[dense,specprune,fastv@specprune]
     python recipes/benchmark_vla.py policy=FOLDER_OF_OPENVLA_OFT task=libero_spatial split=test episodes=500 num_envs=10
 
-Needs a GL library, and for LIBERO the extra libero, see `torchrl_sparse.envs.libero`. Kill it and run it again to go on:
-finished episodes are read from OUT/episodes.
+Needs a GL library, and for LIBERO the extra libero. Kill it and run it again to go on: finished episodes are in OUT/episodes.
 """
 
 from __future__ import annotations
@@ -58,8 +57,7 @@ def main(config: DictConfig) -> None:
     make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     design = make_design(config.until, config.episodes, config.max_episodes)
     seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
-    horizon = episode_horizon(make_env, seeds)
-    terms = Terms(design, horizon, task.early_cut, config.margin, config.time_margin)
+    terms = Terms(design, episode_horizon(make_env, seeds), task.early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}
     recorded = record_methods(methods, dense, make_env, **probed, settings=options)
@@ -110,8 +108,7 @@ def main(config: DictConfig) -> None:
         film_tokens(video, actors[name], make_env, seeds[0], out)
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}")
-    print(f"\nFiles are in {out}")
+    print(f"\n{format_table(results)}\n\nFiles are in {out}")
 
 
 def load_policy(config: DictConfig) -> VLAPolicy:

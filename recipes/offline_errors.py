@@ -91,13 +91,8 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
         if results.task != task:
             raise ValueError(f"results: {path}: expected a table of {task}, got one of {results.task}")
         found = outcomes(results).items()
-        played[path] = {name: outcome for name, outcome in found if answers_alone(MethodName.parse(name))}
+        played[path] = {name: outcome for name, outcome in found if MethodName.parse(name).asked_as_usual}
     return played
-
-
-def answers_alone(name: MethodName) -> bool:
-    """True for methods whose episodes follow from their answers, not from how often or for how many they are asked."""
-    return name.every is None and name.samples == 1
 
 
 def no_calibration() -> Any:

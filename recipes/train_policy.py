@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.data.robomimic import Demonstrations, join_demos, read_demos
+from torchrl_sparse.data.robomimic import read_all_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -45,7 +45,16 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
     config.network = with_published(config.task, config.network)
     config.train = with_published(config.task, config.train)
-    task, cameras, demos = find_task(config.task), chosen_cameras(config.cameras), read_all(config)
+    task, cameras = find_task(config.task), chosen_cameras(config.cameras)
+    demos = read_all_demos(
+        config.demos,
+        task.proprioception_keys if cameras else task.state_keys,
+        filter_key=config.filter_key,
+        cameras=cameras,
+        image_folder=Path(config.out) / "images",
+        poses=task.acts_in_poses,
+        task=task.name,
+    )
     if config.init is None:
         policy = untrained_policy(
             demos,
@@ -68,26 +77,6 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
     )
     return trainer
-
-
-def read_all(config: DictConfig) -> Demonstrations:
-    """Read the demonstrations of a file, or of several."""
-    task, cameras = find_task(config.task), chosen_cameras(config.cameras)
-    paths = [config.demos] if isinstance(config.demos, str) else list(config.demos)
-    if cameras and len(paths) > 1:
-        raise ValueError(
-            f"demos: expected one file with cameras, whose images are streamed, got {len(paths)}"
-        )
-    read = partial(
-        read_demos,
-        state_keys=task.proprioception_keys if cameras else task.state_keys,
-        filter_key=config.filter_key,
-        cameras=cameras,
-        image_folder=Path(config.out) / "images",
-        poses=task.acts_in_poses,
-        task=task.name,
-    )
-    return join_demos([read(path) for path in paths])
 
 
 def export(trainer: PolicyTrainer, config: DictConfig) -> Path:

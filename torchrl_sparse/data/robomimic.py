@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -28,7 +29,7 @@ from torchrl_sparse.data.images import read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
-__all__ = ["Demonstrations", "join_demos", "read_demos"]
+__all__ = ["Demonstrations", "join_demos", "read_all_demos", "read_demos"]
 
 
 @dataclass(frozen=True)
@@ -173,6 +174,24 @@ def read_demos(
     state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
     data = TensorDict({keys.STATE: state, keys.ACTION: action, **images}, batch_size=[len(state)])
     return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0), torch.tensor(driven))
+
+
+def read_all_demos(paths: str | Sequence[str], state_keys: Sequence[str], **options: Any) -> Demonstrations:
+    """Read the demonstrations of a file, or of several, see `join_demos`.
+
+    Args:
+        paths: of the files.
+        state_keys, options: of `read_demos`.
+
+    Raises:
+        ValueError: as `read_demos` and `join_demos`, and for several files with cameras.
+    """
+    paths = [paths] if isinstance(paths, str) else list(paths)
+    if options.get("cameras") and len(paths) > 1:
+        raise ValueError(
+            f"demos: expected one file with cameras, whose images are streamed, got {len(paths)}"
+        )
+    return join_demos([read_demos(path, state_keys, **options) for path in paths])
 
 
 def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:

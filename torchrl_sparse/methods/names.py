@@ -34,6 +34,11 @@ class MethodName:
     every: int | None = None
     samples: int = 1
 
+    @property
+    def asked_as_usual(self) -> bool:
+        """True where episodes follow from the method's answers, not from how often or for how many it is asked."""
+        return self.every is None and self.samples == 1
+
     @classmethod
     def parse(cls, text: str) -> MethodName:
         """Raise ValueError unless ``text`` is written as above.
