@@ -93,3 +93,10 @@ def test_they_are_kept_and_drawn(results, tmp_path):
     path = save_offline(results, tmp_path / "offline_errors_Lift.json")
     assert load_offline(path) == results
     assert plot_offline(results, "a.json", tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_a_task_done_by_degrees_comes_to_its_scores():
+    results = load_results("assets/pusht/results.json")
+    found, entry = outcomes(results)["ddpm2_logsnr"], results.methods["ddpm2_logsnr"]
+    assert found.success == entry.score.mean - results.dense.score.mean < -0.3
+    assert abs(entry.success.rate - results.dense.success.rate) < 0.02

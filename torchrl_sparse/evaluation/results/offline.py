@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults
+from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
 from torchrl_sparse.evaluation.statistics.ranks import rank_correlation
 from torchrl_sparse.storage.json import read_json, write_json
@@ -79,13 +79,17 @@ def save_offline(results: OfflineResults, path: str | os.PathLike) -> Path:
 
 
 def outcomes(results: AnyResults) -> dict[str, Outcome]:
-    """Return what the methods of a table came to, but for dense itself."""
+    """Return what the methods of a table came to, but for dense itself; of a task done by degrees, in their scores."""
     dense = results.dense
     return {
-        name: Outcome(entry.success.rate - dense.success.rate, entry.episode_length / dense.episode_length)
+        name: Outcome(_reached(entry) - _reached(dense), entry.episode_length / dense.episode_length)
         for name, entry in results.methods.items()
         if name not in _SELF
     }
+
+
+def _reached(entry: MethodEntry1) -> float:
+    return entry.score.mean if entry.score else entry.success.rate
 
 
 def error_rows(results: OfflineResults) -> list[dict[str, str]]:
