@@ -96,7 +96,7 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
 def test_a_policy_drives_and_is_trained_on_with_what_it_was_taught(work, demos, policy):
     driven = (f"policy={policy}", "method=ddim2", "mixing=1", f"out={work}/driven.h5")
     assert "kept 2" in run("collect_demos", "task=lift", "episodes=2", "seed=9", *driven)
-    options = (f"init={policy}", f"out={work}/taught", "max_steps=2", "batch_size=8", "train.val_ratio=0")
+    options = (f"init={policy}", f"out={work}/driven", "max_steps=2", "batch_size=8", "train.val_ratio=0")
     output = run("train_policy", f"demos=[{demos},{work}/driven.h5]", *options)
     assert "4 demonstrations" in output
     refused = run("collect_demos", f"policy={policy}", "mixing=2", f"out={work}/no.h5", expect=2)

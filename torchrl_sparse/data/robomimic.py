@@ -226,11 +226,11 @@ def _read_episode(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32, and how many steps were driven."""
     demo, length = open_demo(where, data, name)
+    action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
+    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in state_keys]
     driven = count_attribute(where, demo, "driven") if "driven" in demo.attrs else 0
     if not 0 <= driven <= length:
         raise ValueError(f"{where}, driven: expected 0 to {length} steps, got {driven}")
-    action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
-    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in state_keys]
     return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32), driven
 
 
