@@ -38,10 +38,8 @@ class CameraSlot:
             or not can_pack_vision(vision)
         ):
             return vision
-        watch, (known, packed) = (
-            self._watch,
-            self._made,
-        )  # read and replaced in one go: other threads may do the same
+        # Read and replaced in one go: other threads may do the same.
+        watch, (known, packed) = self._watch, self._made
         if watch is None or watch.network is not vision:
             watch = self._watch = WeightWatch(vision)
         state = id(vision), watch.state()

@@ -242,10 +242,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
                 None nor a `WarmStart`; nothing is written.
         """
-        warm, rounds = (
-            stored_start(self.start),
-            self.engine if self.engine in get_args(RoundedEngine) else None,
-        )
+        warm = stored_start(self.start)
+        rounds = self.engine if self.engine in get_args(RoundedEngine) else None
         kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm, rounds
         write_pretrained(
             Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
