@@ -1,5 +1,7 @@
 """The table of options knows those of every recipe, and says what each may be."""
 
+from pathlib import Path
+
 import hydra
 import pytest
 from omegaconf import OmegaConf
@@ -97,3 +99,12 @@ def test_what_cannot_mean_anything_is_refused(recipe, override, message):
 )
 def test_what_pages_show_is_taken(recipe, override):
     check_options(recipe, options(recipe, override))
+
+
+def test_the_shipped_policy_is_found_from_any_folder_and_one_that_is_here_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = OmegaConf.create({"policy": "${shipped:assets/lift}", "none": "${shipped:assets/nope}"})
+    assert (Path(shipped.policy) / "config.json").is_file()
+    assert shipped.none == "assets/nope"
+    (tmp_path / "assets" / "lift").mkdir(parents=True)
+    assert shipped.policy == "assets/lift"

@@ -49,7 +49,7 @@ def fail(monkeypatch, capsys):
             ["quality=nope"],
             "quality: expected one of proficient, recovering, mixed for Lift, got 'nope'",
         ),
-        ("convert_robomimic", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
+        ("convert_robomimic", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
         (
             "benchmark_vla",
@@ -69,7 +69,7 @@ def fail(monkeypatch, capsys):
         ("train_pruner", ["method=l2c", "spread=1"], "spread: expected null with an init or without"),
         ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
-        ("train_policy", ["demos=nope.h5"], "demonstrations: no file nope.h5"),
+        ("train_policy", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
     ],
 )

@@ -43,5 +43,5 @@ def test_older_files_have_none(tmp_path):
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="demonstrations: no file"):
+    with pytest.raises(FileNotFoundError, match="expected a file of demonstrations, got none"):
         read_instructions(tmp_path / "demos.h5")

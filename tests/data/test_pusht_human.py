@@ -97,5 +97,5 @@ def test_damaged_files_are_refused(source, tmp_path, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"demonstrations: no file .*none\.npz"):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a file of demonstrations, got none"):
         convert_pusht(tmp_path / "none.npz", tmp_path / "human.h5")

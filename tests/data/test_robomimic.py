@@ -191,7 +191,7 @@ def test_file_without_demonstrations_and_missing_file(tmp_path):
         file.create_group("data")
     with pytest.raises(ValueError, match="expected groups data/demo_<number>"):
         read_demos(tmp_path / "empty.h5", STATE_KEYS)
-    with pytest.raises(FileNotFoundError, match=r"no file .*nowhere\.h5"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.h5: expected a file of demonstrations, got none"):
         read_demos(tmp_path / "nowhere.h5", STATE_KEYS)
 
 

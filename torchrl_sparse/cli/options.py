@@ -234,10 +234,11 @@ OPEN_SECTIONS = ("specprune", "options", "controller", "train_vla.network")
 
 # ${folder:PATH} in a yaml: where what is made of PATH lies, the folder itself or, beside a file.ckpt, that named `file`
 OmegaConf.register_new_resolver("folder", lambda path: path and path.removesuffix(".ckpt"), replace=True)
-# ${shipped:assets/lift}: that folder, or the one that a wheel brought where there is none here
+# ${shipped:assets/lift}: that folder, or where there is none here the one that a wheel brought, or the repository's
+_ROOTS = (Path(), _PACKAGE, _PACKAGE.parent)
 OmegaConf.register_new_resolver(
     "shipped",
-    lambda path: next((str(at) for at in (Path(path), _PACKAGE / path) if at.exists()), path),
+    lambda path: next((str(root / path) for root in _ROOTS if (root / path).exists()), path),
     replace=True,
 )
 

@@ -31,7 +31,7 @@ def open_demos(path: str | Path) -> Iterator[h5py.File]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"demonstrations: no file {path}")
+        raise FileNotFoundError(f"{path}: expected a file of demonstrations, got none")
     try:
         file = h5py.File(path, "r")
     except OSError as error:

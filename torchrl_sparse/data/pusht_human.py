@@ -82,7 +82,7 @@ def _observations(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
-        raise FileNotFoundError(f"demonstrations: no file {path}")
+        raise FileNotFoundError(f"{path}: expected a file of demonstrations, got none")
     if not is_zipfile(path):
         raise ValueError(f"{path}: expected a complete npz file, got another or a part of one")
     with np.load(path, allow_pickle=False) as file:

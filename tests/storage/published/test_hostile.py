@@ -262,7 +262,7 @@ def test_foreign_files(tmp_path):
     ):
         with pytest.raises(CheckpointError, match=f"{name}: .*{message}"):
             DiffusionPolicy.from_diffusion_policy(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match=r"expected a file .*nowhere\.ckpt"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.ckpt: expected a checkpoint, got no file"):
         DiffusionPolicy.from_diffusion_policy(tmp_path / "nowhere.ckpt")
 
 

@@ -36,7 +36,7 @@ def read_diffusion_policy(path: str | Path) -> StoredPolicy:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"checkpoint: expected a file {path}")
+        raise FileNotFoundError(f"{path}: expected a checkpoint, got no file")
     with naming_faults(path), TorchArchive(path) as archive:
         return _read(archive)
 
