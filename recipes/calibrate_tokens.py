@@ -1,10 +1,11 @@
-"""Pick SpecPrune's alpha for a task: the smallest within a tolerance of the dense policy, in action error or in success.
+"""Pick how many visual tokens a method keeps for a task: the fewest within a tolerance of the dense policy.
 
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla tolerance=0.02
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla demos=data/lift_named_images.h5   # without rendering
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla measure=success tolerance=0.05
+    python recipes/calibrate_tokens.py task=lift_named policy=assets/vla method=fastv   # a baseline, by the same rule
 
-Writes ``out``, which `TokenBudget.from_pretrained` reads, and a figure beside it.
+Writes ``out``, which `TokenBudget.from_pretrained` reads, and a figure beside it; prints the method as benchmark_vla takes it.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
+from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget, fewest_tokens, numbered_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.tokens.budget import BudgetPoint, TokenBudget, smallest_alpha
-from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.training.vla.token_budget import (
     demonstrated_queries,
     measure_errors,
@@ -38,6 +39,8 @@ from torchrl_sparse.training.vla.token_budget import (
 )
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
+Pruners = dict[float, TokenPruner]
+
 
 @recipe("calibrate_tokens", out="file")
 def main(config: DictConfig) -> None:
@@ -45,22 +48,22 @@ def main(config: DictConfig) -> None:
     if config.measure not in measures:
         raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
     published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
+    tried = pruners(config)  # first, since what it refuses need not be recorded
     policy = VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
-    points = tuple(measures[config.measure](policy, config))
+    points = tuple(measures[config.measure](policy, tried, config))
     for point in points:
-        print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
-    alpha = smallest_alpha(points, config.tolerance)
-    budget = TokenBudget(
-        config.preset, alpha, config.measure, config.tolerance, points, OmegaConf.to_container(config.options)
-    )
+        print(f"{config.method}@{point.number:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
+    number = fewest_tokens(points, config.tolerance)
+    settings = OmegaConf.to_container(config.options)
+    budget = TokenBudget(config.method, number, config.measure, config.tolerance, points, settings)
     out = Path(config.out)
     budget.save_pretrained(out)
     plot_token_budget(budget, out.with_suffix(".png"))
-    print(f"{out}: alpha {alpha:g}, {config.measure} within {config.tolerance:g} of dense")
+    print(f"{out}: {config.method}@{number:g}, {config.measure} within {config.tolerance:g} of dense")
 
 
-def errors(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
-    """Measure the action error of each alpha, on the same recorded queries."""
+def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
+    """Measure the action error at each number, on the same recorded queries."""
     if config.demos is not None:
         recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps)
     else:
@@ -70,18 +73,19 @@ def errors(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
     recorded = islice(recorded, config.episodes)
     episodes = [*tqdm(recorded, total=config.episodes, unit="episode", desc="recording")]
     with tqdm(total=len(episodes), unit="episode", desc="replaying") as bar:
-        return measure_errors(policy, episodes, pruners(config), config.n_action_steps, bar.update)
+        return measure_errors(policy, episodes, tried, config.n_action_steps, bar.update)
 
 
-def lost_episodes(policy: VLAPolicy, config: DictConfig) -> list[BudgetPoint]:
-    """Measure the success that each alpha loses to the dense policy, on the same initial states."""
+def lost_episodes(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
+    """Measure the success that each number loses to the dense policy, on the same initial states."""
     make_actor, make = partial(executor, config=config), environment(policy, config)
-    with tqdm(total=(1 + len(config.alphas)) * config.episodes, unit="episode") as bar:
-        return measure_success(policy, make_actor, make, seeds(config), pruners(config), bar.update)
+    with tqdm(total=(1 + len(tried)) * config.episodes, unit="episode") as bar:
+        return measure_success(policy, make_actor, make, seeds(config), tried, bar.update)
 
 
-def pruners(config: DictConfig) -> list[SpecPrune]:
-    return [SpecPrune(config.preset, alpha=alpha, **config.options) for alpha in config.alphas]
+def pruners(config: DictConfig) -> Pruners:
+    options = OmegaConf.to_container(config.options)
+    return {number: numbered_pruner(config.method, number, options) for number in config.numbers}
 
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:

@@ -35,6 +35,7 @@ from .evaluation import (
 from .methods import (
     METHODS as METHODS,
     Method as Method,
+    TokenBudget as TokenBudget,
     make_method as make_method,
 )
 from .networks import (
@@ -56,7 +57,6 @@ from .tokens import (
     RandomPruner as RandomPruner,
     SparseVLMPruner as SparseVLMPruner,
     SpecPrune as SpecPrune,
-    TokenBudget as TokenBudget,
     TokenPruner as TokenPruner,
     VLACachePruner as VLACachePruner,
 )

@@ -28,11 +28,11 @@ from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResul
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import make_controller, make_method
+from torchrl_sparse.methods.token_budget import TokenBudget
 from torchrl_sparse.methods.vla import TokenMethodName, make_controller as make_token_controller, make_pruner
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.json import to_plain
-from torchrl_sparse.tokens.budget import TokenBudget
 
 __all__ = [
     "EpisodeResult",

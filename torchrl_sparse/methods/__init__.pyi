@@ -7,6 +7,10 @@ from .diffusion import (
     make_controller as make_controller,
     make_method as make_method,
 )
+from .token_budget import (
+    BudgetPoint as BudgetPoint,
+    TokenBudget as TokenBudget,
+)
 from .vla import (
     TOKEN_METHODS as TOKEN_METHODS,
     TokenMethod as TokenMethod,

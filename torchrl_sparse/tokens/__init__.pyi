@@ -1,8 +1,4 @@
 from .base import TokenPruner as TokenPruner
-from .budget import (
-    BudgetPoint as BudgetPoint,
-    TokenBudget as TokenBudget,
-)
 from .dense_first import DenseFirst as DenseFirst
 from .efficientvla import (
     EfficientVLAPruner as EfficientVLAPruner,

@@ -12,11 +12,11 @@ from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, later, make_policy,
 from tests.training.vla.rendered import write_demos
 from torchrl_sparse import ChunkExecutor, keys
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.methods.token_budget import TokenBudget
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.tokens.budget import TokenBudget
 from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.token_budget import (
     demonstrated_queries,
@@ -57,16 +57,16 @@ def test_replaying_is_what_a_rollout_does():
 def test_errors_are_those_of_the_executed_actions_after_the_first_query():
     policy, queries = make_policy(), episode()
     tight, whole = measure_errors(
-        policy, [queries, queries[:1]], [pruner(0.2), pruner(1.0)], n_action_steps=1
+        policy, [queries, queries[:1]], {number: pruner(number) for number in (0.2, 1.0)}, n_action_steps=1
     )
     answers = (replay(policy, queries, method)[keys.CHUNK] for method in (None, pruner(0.2)))
     dense, pruned = (policy.normalizer.normalize_action(chunks)[1:, :1] for chunks in answers)
     assert tight.loss == pytest.approx((pruned - dense).abs().mean().item())
     assert tight.loss > 0 == whole.loss
     assert tight.kept < whole.kept == CONFIG.num_visual
-    assert (tight.alpha, whole.alpha) == (0.2, 1.0)
+    assert (tight.number, whole.number) == (0.2, 1.0)
     with pytest.raises(ValueError, match=r"expected one with at least two queries, got \[1, 1\]"):
-        measure_errors(policy, [queries[:1]] * 2, [pruner(0.2)], n_action_steps=1)
+        measure_errors(policy, [queries[:1]] * 2, {0.2: pruner(0.2)}, n_action_steps=1)
 
 
 def test_queries_of_demonstrations_begin_with_each_episode():
@@ -82,7 +82,7 @@ def test_queries_of_demonstrations_begin_with_each_episode():
     assert [[int(td[keys.IMAGE][0, 0, 0]) for td in queries] for queries in found] == [[0, 2], [3, 5]]
     assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False]] * 2
     assert [queries[1][keys.INSTRUCTION] for queries in found] == ["up", "down"]
-    assert measure_errors(make_policy(), found, [pruner(0.2)], 1)[0].kept < CONFIG.num_visual
+    assert measure_errors(make_policy(), found, {0.2: pruner(0.2)}, 1)[0].kept < CONFIG.num_visual
 
 
 def toy_env(seeds):
@@ -112,30 +112,32 @@ def test_success_is_compared_with_dense_on_the_same_seeds():
         made.append(policy.pruner)
         return ChunkExecutor(policy, 2)
 
-    made, pruners = [], [SpecPrune(alpha=0.25, budget=4), SpecPrune(budget=4)]
+    made, pruners = [], {0.25: SpecPrune(alpha=0.25, budget=4), 1.0: SpecPrune(budget=4)}
     points = measure_success(toy_policy(), make_actor, toy_env, [0, 1], pruners)
-    assert made == [None, *pruners]
-    assert [(point.alpha, point.loss) for point in points] == [(0.25, 0), (1.0, 0)]  # none ever succeeds
+    assert made == [None, *pruners.values()]
+    assert [(point.number, point.loss) for point in points] == [(0.25, 0), (1.0, 0)]  # none ever succeeds
     assert points[0].kept < points[1].kept <= 4
 
 
-def test_the_recipe_calibrates_from_a_demonstration_file(tmp_path):
+@pytest.mark.parametrize("method", ["specprune", "fastv_dense_first"])
+def test_the_recipe_calibrates_from_a_demonstration_file(tmp_path, method):
     torch.manual_seed(0)
     sizes = {"image_size": 56, "state_dim": 9, "action_dim": 10, "llm": TransformerSize(32, LAYERS, 2, 64)}
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny(**sizes)), tokenizer=WordTokenizer(["red"]))
     policy.save_pretrained(tmp_path / "policy")
     demos = write_demos(tmp_path / "images.h5", image_size=56)
     options = (
-        "alphas=[0.1,0.3]",
+        f"method={method}",
+        "numbers=[0.1,0.3]",
         "tolerance=2",
         "episodes=2",
         "n_action_steps=2",
         f"policy={tmp_path}/policy",
     )
     run("calibrate_tokens", f"demos={demos}", *options)
-    budget = TokenBudget.from_pretrained(tmp_path / "policy" / "specprune.json")
-    assert budget.alpha == 0.1
-    assert [point.alpha for point in budget.points] == [0.1, 0.3]
+    budget = TokenBudget.from_pretrained(tmp_path / "policy" / f"{method}.json")
+    assert (budget.method, budget.number) == (method, 0.1)
+    assert [point.number for point in budget.points] == [0.1, 0.3]
     assert budget.points[0].kept < budget.points[1].kept
     policy.pruner = budget.pruner()
-    assert iio.imread(tmp_path / "policy" / "specprune.png").std() > 5
+    assert iio.imread(tmp_path / "policy" / f"{method}.png").std() > 5

@@ -14,10 +14,10 @@ from tqdm import tqdm
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
+from torchrl_sparse.methods.token_budget import TokenBudget
 from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, make_controller, make_pruner
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.policies.vla.policy import VLAPolicy
-from torchrl_sparse.tokens.budget import TokenBudget
 from torchrl_sparse.tokens.efficientvla import SIMILARITY, LayerSimilarity, redundant_layers
 from torchrl_sparse.tokens.selection import check_budget
 from torchrl_sparse.tokens.specprune import SpecPrune
@@ -89,7 +89,7 @@ def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     path, changes = Path(options["policy"]) / "specprune.json", options["specprune"]
     if options["calibrated"] and path.is_file():
         budget = TokenBudget.from_pretrained(path)
-        changes = {"preset": budget.preset, "alpha": budget.alpha, **budget.options, **changes}
+        changes = {"alpha": budget.number, **budget.settings, **changes}
     controller = dict(options["controller"])
     if controller.get("motion") == "commanded":  # whose rule asks whether a chunk is used up
         controller.setdefault("chunk_steps", options["n_action_steps"])

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
-from torchrl_sparse.tokens.budget import TokenBudget
+from torchrl_sparse.methods.token_budget import TokenBudget
 
 __all__ = ["draw_tokens", "plot_control", "plot_token_budget", "plot_token_strip", "plot_tokens_per_layer"]
 
@@ -157,7 +157,7 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
 
 
 def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
-    """Draw what every alpha loses over the tokens that it keeps, with the tolerance and the choice.
+    """Draw what every number loses over the tokens that it keeps, with the tolerance and the choice.
 
     Args:
         budget: calibrated.
@@ -168,9 +168,11 @@ def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
     axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=_SPEED, linewidth=1.8)
     for point in points:
         place = (point.kept, point.loss)
-        axes.annotate(f"{point.alpha:g}", place, (4, 6), textcoords="offset points", fontsize=9)
-        if point.alpha == budget.alpha:
-            axes.plot(*place, "o", color=_QUERY, markersize=11, label=f"chosen: alpha {point.alpha:g}")
+        axes.annotate(f"{point.number:g}", place, (4, 6), textcoords="offset points", fontsize=9)
+        if point.number == budget.number:
+            axes.plot(
+                *place, "o", color=_QUERY, markersize=11, label=f"chosen: {budget.method}@{point.number:g}"
+            )
     axes.axhline(budget.tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
     axes.set_xlabel("visual tokens in a decoder layer, mean")
     axes.set_ylabel("action error" if budget.measure == "action_error" else "success lost")

@@ -1,12 +1,13 @@
-"""Measuring what SpecPrune's budget costs a policy, in action error or in success, to calibrate it; see `tokens.budget`.
+"""Measuring what each number of a token pruner costs a policy, in action error or in success, to calibrate it.
 
-The queries of recorded episodes are answered again under each alpha, in their order, so that what one query leaves for the next
-is there as in a rollout, and their actions are compared with the dense policy's.
+`torchrl_sparse.methods.token_budget` chooses. The queries of recorded episodes are answered again under each number, in their
+order, so that what one query leaves for the next is there as in a rollout, and their actions are compared with the dense
+policy's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,10 +15,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.methods.token_budget import BudgetPoint
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
-from torchrl_sparse.tokens.budget import BudgetPoint
-from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 __all__ = ["demonstrated_queries", "measure_errors", "measure_success", "recorded_queries", "replay"]
@@ -96,7 +96,7 @@ def replay(
 def measure_errors(
     policy: VLAPolicy,
     episodes: Sequence[Sequence[TensorDictBase]],
-    pruners: Sequence[SpecPrune],
+    pruners: Mapping[float, TokenPruner],
     n_action_steps: int,
     on_episode: Callable[[], Any] = lambda: None,
 ) -> list[BudgetPoint]:
@@ -105,7 +105,7 @@ def measure_errors(
     Args:
         policy: any; its own pruner plays no part.
         episodes: their queries, each [].
-        pruners: differing in alpha.
+        pruners: number -> pruner.
         n_action_steps: actions of a chunk that are executed, and so compared.
         on_episode: called after each episode.
 
@@ -117,18 +117,18 @@ def measure_errors(
             f"episodes: expected one with at least two queries, got {[len(q) for q in episodes]}"
         )
     normalize = policy.normalizer.normalize_action
-    errors, kept = ([[] for _ in pruners] for _ in range(2))
+    errors, kept = ({number: [] for number in pruners} for _ in range(2))
     for queries in episodes:
         dense = normalize(replay(policy, queries, None)[keys.CHUNK])
-        for index, pruner in enumerate(pruners):
+        for number, pruner in pruners.items():
             answers = replay(policy, queries, pruner)
             difference = normalize(answers[keys.CHUNK]) - dense
-            errors[index].append(difference[1:, :n_action_steps].abs().mean((-2, -1)))
-            kept[index].append(answers[keys.KEPT][1:])
+            errors[number].append(difference[1:, :n_action_steps].abs().mean((-2, -1)))
+            kept[number].append(answers[keys.KEPT][1:])
         on_episode()
     return [
-        BudgetPoint(pruner.options.alpha, torch.cat(tokens).mean().item(), torch.cat(error).mean().item())
-        for pruner, tokens, error in zip(pruners, kept, errors, strict=True)
+        BudgetPoint(number, torch.cat(kept[number]).mean().item(), torch.cat(errors[number]).mean().item())
+        for number in pruners
     ]
 
 
@@ -137,7 +137,7 @@ def measure_success(
     make_actor: Callable[[VLAPolicy], Actor],
     make_env: Callable[..., EnvBase],
     seeds: Sequence[int],
-    pruners: Sequence[SpecPrune],
+    pruners: Mapping[float, TokenPruner],
     on_episode: Callable[[], Any] = lambda: None,
 ) -> list[BudgetPoint]:
     """Measure by how much each pruner's success rate is below the dense policy's, on the same initial states.
@@ -147,7 +147,7 @@ def measure_success(
         make_env, seeds: as of `recorded_queries`.
     """
     rates, kept = [], []
-    for pruner in (None, *pruners):
+    for pruner in (None, *pruners.values()):
         actor = make_actor(policy.with_pruner(pruner))
         won, tokens = [], []
         for seed in seeds:
@@ -158,6 +158,6 @@ def measure_success(
         rates.append(sum(won) / len(won))
         kept.append(torch.cat(tokens).mean().item())
     return [
-        BudgetPoint(pruner.options.alpha, tokens, rates[0] - rate)
-        for pruner, tokens, rate in zip(pruners, kept[1:], rates[1:], strict=True)
+        BudgetPoint(number, tokens, rates[0] - rate)
+        for number, tokens, rate in zip(pruners, kept[1:], rates[1:], strict=True)
     ]
