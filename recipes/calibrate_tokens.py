@@ -45,7 +45,7 @@ def main(config: DictConfig) -> None:
     if config.measure not in measures:
         raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
     published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
-    policy = VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
+    policy = VLAPolicy.from_pretrained(config.policy, base=config.base, **published).to(config.device)
     points = tuple(measures[config.measure](policy, config))
     for point in points:
         print(f"alpha {point.alpha:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")
