@@ -113,7 +113,7 @@ def main(config: DictConfig) -> None:
 
 def load_policy(config: DictConfig) -> VLAPolicy:
     published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
-    return VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
+    return VLAPolicy.from_pretrained(config.policy, base=config.base, **published).to(config.device)
 
 
 if __name__ == "__main__":

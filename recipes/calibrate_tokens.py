@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
         raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
     published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
     tried = pruners(config)  # first, since what it refuses need not be recorded
-    policy = VLAPolicy.from_pretrained(config.policy, **published).to(config.device)
+    policy = VLAPolicy.from_pretrained(config.policy, base=config.base, **published).to(config.device)
     points = tuple(measures[config.measure](policy, tried, config))
     for point in points:
         print(f"{config.method}@{point.number:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")

@@ -1,6 +1,7 @@
 """Benchmark a vision-language-action model with random weights: time of its parts, of pruning helpers, and what pruning saves.
 
     python recipes/profile_vla.py                                                      # reduced shape, one CPU thread
+    python recipes/profile_vla.py shape=smollm2 "equal_to='specprune, alpha 1'"          # SmolLM2's, at equal tokens
     python recipes/profile_vla.py shape=published device=cuda dtype=bfloat16           # the published 7B shape
 
 Writes OUT/vla_latency.json, a table and a chart. Times are medians, everything interleaved in one process.
@@ -13,6 +14,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
+from torchrl_sparse import keys
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.figures.latency import plot_vla_times
@@ -20,9 +22,10 @@ from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase, make_policy
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, save_vla_results
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
-from torchrl_sparse.tokens import FastVPruner, RandomPruner, SpecPrune
+from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, RandomPruner, SpecPrune
 from torchrl_sparse.tokens.base import TokenPruner
 
 
@@ -30,7 +33,10 @@ from torchrl_sparse.tokens.base import TokenPruner
 def main(config: DictConfig) -> None:
     with num_threads(config.threads), torch.no_grad():
         policy = make_policy(config.shape, dtype=getattr(torch, config.dtype), device=config.device)
-        case = VLACase(policy, make_pruners(config))
+        pruners = make_pruners(config)
+        if config.equal_to is not None:
+            pruners |= equal_pruners(policy, pruners, config.equal_to)
+        case = VLACase(policy, pruners)
         with progress("timing", "round", config.repeats) as show:
             results = measure_vla(
                 case,
@@ -53,6 +59,28 @@ def make_pruners(config: DictConfig) -> dict[str, TokenPruner | None]:
     pruners |= {f"fastv, {share:.0%}": FastVPruner(share) for share in config.shares}
     pruners |= {f"random, {share:.0%}": RandomPruner(share) for share in config.shares}
     return pruners
+
+
+def equal_pruners(
+    policy: VLAPolicy, pruners: dict[str, TokenPruner | None], name: str
+) -> dict[str, TokenPruner]:
+    """Make FastV, frame difference and random that keep as many tokens in a layer, on average, as the pruner ``name``."""
+    if name not in pruners:
+        raise ValueError(f"equal_to: expected one of {', '.join(pruners)}, got {name!r}")
+    share = VLACase(policy, {name: pruners[name]}).answer(name)[keys.KEPT].item()
+    share /= policy.network.config.num_visual
+    before = (
+        FastVPruner().layer / policy.network.config.llm.layers
+    )  # the share of layers that see every token
+    if share <= before:
+        raise ValueError(
+            f"equal_to: expected a method that keeps more than {before:.0%}, got {share:.0%} of {name}"
+        )
+    return {
+        "fastv, as many": FastVPruner((share - before) / (1 - before)),
+        "frame difference, as many": FrameDifferencePruner(share),
+        "random, as many": RandomPruner(share),
+    }
 
 
 if __name__ == "__main__":

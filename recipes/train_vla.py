@@ -3,6 +3,7 @@
     python recipes/collect_demos.py task=lift_named episodes=600 out=data/lift_named_proficient.h5
     python recipes/render_demos.py task=lift_named
     python recipes/train_vla.py task=lift_named precision=bf16
+    python recipes/train_vla.py task=lift_named precision=bf16 base=SmolLM2-135M-Instruct.Q4_1.gguf +network.patch_size=7
 
 ``out/policy``, renewed at each checkpoint, is the policy with averaged weights for `VLAPolicy.from_pretrained`.
 """
@@ -59,17 +60,16 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
     if config.init is None:
-        policy = untrained_policy(
-            demos, config.size, cameras=[*cameras], changes=config.network, seed=config.seed
-        )
+        sizes = {"changes": config.network, "base": config.base, "rank": config.rank}
+        policy = untrained_policy(demos, config.size, cameras=[*cameras], seed=config.seed, **sizes)
     else:
-        policy = VLAPolicy.from_pretrained(config.init)
+        policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
     policy.source = VLASource(find_robosuite_task(config.task).name, cameras)
     trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), stages)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(episodes.data)} steps, {len(trainer.train_rows)} training windows; "
-        f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
+        f"{sum(p.numel() for p in policy.network.parameters() if p.requires_grad):,} parameters to train"
     )
     return trainer
 
@@ -90,7 +90,7 @@ def export(trainer: VLATrainer, config: DictConfig) -> Path:
 
 def averaged_policy(trainer: VLATrainer) -> VLAPolicy:
     policy = VLAPolicy(trainer.averaged(), trainer.policy.normalizer, trainer.policy.tokenizer)
-    policy.source = trainer.policy.source
+    policy.source, policy.base = trainer.policy.source, trainer.policy.base
     return policy
 
 

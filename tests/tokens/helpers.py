@@ -1,5 +1,7 @@
 """A small vision-language-action policy, queries for it, and a pruner that records another one."""
 
+from dataclasses import replace
+
 import torch
 from tensordict import TensorDict
 
@@ -64,6 +66,19 @@ def make_policy(pruner=None):
     policy = VLAPolicy(VLANetwork(CONFIG))
     policy.pruner = pruner
     return policy
+
+
+def make_grouped_policies(make_pruner):
+    """Two policies of one function: heads that share keys and values, and heads that have the same ones each."""
+    torch.manual_seed(0)
+    size = TransformerSize(32, LAYERS, 4, 64)
+    grouped, each = (VLAPolicy(VLANetwork(replace(CONFIG, llm=size, kv_heads=n))) for n in (2, None))
+    weights = grouped.network.state_dict()
+    for name in [name for name in weights if "decoder" in name and ("k_proj" in name or "v_proj" in name)]:
+        weights[name] = weights[name].unflatten(0, (2, -1)).repeat_interleave(2, dim=0).flatten(0, 1)
+    each.network.load_state_dict(weights)
+    grouped.pruner, each.pruner = make_pruner(), make_pruner()
+    return grouped, each
 
 
 def query(batch=3, seed=0):

@@ -11,6 +11,7 @@ from tests.tokens.helpers import (
     PRUNERS,
     Recorder,
     later,
+    make_grouped_policies,
     make_policy,
     query,
 )
@@ -84,6 +85,15 @@ def test_a_row_of_a_batch_is_the_row_alone(name):
             alone = policy(before[row : row + 1].clone())
             assert torch.equal(alone[keys.TOKEN_DEPTH][0], after[keys.TOKEN_DEPTH][row])
             torch.testing.assert_close(alone[keys.CHUNK][0], after[keys.CHUNK][row], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_heads_that_share_keys_are_pruned_as_those_that_have_them_each(name):
+    grouped, each = make_grouped_policies(PRUNERS[name])
+    td = grouped(query()), each(query())
+    for mine, other in (td, (grouped(later(td[0])), each(later(td[1])))):
+        assert torch.equal(mine[keys.TOKEN_DEPTH], other[keys.TOKEN_DEPTH])
+        torch.testing.assert_close(mine[keys.CHUNK], other[keys.CHUNK], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -7,7 +7,9 @@
      "tokenizer": {"kind": "words", "words": [...]} or {"kind": "llama", "definition": {content of a tokenizer.json}},
      "source": {fields of VLASource; only where one is known}}
 
-Network weights are fp16, normalisation constants as they are.
+Network weights are fp16, normalisation constants as they are. Of a policy with adapters on a language model, only what was
+trained is there; ``"base": {"sha256": ..., "rank": ...}`` tells which file the rest is in, and ``"tokenizer"`` is
+``{"kind": "base"}``, the one in that file.
 """
 
 from __future__ import annotations
@@ -20,16 +22,19 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchrl_sparse.networks.vla.adapters import add_adapters, is_frozen
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, tokenizer_from_config
 from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.language_model import LanguageModel, digest_of, load_base, read_language_model
 from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
-__all__ = ["StoredVLA", "VLASource", "read_vla", "write_vla"]
+__all__ = ["AdaptedBase", "StoredVLA", "VLASource", "read_vla", "trained_state", "write_vla"]
 
 _NETWORK, _NORMALIZER = "network.", "normalizer."
+_BASE_TOKENIZER = {"kind": "base"}
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,19 @@ class VLASource:
 
 
 @dataclass(frozen=True)
+class AdaptedBase:
+    """The language model that a policy adapts.
+
+    Attributes:
+        sha256: of its file.
+        rank: of the adapters.
+    """
+
+    sha256: str
+    rank: int
+
+
+@dataclass(frozen=True)
 class _Config:
     """Content of ``config.json``."""
 
@@ -56,6 +74,7 @@ class _Config:
     network: dict[str, Any]
     tokenizer: dict[str, Any]
     source: VLASource | None = None
+    base: AdaptedBase | None = None
 
 
 @dataclass(frozen=True)
@@ -67,31 +86,35 @@ class StoredVLA:
         normalizer: of states and actions.
         tokenizer: of instructions.
         source: what it was trained for.
+        base: the language model that its adapters are for; None where there are no adapters.
     """
 
     network: VLANetwork
     normalizer: QuantileNormalizer
     tokenizer: InstructionTokenizer
     source: VLASource = VLASource()
+    base: AdaptedBase | None = None
 
 
 def write_vla(path: Path, policy: StoredVLA) -> None:
     """Write both files into the folder ``path``, each in one piece or not at all."""
-    weights = {name: value.half() for name, value in policy.network.state_dict().items()}
+    weights = {name: value.half() for name, value in trained_state(policy.network, policy.base).items()}
     tensors = _prefixed(_NETWORK, weights) | _prefixed(_NORMALIZER, policy.normalizer.state_dict())
     write_tensors(path / "model.safetensors", tensors)
-    network, tokenizer = policy.network.config.to_dict(), policy.tokenizer.to_config()
+    network = policy.network.config.to_dict()
+    tokenizer = policy.tokenizer.to_config() if policy.base is None else _BASE_TOKENIZER
     source = None if policy.source == VLASource() else policy.source
-    config = _Config("torchrl_sparse.vla_policy/1", network, tokenizer, source)
+    config = _Config("torchrl_sparse.vla_policy/1", network, tokenizer, source, policy.base)
     write_json(path / "config.json", config)
 
 
-def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
+def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = None) -> StoredVLA:
     """Read the policy in the folder ``path``, its network in f32.
 
     Args:
         path: the folder.
         expected: the architecture that it must hold; any by default.
+        base: file of the language model that it adapts, where it does.
 
     Raises:
         FileNotFoundError: if a file is not there.
@@ -100,23 +123,64 @@ def read_vla(path: Path, expected: VLAConfig | None = None) -> StoredVLA:
     where = path / "config.json"
     check_folder(path)
     stored = read_json(where, _Config)
+    language = _read_base(where, stored.base, base)
     try:
         config = VLAConfig.from_dict(stored.network)
-        tokenizer = tokenizer_from_config(stored.tokenizer)
+        tokenizer = tokenizer_from_config(stored.tokenizer) if language is None else language.tokenizer
+        _check_base(config, language)
+        with torch.device(
+            "meta"
+        ):  # the configuration is compared with the weights before memory is taken for it
+            own = trained_state(_build(config, stored.base), stored.base)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
     _check_architecture(where, expected, config)
-    with torch.device("meta"):  # the configuration is compared with the weights before memory is taken for it
-        state = _prefixed(_NETWORK, VLANetwork(config).state_dict())
     identity = QuantileNormalizer.identity(config.state_dim, config.action_dim)
-    tensors = read_tensors(path / "model.safetensors", state | _prefixed(_NORMALIZER, identity.state_dict()))
-    network = VLANetwork(config)
-    network.load_state_dict({name: value.float() for name, value in take(tensors, _NETWORK).items()})
+    tensors = read_tensors(
+        path / "model.safetensors", _prefixed(_NETWORK, own) | _prefixed(_NORMALIZER, identity.state_dict())
+    )
+    network = _build(config, stored.base)
+    weights = {name: value.float() for name, value in take(tensors, _NETWORK).items()}
+    network.load_state_dict(weights, strict=language is None)
+    if language is not None:
+        load_base(network, language)
     try:
         normalizer = QuantileNormalizer(**take(tensors, _NORMALIZER))
     except ValueError as error:
         raise ValueError(f"{path / 'model.safetensors'}: normalizer: {error}") from error
-    return StoredVLA(network.eval(), normalizer, tokenizer, stored.source or VLASource())
+    return StoredVLA(network.eval(), normalizer, tokenizer, stored.source or VLASource(), stored.base)
+
+
+def trained_state(network: VLANetwork, base: AdaptedBase | None) -> dict[str, Tensor]:
+    """Return what a file holds of a network's state: all, or what is not its language model's."""
+    state = network.state_dict()
+    return state if base is None else {name: value for name, value in state.items() if not is_frozen(name)}
+
+
+def _read_base(where: Path, stored: AdaptedBase | None, path: Path | None) -> LanguageModel | None:
+    if (stored is None) != (path is None):
+        needs = "none" if stored is None else f"the file with SHA-256 {stored.sha256}"
+        raise ValueError(f"{where}: base: expected {needs}, got {path}")
+    if stored is None:
+        return None
+    if not path.is_file():
+        raise FileNotFoundError(f"base: expected a file {path}, got none")
+    if (found := digest_of(path)) != stored.sha256:  # before anything else in it is believed
+        raise ValueError(
+            f"{path}: expected the file with SHA-256 {stored.sha256}, which {where} names, got {found}"
+        )
+    return read_language_model(path)
+
+
+def _check_base(config: VLAConfig, language: LanguageModel | None) -> None:
+    for name, size in ({} if language is None else language.sizes).items():
+        if (found := getattr(config, name)) != size:
+            raise ValueError(f"network.{name}: expected {size}, as in the base, got {found}")
+
+
+def _build(config: VLAConfig, base: AdaptedBase | None) -> VLANetwork:
+    network = VLANetwork(config)
+    return network if base is None else add_adapters(network, base.rank)
 
 
 def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig) -> None:

@@ -92,7 +92,7 @@ class DemonstrationTrainer(Trainer):
     ) -> None:
         self.train_rows, self.val_rows = train_rows, val_rows
         self._ema = EMAModel(
-            module.parameters(),
+            _trained(module),
             decay=config.ema_max_decay,
             power=config.ema_power,
             update_after_step=0,
@@ -117,7 +117,7 @@ class DemonstrationTrainer(Trainer):
 
     def train_step(self) -> dict[str, float]:
         losses = super().train_step()
-        self._ema.step(self.module.parameters())
+        self._ema.step(_trained(self.module))
         return losses
 
     @torch.no_grad()
@@ -135,7 +135,7 @@ class DemonstrationTrainer(Trainer):
     def averaged(self) -> nn.Module:
         """Return a copy of the module with the averaged weights, in evaluation mode."""
         module = copy.deepcopy(self.module).eval()
-        self._ema.copy_to(module.parameters())
+        self._ema.copy_to(_trained(module))
         return module
 
     def state(self) -> dict[str, Any]:
@@ -148,12 +148,16 @@ class DemonstrationTrainer(Trainer):
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:
-        self._ema.store(self.module.parameters())
-        self._ema.copy_to(self.module.parameters())
+        self._ema.store(_trained(self.module))
+        self._ema.copy_to(_trained(self.module))
         try:
             yield
         finally:
-            self._ema.restore(self.module.parameters())
+            self._ema.restore(_trained(self.module))
+
+
+def _trained(module: nn.Module) -> list[nn.Parameter]:
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
 def split_windows(

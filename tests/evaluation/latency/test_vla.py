@@ -90,16 +90,36 @@ def test_numbers_are_those_of_the_medians(case):
 
 
 def test_the_recipe_leaves_json_table_and_chart(tmp_path):
-    options = ("shape=toy", "repeats=1", "warmup=0", "alphas=[1]", "shares=[0.5]")
+    options = (
+        "shape=toy",
+        "repeats=1",
+        "warmup=0",
+        "alphas=[1]",
+        "shares=[0.5]",
+        "equal_to='specprune, alpha 1'",
+    )
     printed = run("profile_vla", *options, f"out={tmp_path}")
     results = load_vla_results(tmp_path / "vla_latency.json")
     assert results.machine.threads == 1
     assert results.shape.name == "toy"
-    assert list(results.methods) == ["dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"]
+    assert list(results.methods) == [
+        *("dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"),
+        *("fastv, as many", "frame difference, as many", "random, as many"),
+    ]
+    kept = [method.kept for name, method in results.methods.items() if "as many" in name]
+    assert kept == pytest.approx([results.methods["specprune, alpha 1"].kept] * 3, abs=1)
+    linear, attention, square = results.products.values()
+    assert linear.flops + attention.flops == decoder_flops(
+        SHAPES["toy"], torch.full((8,), results.shape.tokens)
+    )
+    assert square.flops == 2 * 2048**3
+    assert all(f" {name} | " in printed for name in results.products)
     assert all(f"| {name} " in printed for name in [*results.methods, *results.parts])
     assert iio.imread(tmp_path / "vla_latency.png").std() > 5
 
 
 def test_unknown_shapes_are_refused():
-    with pytest.raises(ValueError, match="shape: expected one of published, reduced, toy, got 'huge'"):
+    with pytest.raises(
+        ValueError, match="shape: expected one of published, reduced, smollm2, toy, got 'huge'"
+    ):
         make_policy("huge")

@@ -1,11 +1,13 @@
 """Attention in both directions, positions, scores, and what dropping tokens leaves untouched."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
 from transformers import LlamaConfig, LlamaModel
 
-from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, pack, row_attention
 from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
 
@@ -35,8 +37,8 @@ def sequence():
 class Drop(LayerHooks):
     """Drops visual tokens ``ids`` after a layer; remembers every state that it is shown."""
 
-    def __init__(self, layer, ids):
-        self.layer, self.ids, self.states = layer, ids, []
+    def __init__(self, layer, ids, rows=BATCH):
+        self.layer, self.ids, self.rows, self.states = layer, ids, rows, []
 
     def layers_scored(self, num_layers):
         return set(range(num_layers))
@@ -45,7 +47,7 @@ class Drop(LayerHooks):
         self.states.append(state)
         if index != self.layer:
             return None
-        keep = torch.ones(BATCH, VISUAL, dtype=torch.bool)
+        keep = torch.ones(self.rows, VISUAL, dtype=torch.bool)
         for row, ids in enumerate(self.ids):
             keep[row, ids] = False
         return state.keep_visual(keep)
@@ -186,3 +188,71 @@ def test_rows_that_a_sample_lacks_have_no_attention():
     assert weights[1, 0, 2] == 0
     expected = (query[0, :, 2] * key[0].transpose(0, 1) / 2).sum(-1).softmax(0).mean(1)
     torch.testing.assert_close(weights[0, 1], expected)
+
+
+# -- heads that share keys and values ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def grouped():
+    """Four heads over two of keys and values, with another rope base and epsilon."""
+    torch.manual_seed(0)
+    config = VLAConfig.tiny(llm=TransformerSize(32, 4, 4, 64), kv_heads=2, rope_base=1e5, norm_eps=1e-5)
+    return BidirectionalLlama(config).eval()
+
+
+@torch.no_grad()
+def test_shared_keys_and_values_are_those_of_a_decoder_that_has_them_twice(grouped, sequence):
+    same = {"rope_base": 1e5, "norm_eps": 1e-5}
+    each = BidirectionalLlama(VLAConfig.tiny(llm=TransformerSize(32, 4, 4, 64), **same)).eval()
+    weights = grouped.llama.state_dict()
+    for name in [name for name in weights if "k_proj" in name or "v_proj" in name]:
+        weights[name] = weights[name].unflatten(0, (2, 8)).repeat_interleave(2, dim=0).flatten(0, 1)
+    each.llama.load_state_dict(weights)
+    ours, theirs = (Drop(1, [[0, 5], [3], []]) for _ in range(2))
+    torch.testing.assert_close(grouped(sequence, ours).hidden, each(sequence, theirs).hidden)
+    for mine, other in zip(ours.states, theirs.states, strict=True):
+        torch.testing.assert_close(mine.attention, other.attention)
+
+
+@torch.no_grad()
+def test_it_is_transformers_llama_with_those_sizes(grouped, sequence):
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4}
+    other = {"num_key_value_heads": 2, "rope_parameters": {"rope_type": "default", "rope_theta": 1e5}}
+    config = LlamaConfig(vocab_size=320, **sizes, **other, rms_norm_eps=1e-5, attn_implementation="eager")
+    llama = LlamaModel(config)
+    llama.load_state_dict(grouped.llama.state_dict())
+    expected = manual_attention(llama.eval(), sequence.hidden, causal=False)
+    torch.testing.assert_close(grouped(sequence).hidden, expected)
+
+
+@torch.no_grad()
+def test_a_row_with_shared_heads_is_the_row_alone(grouped, sequence):
+    together = grouped(sequence, Drop(1, [[0, 5], [3], []]))
+    for row, ids in enumerate([[0, 5], [3], []]):
+        names = ("hidden", "alive", "positions", "kind", "task", "td")
+        alone = replace(sequence, **{name: getattr(sequence, name)[row : row + 1] for name in names})
+        length = together.lengths[row]
+        mine = grouped(alone, Drop(1, [ids], rows=1)).hidden[0, :length]
+        torch.testing.assert_close(together.hidden[row, :length], mine, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kv_heads": 3}, "kv_heads: expected a divisor of llm.heads=2, got 3"),
+        ({"kv_heads": 0}, "kv_heads"),
+        ({"rope_base": 0.0}, "rope_base: expected a positive number, got 0.0"),
+        ({"norm_eps": float("inf")}, "norm_eps: expected a positive number, got inf"),
+    ],
+)
+def test_sizes_that_no_decoder_has_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        VLAConfig.tiny(**changes)
+
+
+def test_files_say_what_is_not_as_it_was_from_the_first():
+    assert not {"kv_heads", "rope_base", "norm_eps"} & VLAConfig.tiny().to_dict().keys()
+    config = VLAConfig.tiny(kv_heads=1, norm_eps=1e-5)
+    assert config.to_dict()["kv_heads"] == 1
+    assert VLAConfig.from_dict(config.to_dict()) == config

@@ -5,6 +5,7 @@ import torch
 from safetensors.torch import load_file
 from tensordict import TensorDict
 
+from tests.fixtures.gguf import write_llama
 from tests.training.runs import stop_and_go_on, train_unbroken
 from tests.training.vla.rendered import COLOURS, write_demos
 from torchrl_sparse import keys
@@ -56,3 +57,14 @@ def check_policy(policy):
     assert chunk.shape == (2, 3, 10)
     assert set(chunk[..., 9].flatten().tolist()) <= {-1.0, 0.0, 1.0}
     assert policy.network.config.llm.layers == 2
+
+
+def test_a_language_model_is_adapted_and_saved_without_it(demos, tmp_path):
+    base, out = write_llama(tmp_path / "base.gguf"), tmp_path / "out"
+    sizes = ["size=tiny", "network.chunk_size=2", "+network.patch_size=7", f"base={base}", "rank=2"]
+    stages = ["grounding.locate_steps=2", "grounding.refer_steps=2"]
+    train_unbroken("train_vla", out, [f"demos={demos}", *sizes, *stages, "batch_size=2", "max_steps=6"])
+    names = load_file(out / "policy/model.safetensors").keys()
+    assert any(name.endswith(".mlp.up_proj.up") for name in names)
+    assert not any(name.endswith((".mlp.up_proj.weight", "embed_tokens.weight")) for name in names)
+    assert VLAPolicy.from_pretrained(out / "policy", base=base).network.config.num_visual == 32

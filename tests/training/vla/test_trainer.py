@@ -8,11 +8,13 @@ from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.networks.vla.adapters import add_adapters
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import AdaptedBase
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.loss import VLALoss
@@ -134,6 +136,32 @@ def test_stages_come_before_the_actions_and_leave_the_policy_as_it_was_built(mak
     assert left < 0.8
     assert "head" in learn(3)[0]
     assert trainer.averaged().state_dict().keys() == network.state_dict().keys()
+
+
+def test_training_adapters_resumes_to_the_last_bit_and_leaves_the_rest(make_trainer, tmp_path):
+    def make():
+        trainer = make_trainer()
+        torch.manual_seed(1)
+        policy = VLAPolicy(add_adapters(trainer.policy.network, 2), tokenizer=trainer.policy.tokenizer)
+        policy.base = AdaptedBase("0", 2)
+        return VLATrainer(policy, trainer.demos, trainer.config)
+
+    unbroken, first, second = make(), make(), make()
+    before = {name: value.clone() for name, value in unbroken.policy.network.named_parameters()}
+    losses = run(unbroken, 6)
+    begun = run(first, 3)
+    first.save(tmp_path / "checkpoint.pt")
+    assert not any("embed_tokens" in name for name in first.state()["network"])
+    second.load(tmp_path / "checkpoint.pt")
+    assert begun + run(second, 6) == losses
+    for ours, theirs in ((second.module, unbroken.module), (second.averaged(), unbroken.averaged())):
+        assert all(torch.equal(a, b) for a, b in zip(ours.parameters(), theirs.parameters(), strict=True))
+    for name, value in unbroken.policy.network.named_parameters():
+        assert torch.equal(value, before[name]) == (not value.requires_grad) or "mask_token" in name, name
+    other = make()
+    other.policy.base = AdaptedBase("1", 2)
+    with pytest.raises(ValueError, match=r"made with another config: base.sha256 is"):
+        other.load(tmp_path / "checkpoint.pt")
 
 
 @pytest.mark.parametrize(("warmup", "first"), [(0, 1.0), (2, 0.0)])

@@ -10,8 +10,17 @@ import numpy as np
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine, measure_latency
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase
+from torchrl_sparse.evaluation.latency.vla_products import ProductCall, product_calls
 from torchrl_sparse.evaluation.results.schema import DENSE
-from torchrl_sparse.evaluation.results.vla_report import SCHEMA, Helper, Part, VLALatency, VLAMethod, VLAShape
+from torchrl_sparse.evaluation.results.vla_report import (
+    SCHEMA,
+    Helper,
+    Part,
+    Product,
+    VLALatency,
+    VLAMethod,
+    VLAShape,
+)
 
 __all__ = ["measure_vla"]
 
@@ -38,6 +47,8 @@ def measure_vla(
     calls |= {("query", method): lambda method=method: case.answer(method) for method in case.policies}
     calls |= {(method, helper): call for method in pruned for helper, call in case.helpers(method).items()}
     weight = next(case.network.parameters())
+    products = product_calls(case)
+    calls |= {("products", name): product.call for name, product in products.items()}
     latency = measure_latency(calls, repeats, warmup, device=weight.device, on_round=on_round)
     shape = VLAShape(
         name=name,
@@ -48,7 +59,12 @@ def measure_vla(
         config=case.network.config.to_dict(),
     )
     methods = {method: _method(method, case, latency) for method in case.policies}
-    return VLALatency(SCHEMA, machine, shape, _parts(latency), methods)
+    timed = {part: _product(latency["products", part].p50, product) for part, product in products.items()}
+    return VLALatency(SCHEMA, machine, shape, _parts(latency), methods, timed)
+
+
+def _product(seconds: float, product: ProductCall) -> Product:
+    return Product(seconds, product.flops, product.flops / seconds)
 
 
 def _parts(latency: Mapping[tuple[str, str], Latency]) -> dict[str, Part]:

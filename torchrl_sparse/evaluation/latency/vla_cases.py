@@ -38,6 +38,17 @@ SHAPES = {
         llm=TransformerSize(1024, 12, 16, 2816),
         crop_area=0.9,
     ),
+    # SmolLM2-135M, with the towers of the small model and finer patches, and LiftNamed's state and actions.
+    "smollm2": VLAConfig.small(
+        llm=TransformerSize(576, 30, 9, 1536),
+        vocab_size=49152,
+        kv_heads=3,
+        rope_base=1e5,
+        norm_eps=1e-5,
+        patch_size=7,
+        state_dim=9,
+        action_dim=10,
+    ),
     "toy": VLAConfig.tiny(llm=TransformerSize(32, 8, 2, 64), image_size=112, crop_area=0.9),
 }
 

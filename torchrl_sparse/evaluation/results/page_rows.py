@@ -22,7 +22,12 @@ from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows,
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.results.text import percent_text
-from torchrl_sparse.evaluation.results.vla_report import load_vla_results, vla_method_rows, vla_part_rows
+from torchrl_sparse.evaluation.results.vla_report import (
+    load_vla_results,
+    vla_method_rows,
+    vla_part_rows,
+    vla_product_rows,
+)
 from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 
@@ -137,7 +142,8 @@ def _query(path: Path) -> dict[str, Table]:
 def _vla(path: Path) -> dict[str, Table]:
     results = load_vla_results(path)
     rows = {"methods": vla_method_rows(results), "parts": vla_part_rows(results)}
-    return {name: _table(results.shape.name, of_one) for name, of_one in rows.items()}
+    rows["products"] = vla_product_rows(results)
+    return {name: _table(results.shape.name, of_one) for name, of_one in rows.items() if of_one}
 
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:

@@ -14,9 +14,9 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
   (solved within the task's early cut) and ``speed-up, 95 %``. An ``engine.json`` also has ``f32 arithmetic
   alone, ms``, and what reads its weights, ``memory alone, ms``.
 - ``rows``: which table of a file with several: ``played`` of an ``acceleration.json``, a shape of an ``engine.json``,
-  ``methods`` or ``parts`` of a ``vla_latency.json``, ``success`` or ``time`` of an ``offline_agreement.json``, or ``headline``
-  or ``budgets`` of a ``results*.json`` with times, see `choices`, or its ``ways`` or ``scores``, from the ``episodes/``
-  beside it.
+  ``methods``, ``parts`` or ``products`` of a ``vla_latency.json``, ``success`` or ``time`` of an ``offline_agreement.json``, or
+  ``headline`` or ``budgets`` of a ``results*.json`` with times, see `choices`, or its ``ways`` or ``scores``, from the
+  ``episodes/`` beside it.
 - ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
 - Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
 - ``cells="success, % | speed-up"``: side by side, one row per method and one column per task, which holds these columns of the

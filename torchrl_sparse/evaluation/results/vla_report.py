@@ -14,6 +14,7 @@ from torchrl_sparse.storage.json import read_json, write_json
 __all__ = [
     "Helper",
     "Part",
+    "Product",
     "VLALatency",
     "VLAMethod",
     "VLAShape",
@@ -22,6 +23,7 @@ __all__ = [
     "save_vla_results",
     "vla_method_rows",
     "vla_part_rows",
+    "vla_product_rows",
 ]
 
 SCHEMA = 1
@@ -90,14 +92,24 @@ class VLAMethod:
 
 
 @dataclass(frozen=True)
+class Product:
+    """Matrix products alone: seconds, FLOPs (2 * MAC), and these by those."""
+
+    p50_s: float
+    flops: float
+    flops_per_s: float
+
+
+@dataclass(frozen=True)
 class VLALatency:
-    """The content of a ``vla_latency.json``, version 1."""
+    """The content of a ``vla_latency.json``, version 1; earlier ones have no ``products``."""
 
     schema: Literal[1]
     machine: Machine
     shape: VLAShape
     parts: dict[str, Part]
     methods: dict[str, VLAMethod]
+    products: dict[str, Product] | None = None
 
 
 def save_vla_results(results: VLALatency, path: str | os.PathLike) -> Path:
@@ -122,8 +134,8 @@ def format_vla_table(results: VLALatency) -> str:
         f"{shape.name}: {shape.parameters:,} parameters, {shape.dtype}, {shape.tokens} tokens, "
         f"{shape.visual_tokens} of them visual; {machine.device}, {machine.cpu}, threads {machine.threads}"
     )
-    tables = markdown_table(vla_part_rows(results)), markdown_table(vla_method_rows(results))
-    return "\n\n".join([about, *tables])
+    rows = vla_part_rows(results), vla_product_rows(results), vla_method_rows(results)
+    return "\n\n".join([about, *map(markdown_table, filter(None, rows))])
 
 
 def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
@@ -131,6 +143,22 @@ def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
     return [
         {"part of a dense query": name, "p50, ms": f"{1e3 * part.p50_s:.2f}", "share": f"{part.share:.1%}"}
         for name, part in results.parts.items()
+    ]
+
+
+def vla_product_rows(results: VLALatency) -> list[dict[str, str]]:
+    """Return the rows of the table of matrix products: column -> text; none where they were not timed."""
+    products = results.products or {}
+    best = max((product.flops_per_s for product in products.values()), default=0.0)
+    return [
+        {
+            "products": name,
+            "p50, ms": f"{1e3 * product.p50_s:.1f}",
+            "GFLOP": f"{product.flops / 1e9:.3g}",
+            "GFLOP/s": f"{product.flops_per_s / 1e9:.1f}",
+            "of the best": f"{product.flops_per_s / best:.0%}",
+        }
+        for name, product in products.items()
     ]
 
 

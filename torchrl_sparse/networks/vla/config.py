@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ __all__ = ["TransformerSize", "VLAConfig"]
 
 # Bounds, far beyond any use, on what a file can ask for before its weights are seen.
 _MAX_SIZE, _MAX_LAYERS, _MAX_PIXELS, _MAX_CHUNK = 1 << 20, 256, 4096, 4096
+_ADDED = {"kv_heads": None, "rope_base": 10000.0, "norm_eps": 1e-6}
+"""Fields that the first files did not have, and what those meant: where it is meant still, files are as they were."""
 
 
 def _is_key(value: Any) -> bool:
@@ -73,6 +76,10 @@ class VLAConfig:
         action_dim: numbers of an action A.
         chunk_size: actions of a chunk H.
         crop_area: share of the image's area that is kept, centred, and scaled back; 0.9 for the published checkpoints.
+        kv_heads: heads of the decoder's keys and values, each of which serves as many of its queries' (arXiv:2305.13245);
+            None is one for each.
+        rope_base: of the decoder's rotary embeddings.
+        norm_eps: of the decoder's norms.
 
     Raises:
         ValueError: if sizes do not fit together.
@@ -96,6 +103,9 @@ class VLAConfig:
     action_dim: int = 7
     chunk_size: int = 8
     crop_area: float = 1.0
+    kv_heads: int | None = _ADDED["kv_heads"]
+    rope_base: float = _ADDED["rope_base"]
+    norm_eps: float = _ADDED["norm_eps"]
 
     def __post_init__(self) -> None:
         for name in ("vocab_size", "registers", "state_dim", "action_dim"):
@@ -119,6 +129,19 @@ class VLAConfig:
             raise ValueError(f"cameras: expected one or two keys, got {reprlib.repr(list(self.cameras))}")
         if type(self.crop_area) not in (int, float) or not 0 < self.crop_area <= 1:
             raise ValueError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
+        self._check_decoder()
+
+    def _check_decoder(self) -> None:
+        if self.kv_heads is not None:
+            check_size("kv_heads", self.kv_heads, _MAX_SIZE)
+            if self.llm.heads % self.kv_heads:
+                raise ValueError(
+                    f"kv_heads: expected a divisor of llm.heads={self.llm.heads}, got {self.kv_heads}"
+                )
+        for name in ("rope_base", "norm_eps"):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 < value < math.inf:
+                raise ValueError(f"{name}: expected a positive number, got {value}")
 
     @classmethod
     def tiny(cls, **changes: Any) -> VLAConfig:
@@ -150,25 +173,31 @@ class VLAConfig:
         return self.chunk_size * self.action_dim
 
     @property
+    def kv_dim(self) -> int:
+        """Width of the decoder's keys, and of its values."""
+        return self.llm.dim // self.llm.heads * (self.kv_heads or self.llm.heads)
+
+    @property
     def visual_spec(self) -> VisualSpec:
         """The sizes that decide which visual tokens there are."""
         return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as JSON values, which `from_dict` reads."""
-        fields = dataclasses.asdict(self)
+        """Return the fields as JSON values, which `from_dict` reads."""
+        added = {name for name, meant in _ADDED.items() if getattr(self, name) == meant}
+        fields = {name: value for name, value in dataclasses.asdict(self).items() if name not in added}
         fields["cameras"] = [list(key) if isinstance(key, tuple) else key for key in self.cameras]
         return fields
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> VLAConfig:
-        """Return the sizes whose `to_dict` gave ``fields``, all of them.
+        """Return the sizes whose `to_dict` gave ``fields``.
 
         Raises:
             ValueError: if a field is missing, unknown or wrong.
         """
         names = {field.name for field in dataclasses.fields(cls)}
-        if not isinstance(fields, Mapping) or set(fields) != names:
+        if not isinstance(fields, Mapping) or not names - _ADDED.keys() <= set(fields) <= names:
             found = sorted(fields) if isinstance(fields, Mapping) else type(fields).__name__
             raise ValueError(f"expected the fields {sorted(names)}, got {found}")
         towers = {name: _size(name, fields[name]) for name in ("dino", "siglip", "llm")}

@@ -19,7 +19,6 @@ from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState
 
 __all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
 
-_ROPE_BASE = 10000.0
 _PER_TOKEN = ("hidden", "positions", "kind", "task")
 
 
@@ -56,12 +55,15 @@ class BidirectionalLlama(nn.Module):
                 intermediate_size=config.llm.mlp,
                 num_hidden_layers=config.llm.layers,
                 num_attention_heads=config.llm.heads,
+                num_key_value_heads=config.kv_heads,
+                rms_norm_eps=config.norm_eps,
                 # Llama's constant 0.02 is made for wide models; a narrow one hardly learns to read with it
                 initializer_range=config.llm.dim**-0.5,
             )
         )
         self.llama.rotary_emb = nn.Identity()  # angles are computed here
         self._head_dim = config.llm.dim // config.llm.heads
+        self._rope_base = config.rope_base
 
     def embed(self, ids: Tensor) -> Tensor:
         """Return the embeddings [..., d] of token ids i64 [...]."""
@@ -102,7 +104,7 @@ class BidirectionalLlama(nn.Module):
     def _rotary(self, state: LayerState) -> tuple[Tensor, Tensor]:
         """Return cosine and sine, [B, S, head_dim] each, of the original positions (arXiv:2104.09864), computed in f32."""
         exponent = torch.arange(0, self._head_dim, 2, device=state.hidden.device, dtype=torch.float32)
-        angle = state.positions[..., None].float() * _ROPE_BASE ** (-exponent / self._head_dim)
+        angle = state.positions[..., None].float() * self._rope_base ** (-exponent / self._head_dim)
         angle = torch.cat([angle, angle], dim=-1)
         return angle.cos().to(state.hidden.dtype), angle.sin().to(state.hidden.dtype)
 
@@ -175,7 +177,10 @@ def _run_layer(
     mask: Tensor | None,
     head_dim: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Run one of Llama's layers; return its output, and its queries and keys, [B, heads, S, head_dim]."""
+    """Run one of Llama's layers; return its output, and its queries and keys, [B, heads, S, head_dim].
+
+    Heads that share keys and values get them once each, so that whoever reads attention knows nothing of groups.
+    """
     attention = layer.self_attn
     normed = layer.input_layernorm(hidden)
     query, key, value = (
@@ -183,6 +188,8 @@ def _run_layer(
         for project in (attention.q_proj, attention.k_proj, attention.v_proj)
     )
     query, key = backbones.apply_rotary_pos_emb(query, key, *rotary)
+    if (groups := query.shape[1] // key.shape[1]) > 1:
+        key, value = (shared.repeat_interleave(groups, dim=1) for shared in (key, value))
     attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
     hidden = hidden + attention.o_proj(attended.transpose(1, 2).flatten(2))
     return hidden + layer.mlp(layer.post_attention_layernorm(hidden)), query, key

@@ -6,7 +6,8 @@ projection, as its read-outs go to the action head. With S tokens a layer of wid
 
     2 * S * (4 * d**2 + 3 * d * m) + 4 * d * S**2
 
-For the published 7B decoder at S = 605 that is 8.03e12 in 32 layers: 7.84e12 linear, 0.19e12 attention.
+where keys and values that heads share make two of the four d**2 narrower. For the published 7B decoder at S = 605 that is
+8.03e12 in 32 layers: 7.84e12 linear, 0.19e12 attention.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def decoder_flops(config: VLAConfig, tokens: Tensor) -> Tensor:
         8.03
     """
     size, tokens = config.llm, tokens.double()
-    linear = 2 * (4 * size.dim**2 + 3 * size.dim * size.mlp)
+    linear = 2 * size.dim * (2 * size.dim + 2 * config.kv_dim + 3 * size.mlp)
     return (tokens * linear + 4 * size.dim * tokens**2).sum(-1)
 
 

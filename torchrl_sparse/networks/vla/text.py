@@ -87,13 +87,17 @@ class WordTokenizer:
 
 
 class LlamaTokenizer:
-    """The published tokenizer, from the text of its ``tokenizer.json``, which is data only.
+    """The tokenizer of a language model, by default the published one, from the text of its ``tokenizer.json``: data only.
+
+    Args:
+        definition: the text.
+        closing: id of the token that ends every prompt; None for none.
 
     Raises:
         ValueError: if the text is no tokenizer.
     """
 
-    def __init__(self, definition: str):
+    def __init__(self, definition: str, closing: int | None = _EMPTY_WORD_ID):
         from tokenizers import Tokenizer
 
         try:
@@ -107,9 +111,9 @@ class LlamaTokenizer:
         # Prompts are padded here; what a file asks for could be any length.
         self._tokenizer.no_padding()
         self._tokenizer.no_truncation()
-        self.definition = definition
+        self.definition, self.closing = definition, closing
         highest = max(self._tokenizer.get_vocab().values(), default=0)
-        self.vocab_size = 1 + max(highest, _EMPTY_WORD_ID)
+        self.vocab_size = 1 + max(highest, closing or 0)
 
     @classmethod
     def from_file(cls, path: str | Path) -> LlamaTokenizer:
@@ -134,13 +138,15 @@ class LlamaTokenizer:
             start, stop = len(_BEFORE), len(_BEFORE) + len(text)
             # a token belongs to the instruction if its last character does: it may begin with the space before
             inside = [start < end <= stop for _, end in encoding.offsets]
-            rows.append(encoding.ids + [_EMPTY_WORD_ID] * (encoding.ids[-1] != _EMPTY_WORD_ID))
+            closed = self.closing is None or encoding.ids[-1] == self.closing
+            rows.append(encoding.ids if closed else [*encoding.ids, self.closing])
             spans.append((inside.index(True) if any(inside) else 0, sum(inside)))
         return _pad(rows, spans)
 
     def to_config(self) -> dict[str, Any]:
         """Return JSON values that `tokenizer_from_config` reads."""
-        return {"kind": "llama", "definition": json.loads(self.definition)}
+        config = {"kind": "llama", "definition": json.loads(self.definition)}
+        return config if self.closing == _EMPTY_WORD_ID else {**config, "closing": self.closing}
 
 
 def tokenizer_from_config(config: Any) -> InstructionTokenizer:
@@ -154,6 +160,8 @@ def tokenizer_from_config(config: Any) -> InstructionTokenizer:
             return WordTokenizer(words)
         case {"kind": "llama", "definition": dict(definition), **rest} if not rest:
             return LlamaTokenizer(json.dumps(definition))
+        case {"kind": "llama", "definition": dict(definition), "closing": None, **rest} if not rest:
+            return LlamaTokenizer(json.dumps(definition), closing=None)
     raise ValueError(f"tokenizer: expected kind 'words' or 'llama' and its field, got {str(config)[:80]}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import Decoded
 from torchrl_sparse.networks.vla.flops import query_flops
@@ -43,6 +45,7 @@ class VLAPolicy(VLAWrapperBase):
 
     Attributes:
         source: what it was trained for.
+        base: the language model whose adapters are trained; None where there are none.
         pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense
             policy.
 
@@ -87,7 +90,7 @@ class VLAPolicy(VLAWrapperBase):
             raise ValueError(
                 f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
             )
-        self.pruner, self.source = None, VLASource()
+        self.pruner, self.source, self.base = None, VLASource(), None
         self.eval()
 
     # -- the shape of a query ------------------------------------------------------------------------------------------
@@ -114,7 +117,7 @@ class VLAPolicy(VLAWrapperBase):
             ValueError: if the pruner does not fit the network.
         """
         policy = VLAPolicy(self.network, self.normalizer, self.tokenizer)
-        policy.pruner, policy.source = pruner, self.source
+        policy.pruner, policy.source, policy.base = pruner, self.source, self.base
         return policy
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -210,26 +213,40 @@ class VLAPolicy(VLAWrapperBase):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``."""
-        write_vla(Path(path), StoredVLA(self.network, self.normalizer, self.tokenizer, self.source))
+        """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``; of a `base`, its digest alone."""
+        stored = StoredVLA(self.network, self.normalizer, self.tokenizer, self.source, self.base)
+        write_vla(Path(path), stored)
 
     @classmethod
     def from_pretrained(
-        cls, path: str | Path, *, config: VLAConfig | None = None, **published: Any
+        cls,
+        path: str | Path,
+        *,
+        config: VLAConfig | None = None,
+        base: str | Path | None = None,
+        fold: bool = True,
+        **published: Any,
     ) -> VLAPolicy:
         """Load what `save_pretrained` wrote, or a folder as OpenVLA-OFT is published. Nothing in the files is executed.
 
         Args:
             path: the folder.
             config: the architecture that it must hold, for instance with two cameras; any by default.
+            base: file of the language model that the policy adapts, where it does.
+            fold: adapters are added to the weights that they adapt, to use the policy; False to train it further.
             published: arguments of `from_openvla_oft`, which only such a folder takes.
 
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
         if is_openvla_oft(path):
+            if base is not None:
+                raise ValueError(f"base: expected none for {path}, which holds its decoder, got {base}")
             return cls.from_openvla_oft(path, **published)
-        return cls._assemble(read_vla(Path(path), config))
+        stored = read_vla(Path(path), config, None if base is None else Path(base))
+        if stored.base is not None and fold:
+            stored = replace(stored, network=fold_adapters(stored.network), base=None)
+        return cls._assemble(stored)
 
     @classmethod
     def from_openvla_oft(
@@ -273,5 +290,5 @@ class VLAPolicy(VLAWrapperBase):
     @classmethod
     def _assemble(cls, stored: StoredVLA) -> VLAPolicy:
         policy = cls(stored.network, stored.normalizer, stored.tokenizer)
-        policy.source = stored.source
+        policy.source, policy.base = stored.source, stored.base
         return policy

@@ -19,6 +19,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import trained_state
 from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
 from torchrl_sparse.training.trainer import checksum
 from torchrl_sparse.training.vla.grounding import Grounding, GroundingConfig, ObjectPositions
@@ -137,9 +138,22 @@ class VLATrainer(DemonstrationTrainer):
         """Return a copy of the network with the averaged weights, in evaluation mode."""
         return super().averaged()["network"]
 
+    def state(self) -> dict[str, Any]:
+        """Return what a checkpoint holds; of a language model that is adapted, nothing: its file has it."""
+        state = super().state()
+        if self.policy.base is not None:
+            own = {f"network.{name}" for name in trained_state(self.policy.network, self.policy.base)}
+            weights = state["network"].items()
+            state["network"] = {n: v for n, v in weights if n in own or not n.startswith("network.")}
+        return state
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        super().load_state(state | {"network": self.module.state_dict() | state["network"]})
+
     def header(self) -> dict[str, dict]:
+        base = {} if self.policy.base is None else {"base": asdict(self.policy.base)}
         return {
-            "config": asdict(self.config) | asdict(self.stages),
+            "config": asdict(self.config) | asdict(self.stages) | base,
             "network_config": self.policy.network.config.to_dict(),
             "data": {
                 "windows": len(self.train_rows),
@@ -171,7 +185,7 @@ def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
 
 def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
     """Return parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
-    parameters = [*network.parameters()]
+    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     matrices = [parameter for parameter in parameters if parameter.ndim > 1]
     vectors = [parameter for parameter in parameters if parameter.ndim <= 1]
     return [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]

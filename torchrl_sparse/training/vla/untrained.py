@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
 
 from torchrl_sparse import keys
+from torchrl_sparse.networks.vla.adapters import add_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.rotations import ABSOLUTE_DIM
+from torchrl_sparse.storage.language_model import LanguageModel, load_base, read_language_model
+from torchrl_sparse.storage.vla import AdaptedBase
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 __all__ = ["untrained_policy"]
@@ -29,6 +34,8 @@ def untrained_policy(
     cameras: Sequence[str],
     changes: Mapping[str, Any] | None = None,
     seed: int = 0,
+    base: str | Path | None = None,
+    rank: int = 16,
 ) -> VLAPolicy:
     """Return a policy whose inputs, outputs, words and normaliser are those of demonstrations.
 
@@ -38,20 +45,32 @@ def untrained_policy(
         cameras: names of the images that the policy observes.
         changes: fields of `VLAConfig`, nested as there, that shall differ from those of ``size``.
         seed: of the weights.
+        base: file of the language model that is the decoder, adapted; None for one with random weights.
+        rank: of the adapters.
 
     Raises:
-        ValueError: for another size.
+        ValueError: for another size, or a file that is no language model.
     """
     data = demos.episodes.data
     action = data[keys.ACTION]
     grippers = range(ABSOLUTE_DIM - 1, action.shape[-1], ABSOLUTE_DIM)
-    words = sorted({word for text in demos.instructions for word in text.lower().split()})
+    normalizer = QuantileNormalizer.fit(data[keys.STATE], action, gripper=grippers)
+    config = _fitting_config(demos, size, cameras, changes or {})
     torch.manual_seed(seed)
-    return VLAPolicy(
-        VLANetwork(_fitting_config(demos, size, cameras, changes or {})),
-        QuantileNormalizer.fit(data[keys.STATE], action, gripper=grippers),
-        WordTokenizer(words),
-    )
+    if base is not None:
+        return _adapting(config, normalizer, read_language_model(base), rank)
+    words = sorted({word for text in demos.instructions for word in text.lower().split()})
+    return VLAPolicy(VLANetwork(config), normalizer, WordTokenizer(words))
+
+
+def _adapting(
+    config: VLAConfig, normalizer: QuantileNormalizer, language: LanguageModel, rank: int
+) -> VLAPolicy:
+    network = add_adapters(VLANetwork(replace(config, **language.sizes)), rank)
+    load_base(network, language)
+    policy = VLAPolicy(network, normalizer, language.tokenizer)
+    policy.base = AdaptedBase(language.sha256, rank)
+    return policy
 
 
 def _fitting_config(

@@ -1,0 +1,52 @@
+"""The matrix products of a decoder alone, beside a large one: is a query at the machine's arithmetic limit?
+
+The products are those of a dense query, one layer's after the other's on their own weights, so that what is fetched from memory
+is what a query fetches. The large one, square, is what the machine does at best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from torchrl_sparse.evaluation.latency.vla_cases import VLACase
+
+__all__ = ["ProductCall", "product_calls"]
+
+_SIDE = 2048
+
+
+@dataclass(frozen=True)
+class ProductCall:
+    """Products to time: the call, and its FLOPs, 2 * MAC."""
+
+    call: Callable[[], Any]
+    flops: float
+
+
+def product_calls(case: VLACase) -> dict[str, ProductCall]:
+    """Return the decoder's linear layers, its attention, and the large product: name -> call."""
+    sequence, config = case.sequence().hidden, case.network.config
+    layers, length = case.network.decoder.llama.layers, sequence.shape[1]
+    inputs = {width: sequence.new_ones(1, length, width) for width in (config.llm.dim, config.llm.mlp)}
+    linear = [(part, inputs[part.in_features]) for part in layers.modules() if isinstance(part, nn.Linear)]
+    heads = torch.randn_like(sequence).unflatten(-1, (config.llm.heads, -1)).transpose(1, 2)
+    square = torch.randn(_SIDE, _SIDE, dtype=sequence.dtype, device=sequence.device)
+
+    def attend() -> None:
+        for _ in layers:
+            functional.scaled_dot_product_attention(heads, heads, heads)
+
+    return {
+        "linear layers": ProductCall(
+            lambda: [part(x) for part, x in linear],
+            2.0 * length * sum(part.weight.numel() for part, _ in linear),
+        ),
+        "attention": ProductCall(attend, 4.0 * len(layers) * config.llm.dim * length**2),
+        "large square": ProductCall(lambda: square @ square, 2.0 * _SIDE**3),
+    }
