@@ -2,6 +2,7 @@
 
 import os
 
+import gguf
 import numpy as np
 import pytest
 import torch
@@ -45,7 +46,6 @@ def test_quantised_tensors_are_what_their_blocks_mean(tmp_path, kind, quantise):
 
 
 def test_the_package_gguf_reads_the_same(tmp_path):
-    gguf = pytest.importorskip("gguf", reason="the package gguf is not installed")
     tensors = llama_tensors(tiny_weights())
     for kind, quantise in ((3, q4_1), (8, q8_0)):
         tensors[f"more.{kind}"] = (
