@@ -1,8 +1,9 @@
 """GGUF, llama.cpp's files of language models: what a header says, and tensors, dequantised. Data only; nothing is executed.
 
 A file is ``"GGUF" | version | counts | metadata | descriptions of tensors | their data``, little-endian throughout. Quantised
-are blocks of 32 numbers with a scale of their own. Every length is compared with the bytes that are there before it is used. llama.cpp's own
-package ``gguf`` does not: 60 bytes that claim 2**36 numbers keep it reading without end. Tests hold what is read against it.
+are blocks of 32 numbers with a scale of their own. Every length is compared with the bytes that are there before it is used.
+llama.cpp's own package ``gguf`` does not: 60 bytes that claim 2**36 numbers keep it reading without end. Tests hold what is
+read against it.
 """
 
 from __future__ import annotations
