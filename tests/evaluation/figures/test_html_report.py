@@ -3,6 +3,8 @@
 import json
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
+from shutil import copyfile
 
 import pytest
 
@@ -10,8 +12,11 @@ from tests.evaluation import synthetic
 from tests.evaluation.results.test_realtime import DENSE, FAST, build
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
+from torchrl_sparse.evaluation.results.page_rows import KINDS, read_tables
 from torchrl_sparse.evaluation.results.realtime import save_realtime
 from torchrl_sparse.evaluation.results.schema import save_results
+
+ASSETS = Path(__file__).parents[3] / "assets"
 
 
 class Page(HTMLParser):
@@ -103,6 +108,27 @@ def test_pictures_belong_to_the_nearest_run(runs, tmp_path):
     save_results(synthetic.make_results(20, names=("dense",)), runs / "results.json")
     write_report(runs, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().count("YSB2aWRlbw==") == 1
+
+
+def test_files_that_nothing_is_drawn_of_show_all_their_tables(tmp_path):
+    names = ["engine/engine_images", "engine/query_quiet", "vla_smollm2/vla_latency", "statistics/aggregate"]
+    names += [f"statistics/{name}" for name in ("stopping", "carried_noise_Lift", "offline_agreement")]
+    names += ["statistics/offline_errors_Lift"]
+    for name in names:
+        copyfile(ASSETS / f"{name}.json", tmp_path / f"{Path(name).name}.json")
+    assert write_report(tmp_path, tmp_path / "report.html") == {}
+    text = (tmp_path / "report.html").read_text()
+    assert Page(text).open == []
+    tables = [table for name in names for table in read_tables(ASSETS / f"{name}.json")]
+    assert text.count("<table>") == text.count("<h3>") == len(tables)
+    assert all(f"<h3>{table}</h3>" in text for table in tables)
+
+
+def test_every_file_of_results_that_is_shipped_can_be_shown():
+    shipped = [path for path in ASSETS.rglob("*.json") if path.name.startswith(KINDS)]
+    assert {path.name.startswith("query") for path in shipped} == {True, False}
+    for path in shipped:
+        assert all(table.rows for table in read_tables(path).values()), path
 
 
 def test_a_folder_without_results_is_refused(tmp_path):

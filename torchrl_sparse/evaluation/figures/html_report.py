@@ -1,4 +1,4 @@
-"""Any set of ``results.json``, ``realtime.json`` and ``acceleration.json`` as one HTML page that needs nothing else.
+"""Any set of files of results as one HTML page that needs nothing else.
 
 Tables and figures are made from the files alone; pictures and videos that lie beside them are embedded as data URIs. A
 content security policy forbids the page every request, and the template escapes everything that was read from a file.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import base64
 import os
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchrl_sparse.evaluation.figures.acceleration import plot_acceleration
@@ -23,10 +23,11 @@ from torchrl_sparse.evaluation.results.acceleration import (
     acceleration_rows,
     load_acceleration,
 )
+from torchrl_sparse.evaluation.results.page_rows import KINDS, Row, read_tables
 from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, realtime_note, realtime_rows
 from torchrl_sparse.evaluation.results.report import results_note, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, Results, load_results
-from torchrl_sparse.evaluation.results.tables import LEFT
+from torchrl_sparse.evaluation.results.tables import LEFT, select_columns
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["find_runs", "write_report"]
@@ -47,7 +48,7 @@ def _plots_of_acceleration(results: Acceleration) -> dict[str, Callable[..., Pat
     return {"error to demonstrations against latency": plot_acceleration}
 
 
-_KINDS = {  # by the beginning of a file's name: results.json, results_400.json
+_DRAWN = {  # by the beginning of a file's name, what is drawn of it too: results.json, results_400.json
     "acceleration": (load_acceleration, acceleration_rows, acceleration_note, _plots_of_acceleration),
     "results": (load_results, results_rows, results_note, _plots_of_results),
     "realtime": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
@@ -75,10 +76,10 @@ class Medium:
 
 @dataclass(frozen=True)
 class Run:
-    """A file of results: its table, notes and figures, or what is wrong with it."""
+    """A file of results: its tables by name, notes and figures, or what is wrong with it."""
 
     name: str
-    rows: Sequence[dict[str, str]] = ()
+    tables: Mapping[str, Sequence[Row]] = field(default_factory=dict)
     note: str = ""
     figures: Sequence[Medium] = ()
     fault: str = ""
@@ -86,21 +87,34 @@ class Run:
     @classmethod
     def read(cls, file: Path, name: str) -> Run:
         """Read a file and draw its figures."""
-        load, make_rows, make_note, find_plots = _KINDS[_kind(file)]
         try:
-            results = load(file)
+            return cls._drawn(file, name) if _is_drawn(file) else cls(name, _tables(file))
         except (ValueError, OSError) as error:
             return cls(name, fault=str(error))
+
+    @classmethod
+    def _drawn(cls, file: Path, name: str) -> Run:
+        load, make_rows, make_note, find_plots = _DRAWN[_beginning(file)]
+        results = load(file)
         with tempfile.TemporaryDirectory() as folder:
             figures = [
                 Medium.read(plot(results, Path(folder) / "figure.png"), caption)
                 for caption, plot in find_plots(results).items()
             ]
-        return cls(name, make_rows(results), make_note(results), figures)
+        return cls(name, {"": make_rows(results)}, make_note(results), figures)
 
 
-def _kind(file: Path) -> str:
+def _tables(file: Path) -> dict[str, list[dict[str, str]]]:
+    """Return every table of a file that nothing is drawn of, with the columns that it shows."""
+    return {name: select_columns(found.rows, found.columns) for name, found in read_tables(file).items()}
+
+
+def _beginning(file: Path) -> str:
     return file.stem.partition("_")[0]
+
+
+def _is_drawn(file: Path) -> bool:
+    return _beginning(file) in _DRAWN
 
 
 def find_runs(root: str | os.PathLike) -> list[Path]:
@@ -109,10 +123,11 @@ def find_runs(root: str | os.PathLike) -> list[Path]:
     Raises:
         FileNotFoundError: if there is none.
     """
-    found = sorted(path for path in Path(root).rglob("*.json") if _kind(path) in _KINDS)
+    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith(KINDS))
     if not found:
+        others = (kind for kind in KINDS if kind not in _DRAWN)
         raise FileNotFoundError(
-            f"{root}: expected {' or '.join(f'{kind}.json' for kind in _KINDS)} in it or below it, got none"
+            f"{root}: expected {' or '.join(f'{kind}.json' for kind in (*_DRAWN, *others))} in it or below it, got none"
         )
     return found
 

@@ -10,7 +10,7 @@ from typing import Literal
 from torchrl_sparse.evaluation.statistics.carried_noise import CarriedNoise
 from torchrl_sparse.storage.json import read_json, write_json
 
-__all__ = ["CarriedNoiseResults", "load_carried_noise", "save_carried_noise"]
+__all__ = ["CarriedNoiseResults", "carried_noise_rows", "load_carried_noise", "save_carried_noise"]
 
 
 @dataclass(frozen=True)
@@ -46,3 +46,16 @@ def load_carried_noise(path: str | os.PathLike) -> CarriedNoiseResults:
 def save_carried_noise(results: CarriedNoiseResults, path: str | os.PathLike) -> Path:
     """Write a ``carried_noise_TASK.json`` in one piece or not at all; return the path."""
     return write_json(path, results)
+
+
+def carried_noise_rows(results: CarriedNoiseResults) -> list[dict[str, str]]:
+    """Return a row for every sampler: how its last prediction follows its first noise, and its answers."""
+    return [
+        {
+            "sampler": name,
+            "correlation with the first noise": f"{chain.correlation[-1]:+.2f}",
+            "spread": f"{chain.spread:.3f}",
+            "error": f"{chain.error:.3f}",
+        }
+        for name, chain in results.chains.items()
+    ]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
+from torchrl_sparse.evaluation.results.carried_noise import carried_noise_rows, load_carried_noise
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.engine_report import (
     COLUMNS,
@@ -15,12 +16,14 @@ from torchrl_sparse.evaluation.results.engine_report import (
     image_part_rows,
     load_engine_results,
 )
+from torchrl_sparse.evaluation.results.offline import agreement_rows, error_rows, load_offline
 from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
+from torchrl_sparse.evaluation.results.stopping import load_stopping, stopping_rows
 from torchrl_sparse.evaluation.results.text import percent_text
 from torchrl_sparse.evaluation.results.vla_report import (
     load_vla_results,
@@ -31,7 +34,7 @@ from torchrl_sparse.evaluation.results.vla_report import (
 from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 
-__all__ = ["Row", "Table", "read_table"]
+__all__ = ["KINDS", "Row", "Table", "read_table", "read_tables"]
 
 Row = Mapping[str, str]
 
@@ -60,7 +63,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
 
     Args:
         path: ``results*.json``, ``acceleration*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``,
-            ``query*.json``, ``vla_latency*.json`` or ``offline_agreement*.json``.
+            ``query*.json``, ``vla_latency*.json``, ``offline_agreement*.json``, ``offline_errors*.json``,
+            ``carried_noise*.json`` or ``stopping*.json``.
         which: of the tables of the file, where it has several.
         pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
 
@@ -68,19 +72,23 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
         FileNotFoundError: if the file is not there.
         ValueError: if its name is of no kind, the file is of no use, or it has no such table.
     """
-    kind = next((kind for kind in _READERS if path.name.startswith(kind)), None)
-    if kind is None:
-        names = ", ".join(f"{kind}*.json" for kind in _READERS)
+    if not path.name.startswith(KINDS):
+        names = ", ".join(f"{kind}*.json" for kind in KINDS)
         raise ValueError(f"expected a file {names}, got {path.name}")
     if pairs:
         return _pairs(path, pairs)
     if which in _OF_EPISODES:
         return _OF_EPISODES[which](path)
-    tables = _READERS[kind](path)
+    tables = read_tables(path)
     name = which or next(iter(tables))
     if name not in tables:
         raise ValueError(f"rows: expected one of {', '.join(tables)}, got {name!r}")
     return tables[name]
+
+
+def read_tables(path: Path) -> dict[str, Table]:
+    """Read all tables of such a file that its episodes are not needed for, by name."""
+    return next(read for kind, read in _READERS.items() if path.name.startswith(kind))(path)
 
 
 def _results(path: Path) -> dict[str, Table]:
@@ -200,6 +208,22 @@ def _agreement(path: Path) -> dict[str, Table]:
     }
 
 
+def _offline(path: Path) -> dict[str, Table]:
+    results = load_offline(path)
+    rows = {"methods": error_rows(results), "agreement": agreement_rows(results)}
+    return {name: _table(results.task, of_one) for name, of_one in rows.items()}
+
+
+def _carried_noise(path: Path) -> dict[str, Table]:
+    results = load_carried_noise(path)
+    return {"samplers": _table(results.task, carried_noise_rows(results))}
+
+
+def _stopping(path: Path) -> dict[str, Table]:
+    results = load_stopping(path)
+    return {name: _table(f"{results.trials} trials", rows) for name, rows in stopping_rows(results).items()}
+
+
 _OF_EPISODES = {"ways": _ways, "scores": _scores}
 _READERS = {
     "results": _results,
@@ -210,4 +234,9 @@ _READERS = {
     "query": _query,
     "vla_latency": _vla,
     "offline_agreement": _agreement,
+    "offline_errors": _offline,
+    "carried_noise": _carried_noise,
+    "stopping": _stopping,
 }
+KINDS = tuple(_READERS)
+"""What the name of a file of results begins with."""

@@ -20,6 +20,7 @@ __all__ = [
     "load_stopping",
     "save_stopping",
     "simulate_stopping",
+    "stopping_rows",
 ]
 
 # Success and mean steps of solved episodes of the dense policies here, rounded.
@@ -109,3 +110,23 @@ def load_stopping(path: str | os.PathLike) -> StoppingResults:
 def save_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
     """Write a ``stopping.json`` in one piece or not at all; return the path."""
     return write_json(path, results)
+
+
+def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
+    """Return two tables, of false claims where a method is worse by the margin, and of episodes saved."""
+    claims = [
+        {"task": one.task, "margin": one.margin, "non-inferior all the same": f"{one.rate:.1%}"}
+        for one in results.type_one
+    ]
+    saved = [
+        {
+            "task": one.task,
+            "true difference, points": f"{100 * one.difference:+.0f}",
+            "time vs dense": f"{one.ratio:.2f}",
+            "episodes saved": f"{one.savings.saved:.0%}",
+            "non-inferior": f"{one.savings.non_inferior:.0%}",
+            "inferior": f"{one.savings.inferior:.0%}",
+        }
+        for one in results.savings
+    ]
+    return {"claims": claims, "saved": saved}
