@@ -163,3 +163,11 @@ def test_the_version_of_robosuite_is_read_where_it_is_noted(published, tmp_path,
 
     path = write_checkpoint(tmp_path / "a.ckpt", published, change=note)
     assert DiffusionPolicy.from_pretrained(path).source["robosuite"] == "1.4.1"
+
+
+def test_the_version_of_robosuite_may_stand_beside_the_weights(published, tmp_path):
+    def note(payload):
+        payload["env_meta"] = {"env_name": "Lift", "env_version": "1.4.1"}
+
+    path = write_checkpoint(tmp_path / "a.ckpt", published, change=note)
+    assert DiffusionPolicy.from_pretrained(path).source["robosuite"] == "1.4.1"

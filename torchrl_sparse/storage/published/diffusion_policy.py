@@ -112,7 +112,8 @@ _READERS = {
 def _robosuite_version(config: PublishedConfig, payload: Mapping) -> str | None:
     """Return the version that robomimic's ``env_meta`` notes; None where a checkpoint has none."""
     if "env_meta" in payload:
-        return PublishedConfig(payload).get("env_meta.env_version", str, None)
+        noted = PublishedConfig({"env_meta": payload["env_meta"]})  # tensors stand beside it
+        return noted.get("env_meta.env_version", str, None)
     places = (f"{place}env_meta.env_version" for place in ("", "task.", "task.env_runner."))
     return next(filter(None, (config.get(place, str, None) for place in places)), None)
 
