@@ -60,6 +60,9 @@ def main(config: DictConfig) -> None:
     budget.save_pretrained(out)
     plot_token_budget(budget, out.with_suffix(".png"))
     print(f"{out}: {config.method}@{number:g}, {config.measure} within {config.tolerance:g} of dense")
+    base = "" if config.base is None else f" base={config.base}"
+    methods = f"methods=[dense,{config.method}@{number:g}]"
+    print(f"next: torchrl-sparse benchmark_vla task={config.task} policy={config.policy}{base} {methods}")
 
 
 def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:

@@ -69,9 +69,8 @@ def equal_pruners(
         raise ValueError(f"equal_to: expected one of {', '.join(pruners)}, got {name!r}")
     share = VLACase(policy, {name: pruners[name]}).answer(name)[keys.KEPT].item()
     share /= policy.network.config.num_visual
-    before = (
-        FastVPruner().layer / policy.network.config.llm.layers
-    )  # the share of layers that see every token
+    # the share of layers that see every token
+    before = FastVPruner().layer / policy.network.config.llm.layers
     if share <= before:
         raise ValueError(
             f"equal_to: expected a method that keeps more than {before:.0%}, got {share:.0%} of {name}"

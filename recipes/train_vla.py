@@ -26,7 +26,7 @@ from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.vla import VLASource
-from torchrl_sparse.training.demonstrations import TrainConfig
+from torchrl_sparse.training.demonstrations import TrainConfig, trained_parameters
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
@@ -69,7 +69,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
         f"{len(episodes.data)} steps, {len(trainer.train_rows)} training windows; "
-        f"{sum(p.numel() for p in policy.network.parameters() if p.requires_grad):,} parameters to train"
+        f"{sum(p.numel() for p in trained_parameters(policy.network)):,} parameters to train"
     )
     return trainer
 

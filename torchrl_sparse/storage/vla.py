@@ -128,9 +128,8 @@ def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = 
         config = VLAConfig.from_dict(stored.network)
         tokenizer = tokenizer_from_config(stored.tokenizer) if language is None else language.tokenizer
         _check_base(config, language)
-        with torch.device(
-            "meta"
-        ):  # the configuration is compared with the weights before memory is taken for it
+        # the configuration is compared with the weights before memory is taken for it
+        with torch.device("meta"):
             own = trained_state(_build(config, stored.base), stored.base)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.training.trainer import Trainer
 
-__all__ = ["DemonstrationTrainer", "TrainConfig", "split_windows"]
+__all__ = ["DemonstrationTrainer", "TrainConfig", "split_windows", "trained_parameters"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class DemonstrationTrainer(Trainer):
     ) -> None:
         self.train_rows, self.val_rows = train_rows, val_rows
         self._ema = EMAModel(
-            _trained(module),
+            trained_parameters(module),
             decay=config.ema_max_decay,
             power=config.ema_power,
             update_after_step=0,
@@ -117,7 +117,7 @@ class DemonstrationTrainer(Trainer):
 
     def train_step(self) -> dict[str, float]:
         losses = super().train_step()
-        self._ema.step(_trained(self.module))
+        self._ema.step(trained_parameters(self.module))
         return losses
 
     @torch.no_grad()
@@ -135,7 +135,7 @@ class DemonstrationTrainer(Trainer):
     def averaged(self) -> nn.Module:
         """Return a copy of the module with the averaged weights, in evaluation mode."""
         module = copy.deepcopy(self.module).eval()
-        self._ema.copy_to(_trained(module))
+        self._ema.copy_to(trained_parameters(module))
         return module
 
     def state(self) -> dict[str, Any]:
@@ -148,15 +148,16 @@ class DemonstrationTrainer(Trainer):
 
     @contextmanager
     def _averaged_weights(self) -> Iterator[None]:
-        self._ema.store(_trained(self.module))
-        self._ema.copy_to(_trained(self.module))
+        self._ema.store(trained_parameters(self.module))
+        self._ema.copy_to(trained_parameters(self.module))
         try:
             yield
         finally:
-            self._ema.restore(_trained(self.module))
+            self._ema.restore(trained_parameters(self.module))
 
 
-def _trained(module: nn.Module) -> list[nn.Parameter]:
+def trained_parameters(module: nn.Module) -> list[nn.Parameter]:
+    """Return the parameters of a module that are not frozen."""
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 

@@ -3,6 +3,7 @@
 import itertools
 from pathlib import Path
 from time import perf_counter
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, Sampler
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.evaluation.latency import profile
 from torchrl_sparse.evaluation.latency.measure import usable_cores
 from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
@@ -62,6 +64,22 @@ def test_every_sampler_is_timed_on_every_number_of_threads(policy):
     seconds = thread_seconds(policy.network, samplers, [1, 2], repeats=3)
     assert {name: list(counts) for name, counts in seconds.items()} == {"dense": [1, 2], "ddim1": [1, 2]}
     assert all(second > 0 for counts in seconds.values() for second in counts.values())
+
+
+def test_times_are_those_of_the_sampler_and_the_threads(policy, monkeypatch):
+    """Told by a stand-in for the engine, since a clock may say anything."""
+
+    def engine(network, sampler, threads):
+        return SimpleNamespace(denoise=lambda noise, cond: (sampler.num_inference_steps, threads))
+
+    def measure(calls, repeats, warmup):
+        return {name: SimpleNamespace(p50=call()) for name, call in calls.items()}
+
+    monkeypatch.setattr(profile, "NativeEngine", engine)
+    monkeypatch.setattr(profile, "measure_latency", measure)
+    samplers = {"dense": Sampler("ddpm", 6), "ddim1": Sampler("ddim", 1)}
+    seconds = thread_seconds(policy.network, samplers, [1, 2], repeats=3)
+    assert seconds == {"dense": {1: (6, 1), 2: (6, 2)}, "ddim1": {1: (1, 1), 2: (1, 2)}}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])

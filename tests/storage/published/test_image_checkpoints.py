@@ -59,9 +59,8 @@ def test_a_chain_of_100_steps_is_the_published_one(published, checkpoint, engine
     policy(td)
     cond = published.cond(theirs)
     assert cond[..., :128].std(0).mean() > 1e-3  # features tell the pictures apart
-    torch.testing.assert_close(
-        td[keys.COND], cond, atol=1e-5, rtol=0
-    )  # packed convolutions sum in another order
+    # packed convolutions sum in another order
+    torch.testing.assert_close(td[keys.COND], cond, atol=1e-5, rtol=0)
     sample = torch.randn(2, 10, 10)
     with torch.no_grad():
         eps = policy.network(sample, 50, cond)

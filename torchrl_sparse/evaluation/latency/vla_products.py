@@ -1,7 +1,8 @@
 """The matrix products of a decoder alone, beside a large one: is a query at the machine's arithmetic limit?
 
 The products are those of a dense query, one layer's after the other's on their own weights, so that what is fetched from memory
-is what a query fetches. The large one, square, is what the machine does at best.
+is what a query fetches. The large one, square, is what the machine does at best: by oneDNN where PyTorch has it, see
+`torchrl_sparse.evaluation.latency.limits.measure_multiply_adds`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase
 
 __all__ = ["ProductCall", "product_calls"]
@@ -36,7 +38,8 @@ def product_calls(case: VLACase) -> dict[str, ProductCall]:
     inputs = {width: sequence.new_ones(1, length, width) for width in (config.llm.dim, config.llm.mlp)}
     linear = [(part, inputs[part.in_features]) for part in layers.modules() if isinstance(part, nn.Linear)]
     heads = torch.randn_like(sequence).unflatten(-1, (config.llm.heads, -1)).transpose(1, 2)
-    square = torch.randn(_SIDE, _SIDE, dtype=sequence.dtype, device=sequence.device)
+    square, out = (sequence.new_ones(_SIDE, _SIDE) for _ in range(2))
+    multiply = make_linear(square, square[0])
 
     def attend() -> None:
         for _ in layers:
@@ -48,5 +51,5 @@ def product_calls(case: VLACase) -> dict[str, ProductCall]:
             2.0 * length * sum(part.weight.numel() for part, _ in linear),
         ),
         "attention": ProductCall(attend, 4.0 * len(layers) * config.llm.dim * length**2),
-        "large square": ProductCall(lambda: square @ square, 2.0 * _SIDE**3),
+        "large square": ProductCall(lambda: multiply(square, out), 2.0 * _SIDE**3),
     }

@@ -20,7 +20,12 @@ from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.vla import trained_state
-from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
+from torchrl_sparse.training.demonstrations import (
+    DemonstrationTrainer,
+    TrainConfig,
+    split_windows,
+    trained_parameters,
+)
 from torchrl_sparse.training.trainer import checksum
 from torchrl_sparse.training.vla.grounding import Grounding, GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.loss import VLALoss
@@ -185,7 +190,7 @@ def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
 
 def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
     """Return parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
-    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    parameters = trained_parameters(network)
     matrices = [parameter for parameter in parameters if parameter.ndim > 1]
     vectors = [parameter for parameter in parameters if parameter.ndim <= 1]
     return [{"params": matrices, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
