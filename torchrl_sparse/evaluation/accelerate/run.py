@@ -255,6 +255,7 @@ def _play(
             log=episode_log(out, name),
             identity=method_identity(name, methods[name]) | settings,
             policy_device=methods[name].device,
+            num_envs=1,  # in a batch all would be stepped on until the last, perhaps a failure, ends
             workers=request.workers,
         )
 
