@@ -47,6 +47,7 @@ from .networks import (
 from .networks.vla import VLAConfig as VLAConfig
 from .policies import (
     DiffusionPolicy as DiffusionPolicy,
+    RealtimeChunking as RealtimeChunking,
     VLAPolicy as VLAPolicy,
     WarmStart as WarmStart,
 )

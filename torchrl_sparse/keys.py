@@ -28,6 +28,8 @@ constant                          shape, dtype           meaning
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``START``                         f32 [*B, H, A]         normalised actions that a query begins from, if not from noise
 ``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
+``KNOWN``                         f32 [*B, H, A]         normalised actions that a query is drawn to in every step
+``PULL``                          f32 [*B, H, 1]         how far, for each of them: 0 is not at all, 1 all the way
 ``RECALL``                        bool [*B, K, 3L]       pruned cells that reuse what the query before returned there
 ``QUERY``                         i64 [*B, 1]            queries of the episode before this one, for planners that count them
 ``FEATURES``                      f32 [*B, K, 3L, H, d]  what each block last computed in each step since the episode began
@@ -52,7 +54,8 @@ constant                          shape, dtype           meaning
 ``CHOSEN``                        i64 [*B, 1]            which of them
 ``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the query before, for policies that read it
 ``ELAPSED``                       i64 [*B, 1]            steps since that query; 0 at the beginning of an episode
-``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait
+``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait; a
+                                                         policy that is asked reads what is expected of its own
 ``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
 ``HOLD``                          f32 [*B, A]            the action that keeps the arm where it is
 ``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
@@ -86,6 +89,8 @@ REUSE = ("diffusion", "reuse")
 PRUNE_RATE = ("diffusion", "prune_rate")
 START = ("diffusion", "start")
 NUM_STEPS = ("diffusion", "num_steps")
+KNOWN = ("diffusion", "known")
+PULL = ("diffusion", "pull")
 RECALL = ("diffusion", "recall")
 QUERY = ("diffusion", "query")
 FEATURES = ("diffusion", "features")

@@ -14,7 +14,11 @@ from torchrl_sparse import keys
 from torchrl_sparse.control.plain import PlainLoop
 from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 
-_HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED)  # to policies that read them; no environment writes them
+_HANDED_OVER = (
+    keys.LAST_CHUNK,
+    keys.ELAPSED,
+    keys.DELAY,
+)  # to policies that read them; no environment writes them
 
 
 class ChunkExecutor(TensorDictModuleBase):
@@ -172,7 +176,13 @@ class ChunkExecutor(TensorDictModuleBase):
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
         if keys.LAST_CHUNK in wanted:
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
+        if keys.DELAY in wanted:
+            request.set(keys.DELAY, self._expected_delay(tensordict))
         return request
+
+    def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
+        """Return i64 [*B, 1]: steps that a query asked now will take; none in a world that waits."""
+        return torch.zeros_like(self._age(tensordict))
 
     def _ask(self, request: TensorDictBase) -> TensorDictBase:
         """Return the policy's answers to queries [n], each the chosen one of its samples."""

@@ -2,15 +2,11 @@
 
 A query takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is for
 the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
-asynchronous inference. Two remedies for the seam between the chunks are published and not done here:
-
-* Real-time chunking (arXiv:2506.07339) inpaints: every denoising step is guided towards the actions that play meanwhile, by a
-  gradient through the network. Engines run a query's chain as one program without gradients, so it would run in the reference
-  engine alone, at several times the cost of what it is to make up for. Nearest to it here: the policy begins from the old
-  chunk (`WarmStart`), or samples several chunks of which the one that goes on best is played (``num_samples``).
-* VLASH (arXiv:2512.01031) shows the policy its robot's state rolled forward to when the answer begins, for which it trains the
-  policy. The policies here were not, and half of their state, such as the vector from hand to cube, is what no commanded pose
-  tells.
+asynchronous inference. What the seam between the chunks is mended with: `RealtimeChunking`, a start of the policy, draws each
+query to the actions that play meanwhile; `WarmStart` begins from them; with ``num_samples`` the chunk that goes on best is
+played. Not done here is VLASH (arXiv:2512.01031), which shows the policy its robot's state rolled forward to when the answer
+begins and trains it for that. The policies here were not trained so, and half of their state, such as the vector from hand
+to cube, is what no commanded pose tells.
 """
 
 from __future__ import annotations
@@ -100,6 +96,14 @@ class RealtimeExecutor(ChunkExecutor):
         old = keys.recall(tensordict, keys.MEANWHILE, meanwhile.shape[-2:], 0.0)
         tensordict.set(keys.MEANWHILE, torch.where(due[..., None], meanwhile, old))
 
+    def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
+        """Return i64 [*B, 1]: the latency that is given, else what the latest query took."""
+        return self._delay(tensordict) if self.latency is None else self._given_delay(tensordict)
+
+    def _given_delay(self, tensordict: TensorDictBase) -> Tensor:
+        latency = torch.tensor([self.latency], device=tensordict.device)
+        return delay_steps(latency, self.control_freq).expand(*tensordict.batch_size, 1)
+
     def _delay(self, tensordict: TensorDictBase) -> Tensor:
         """Return i64 [*B, 1]: steps that the latest query takes."""
         return keys.recall(tensordict, keys.DELAY, (1,), 0)
@@ -108,8 +112,7 @@ class RealtimeExecutor(ChunkExecutor):
         """Return i64 [*B, 1]: steps that the query just made takes."""
         if self.latency is None:
             return delay_steps(keys.read(tensordict, keys.LATENCY), self.control_freq)
-        latency = torch.tensor([self.latency], device=tensordict.device)
-        return delay_steps(latency, self.control_freq).expand(*tensordict.batch_size, 1)
+        return self._given_delay(tensordict)
 
     def _play_on(self, tensordict: TensorDictBase, before: TensorDictBase) -> Tensor:
         """Return f32 [*B, n, A]: what is left of the chunk played ``before``; entry 0 is for the present step."""

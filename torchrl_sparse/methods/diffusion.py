@@ -14,6 +14,7 @@ hand, as ``NAME.json`` or ``NAME/``; saved planners bring the sampler that they 
 ``uniform2_ddpm10``  the same of another sampler
 ``recall2``          every second step of the queries after an episode's first, others as in the one before; reference engine
 ``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
+``ddpm5_logsnr_rtc`` a sampler, whose queries are drawn to what is left of the last chunk
 ==================== ===========================================================================================
 
 A method of one's own is one line, executed before its name is used::
@@ -44,6 +45,7 @@ from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.diffusion.realtime_chunking import RealtimeChunking
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart
 
 __all__ = [
@@ -114,13 +116,17 @@ def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 def _sampler(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Take the sampler of the name."""
-    chain = inputs.name.partition("_warm")[0]
+    chain = inputs.name.partition("_warm")[0].removesuffix("_rtc")
     return Dense(), Sampler.from_name(chain, num_train_timesteps=inputs.sampler.num_train_timesteps)
 
 
 def _warm(inputs: MethodInputs) -> WarmStart:
     """Take the steps of the name."""
     return WarmStart(int(inputs.name.rpartition("_warm")[2]))
+
+
+def _realtime_chunking(inputs: MethodInputs) -> RealtimeChunking:
+    return RealtimeChunking()
 
 
 def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -171,6 +177,7 @@ METHODS: dict[str, Method] = {
     "ddim10": Method(_sampler, color="#E69F00"),
     "<sampler><steps>, <sampler>_<t>_<t>...": Method(_sampler, pattern=CHAIN_PATTERN),
     "<sampler>..._warm<steps>": Method(_sampler, pattern=rf"{CHAIN_PATTERN}_warm[1-9]\d*", start=_warm),
+    "<sampler>..._rtc": Method(_sampler, pattern=rf"{CHAIN_PATTERN}_rtc", start=_realtime_chunking),
     "uniform": Method(_uniform, color="#56B4E9"),
     "uniform<interval>[_<sampler>]": Method(
         _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"

@@ -1,5 +1,6 @@
 from .diffusion import (
     DiffusionPolicy as DiffusionPolicy,
+    RealtimeChunking as RealtimeChunking,
     WarmStart as WarmStart,
 )
 from .vla import VLAPolicy as VLAPolicy

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import Reuse, check_reuse, validate_mask
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -30,7 +31,12 @@ class Engine(Protocol):
     detail: str
 
     def denoise(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None = None,
+        reuse: Reuse = "block",
+        guide: Guide | None = None,
     ) -> Tensor:
         """Return normalised actions f32 [B, H, A], those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
@@ -40,6 +46,7 @@ class Engine(Protocol):
             mask: bool [B, K, 3L], True = pruned, row 0 all False; None prunes nothing. It is checked here, once a
                 query.
             reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`.
+            guide: actions that the query is drawn to; of the network's type and device.
 
         Raises:
             ValueError: naming what was expected and what came (:func:`check_query`).
@@ -66,6 +73,7 @@ def check_query(
     cond: Tensor,
     mask: Tensor | None = None,
     reuse: str = "block",
+    guide: Guide | None = None,
 ) -> None:
     """Refuse what no engine can run; the arguments are those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
@@ -77,11 +85,16 @@ def check_query(
         sampler.num_inference_steps,
         cond.shape[0] if isinstance(cond, Tensor) and cond.ndim else 1,
     )
-    for name, tensor, expected in (
-        ("cond", cond, (batch, network.n_obs_steps, network.cond_dim)),
-        ("noise", noise, (batch, num_steps, network.horizon, network.input_dim)),
-    ):
-        _check_input(name, tensor, expected, network.pos_emb)
+    chunk = network.horizon, network.input_dim
+    expected = {"cond": (batch, network.n_obs_steps, network.cond_dim), "noise": (batch, num_steps, *chunk)}
+    given = {"cond": cond, "noise": noise}
+    if guide is not None:
+        expected |= {"guide.actions": (batch, *chunk), "guide.pull": (batch, network.horizon, 1)}
+        given |= {"guide.actions": guide.actions, "guide.pull": guide.pull}
+    for name, shape in expected.items():
+        _check_input(name, given[name], shape, network.pos_emb)
+    if guide is not None and not ((guide.pull >= 0) & (guide.pull <= 1)).all():
+        raise ValueError(f"guide.pull: expected numbers in [0, 1], got {guide.pull.flatten().tolist()}")
     if mask is not None:
         validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
     check_reuse(reuse)

@@ -14,6 +14,7 @@ from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -54,6 +55,7 @@ def denoise(
     mask: Tensor | None = None,
     *,
     reuse: Reuse = "block",
+    guide: Guide | None = None,
     record: Callable[[int, int, Tensor], None] | None = None,
     replace: Callable[[int, int, Tensor], Tensor] | None = None,
 ) -> Tensor:
@@ -74,6 +76,7 @@ def denoise(
         reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`: ``"block"`` (BAC,
             arXiv:2506.13456), ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
             last-writer-wins) or ``"single"``.
+        guide: what every step's clean prediction is drawn to, see `Guide`; None draws nothing.
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
         replace: called likewise before that; returns what is added instead, and buffers keep what was there.
 
@@ -96,7 +99,7 @@ def denoise(
         >>> denoise(network, Sampler("ddim", 10), noise, cond, mask).shape
         torch.Size([3, 4, 7])
     """
-    check_query(network, sampler, noise, cond, mask, reuse)
+    check_query(network, sampler, noise, cond, mask, reuse, guide)
     computed = ComputedRows(mask)
     latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks)
     sample, cleans = noise[:, 0], ()
@@ -113,8 +116,8 @@ def denoise(
                 record(step, block, output)
         noise_k = noise[:, step + 1] if step + 1 < sampler.num_inference_steps else None
         eps, before = network.head_out(x), sample
-        sample = sampler.step(eps, step, before, noise_k, cleans)
-        cleans = sampler.remember(cleans, eps, step, before)
+        sample = sampler.step(eps, step, before, noise_k, cleans, guide)
+        cleans = sampler.remember(cleans, eps, step, before, guide)
     return sample
 
 
@@ -170,11 +173,16 @@ class ReferenceEngine:
         self._network, self._sampler = network, sampler
 
     def denoise(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None = None,
+        reuse: Reuse = "block",
+        guide: Guide | None = None,
     ) -> Tensor:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.denoise`; gradients flow."""
         check_weights(self._network)
-        return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse)
+        return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse, guide=guide)
 
     def refresh(self) -> None:
         """Do nothing: no weights are kept between queries."""

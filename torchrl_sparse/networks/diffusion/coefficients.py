@@ -9,20 +9,37 @@ With ``clip`` to [-1, 1] and the clean predictions of the two steps before, ever
 
 in diffusers' order of operations for DDPM (arXiv:2006.11239, Eq. 7: ``eps_weight = 0``) and DDIM (arXiv:2010.02502,
 Eq. 12: ``sample_weight = 0``), which remember no step. `torchrl_sparse.networks.diffusion.multistep` has the weights of
-those that do.
+those that do. A `Guide` changes the clean prediction before it is used: ``clean + pull * (actions - clean)``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 
-__all__ = ["StepCoefficients", "step_coefficients"]
+__all__ = ["Guide", "StepCoefficients", "step_coefficients"]
+
+
+class Guide(NamedTuple):
+    """Actions that a query's clean predictions are drawn to in every step, so that the others are denoised to fit them.
+
+    Attributes:
+        actions: normalised, f32 [B, H, A].
+        pull: f32 [B, H, 1], how far each is drawn: 0 leaves it free, at 1 the query ends in ``actions``.
+    """
+
+    actions: Tensor
+    pull: Tensor
+
+    def rows(self, rows: Tensor) -> Guide:
+        """Return the guide of those rows, bool [B] or i64 [n], alone."""
+        return Guide(self.actions[rows], self.pull[rows])
 
 
 @dataclass(frozen=True)
@@ -58,13 +75,20 @@ class StepCoefficients:
         """Return whether denoising step ``step`` adds noise."""
         return bool(self.spread[step] > 0)
 
-    def clean(self, step: int, sample: Tensor, eps: Tensor) -> Tensor:
+    def clean(self, step: int, sample: Tensor, eps: Tensor, guide: Guide | None = None) -> Tensor:
         """Return the clipped clean prediction of denoising step ``step``; arguments as of :meth:`update`."""
         clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
-        return clean.clamp(-self.clip, self.clip)
+        clean = clean.clamp(-self.clip, self.clip)
+        return clean if guide is None else clean + guide.pull * (guide.actions - clean)
 
     def update(
-        self, step: int, sample: Tensor, eps: Tensor, gaussian: Tensor | None, cleans: Sequence[Tensor] = ()
+        self,
+        step: int,
+        sample: Tensor,
+        eps: Tensor,
+        gaussian: Tensor | None,
+        cleans: Sequence[Tensor] = (),
+        guide: Guide | None = None,
     ) -> Tensor:
         """Return the sample after denoising step ``step``.
 
@@ -73,8 +97,10 @@ class StepCoefficients:
             sample, eps: of one shape.
             gaussian: standard normal of the same shape; None where :meth:`reads_noise` is False.
             cleans: clipped predictions of the steps before, the latest first; those of weight 0 may be missing.
+            guide: what the clean prediction is drawn to.
         """
-        result = self.clean_weight[step] * self.clean(step, sample, eps) + self.sample_weight[step] * sample
+        clean = self.clean(step, sample, eps, guide)
+        result = self.clean_weight[step] * clean + self.sample_weight[step] * sample
         result = result + self.eps_weight[step] * eps
         for weight, clean in zip((self.previous_weight, self.earlier_weight), cleans, strict=False):
             result = result + weight[step] * clean

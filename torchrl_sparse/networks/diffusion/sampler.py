@@ -36,7 +36,7 @@ import torch
 from diffusers import DDPMScheduler
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.coefficients import StepCoefficients, step_coefficients
+from torchrl_sparse.networks.diffusion.coefficients import Guide, StepCoefficients, step_coefficients
 from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 from torchrl_sparse.networks.diffusion.naming import KINDS, SamplerName
 from torchrl_sparse.networks.diffusion.spacing import spaced_timesteps
@@ -203,6 +203,7 @@ class Sampler:
         sample: Tensor,
         noise_k: Tensor | None = None,
         cleans: Sequence[Tensor] = (),
+        guide: Guide | None = None,
     ) -> Tensor:
         """Return the sample after denoising step ``k``.
 
@@ -213,6 +214,7 @@ class Sampler:
             noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by
                 deterministic samplers nor by the last step.
             cleans: what :meth:`remember` returned after the step before; empty before the first.
+            guide: what the clean prediction is drawn to, see `Guide`.
 
         Raises:
             IndexError: if ``k`` is not in 0..K-1.
@@ -228,16 +230,18 @@ class Sampler:
             raise ValueError(
                 f"cleans: expected {needed} predictions before step k={k} of {self.name}, got {len(cleans)}"
             )
-        return self.coefficients.update(k, sample, eps, noise_k, cleans)
+        return self.coefficients.update(k, sample, eps, noise_k, cleans, guide)
 
-    def remember(self, cleans: Sequence[Tensor], eps: Tensor, k: int, sample: Tensor) -> tuple[Tensor, ...]:
+    def remember(
+        self, cleans: Sequence[Tensor], eps: Tensor, k: int, sample: Tensor, guide: Guide | None = None
+    ) -> tuple[Tensor, ...]:
         """Return the clean predictions that the step after ``k`` reads, the latest first; empty where none does.
 
         Arguments: :meth:`step`.
         """
         if not self.coefficients.history:
             return ()
-        return (self.coefficients.clean(k, sample, eps), *cleans)[: self.coefficients.history]
+        return (self.coefficients.clean(k, sample, eps, guide), *cleans)[: self.coefficients.history]
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
         """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.

@@ -12,6 +12,7 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
 from torchrl_sparse.blocks.engine.recall import Memory
 from torchrl_sparse.blocks.engine.reference import ReferenceEngine, denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.philox import philox_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -51,6 +52,7 @@ class ActionDenoiser(TensorDictModuleBase):
 
     Attributes:
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
+        guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
         recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`; only
             the reference engine does that.
     """
@@ -65,7 +67,7 @@ class ActionDenoiser(TensorDictModuleBase):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
-        self.warm = self.recalls = False
+        self.warm = self.guided = self.recalls = False
         self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
         self.engine = EngineSlot(engine)
@@ -74,8 +76,14 @@ class ActionDenoiser(TensorDictModuleBase):
     @property
     def in_keys(self):
         own = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
-        warm, recalls = [keys.START, keys.NUM_STEPS], [keys.RECALL, keys.FEATURES]
-        return [*own, *(warm if self.warm else ()), *(recalls if self.recalls else ())]
+        recalls = [keys.RECALL, keys.FEATURES] if self.recalls else []
+        return [*own, *self._begin_keys(), *self._guide_keys(), *recalls]
+
+    def _begin_keys(self) -> list:
+        return [keys.START, keys.NUM_STEPS] if self.warm else []
+
+    def _guide_keys(self) -> list:
+        return [keys.KNOWN, keys.PULL] if self.guided else []
 
     @property
     def out_keys(self):
@@ -95,13 +103,9 @@ class ActionDenoiser(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
-        wanted = [
-            keys.COND,
-            keys.PRUNE_MASK,
-            keys.REUSE,
-            *((keys.START, keys.NUM_STEPS) if self.warm else ()),
-        ]
+        wanted = [keys.COND, keys.PRUNE_MASK, keys.REUSE, *self._begin_keys()]
         cond, mask, rules, *begin = (_flat(keys.read(tensordict, key), batch) for key in wanted)
+        guided = [_flat(keys.read(tensordict, key), batch).to(cond) for key in self._guide_keys()]
         shape = (self.network.horizon, self.network.input_dim)
         seed = tensordict.get(keys.SEED).reshape(-1)
         noise = NOISES[self.noise](seed, self.sampler.num_inference_steps, shape)
@@ -110,7 +114,8 @@ class ActionDenoiser(TensorDictModuleBase):
         if self.recalls:
             actions, flops = self._recall(tensordict, noise, cond, mask, rules.reshape(-1))
         else:
-            actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), *begin)
+            guide = Guide(*guided) if guided else None
+            actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), guide, *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
@@ -135,6 +140,7 @@ class ActionDenoiser(TensorDictModuleBase):
         cond: Tensor,
         mask: Tensor,
         rules: Tensor,
+        guide: Guide | None,
         start: Tensor | None = None,
         num_steps: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
@@ -142,14 +148,15 @@ class ActionDenoiser(TensorDictModuleBase):
         whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
         numbers = [whole] if num_steps is None else sorted(set(num_steps.flatten().tolist()))
         if numbers in ([], [whole]):
-            return self._follow_rules(noise, cond, mask, rules), mask_flops(sizes, mask)
+            return self._follow_rules(noise, cond, mask, rules, guide), mask_flops(sizes, mask)
         if not 1 <= numbers[0] <= numbers[-1] <= whole:
             raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
         actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
         for number in numbers:
             rows = num_steps.flatten() == number
             part = self._last_steps(number, noise[rows], mask[rows], start[rows].to(noise))
-            actions[rows] = self._follow_rules(part[0], cond[rows], part[1], rules[rows], number)
+            drawn = None if guide is None else guide.rows(rows)
+            actions[rows] = self._follow_rules(part[0], cond[rows], part[1], rules[rows], drawn, number)
             flops[rows] = mask_flops(sizes, part[1]).to(flops)
         return actions, flops
 
@@ -164,7 +171,13 @@ class ActionDenoiser(TensorDictModuleBase):
         return noise, mask
 
     def _follow_rules(
-        self, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor, number: int | None = None
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor,
+        rules: Tensor,
+        guide: Guide | None,
+        number: int | None = None,
     ) -> Tensor:
         """Denoise normalised actions, each row under the reuse rule of its own."""
         codes = sorted(set(rules.tolist()))
@@ -173,23 +186,31 @@ class ActionDenoiser(TensorDictModuleBase):
                 f"{keys.REUSE}: expected an index of {list(REUSE_RULES)} for each row, got {codes}"
             )
         if len(codes) == 1:
-            return self.run(noise, cond, mask, REUSE_RULES[codes[0]], number)
+            return self.run(noise, cond, mask, REUSE_RULES[codes[0]], number, guide)
         actions = torch.empty_like(noise[:, 0])
         for code in codes:
             rows = rules == code
-            actions[rows] = self.run(noise[rows], cond[rows], mask[rows], REUSE_RULES[code], number)
+            drawn = None if guide is None else guide.rows(rows)
+            part = noise[rows], cond[rows], mask[rows]
+            actions[rows] = self.run(*part, REUSE_RULES[code], number, drawn)
         return actions
 
     def run(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None, reuse: Reuse, number: int | None = None
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None,
+        reuse: Reuse,
+        number: int | None = None,
+        guide: Guide | None = None,
     ) -> Tensor:
         """Denoise normalised actions [B, H, A], all that the network predicts, in all steps or the last ``number``."""
         sampler, slot = self.sampler, self.engine
         if number not in (None, sampler.num_inference_steps):
             sampler, slot = self._tail(number)
         if self.network.training or cond.requires_grad:
-            return denoise(self.network, sampler, noise, cond, mask, reuse=reuse)
-        return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse)
+            return denoise(self.network, sampler, noise, cond, mask, reuse=reuse, guide=guide)
+        return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse, guide)
 
     def refresh(self) -> None:
         """Read all weights anew in the next query."""

@@ -64,7 +64,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
             which then reads as the `Dense` planner.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
-        start: what queries begin from: noise, or the last chunk after ``policy.start = WarmStart(1)``.
+        start: what queries begin from: noise, the last chunk after ``policy.start = WarmStart(1)``, or noise that is drawn to
+            the last chunk after ``policy.start = RealtimeChunking()``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
@@ -143,7 +144,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
-        self.module["denoise"].warm, self.module["denoise"].recalls = bool(start.out_keys), recalls
+        denoise = self.module["denoise"]
+        denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
+        denoise.recalls = recalls
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]

@@ -66,6 +66,12 @@ struct Model {
     const float* valid;         // [padded width]: 1 for each column, 0 for the padding
 };
 
+// What the clean predictions of one query are drawn to; null where they are not.
+struct Guide {
+    const float* actions;  // [horizon][action_dim]
+    const float* pull;     // [horizon], 0 to 1
+};
+
 // The MLP of a pruner, see pruner.py. A cell is a block of a denoising step.
 struct Pruner {
     Matrix obs, middle;  // observation -> what it adds to every cell; cell -> its second hidden layer
@@ -643,9 +649,10 @@ struct Query {
                 b.key_bias[first + o * m.heads + h] = dot(b.kv + o * ldk + h * b.head, layer.query_bias + h * b.head, b.head);
     }
 
-    // Predicts the noise from the residual stream and takes the sampler's step, with MEMORY of earlier clean predictions.
-    template <bool MEMORY>
-    void advance(int step, const float* noise) const {
+    // Predicts the noise from the residual stream and takes the sampler's step, with MEMORY of earlier clean predictions,
+    // GUIDED to actions.
+    template <bool MEMORY, bool GUIDED>
+    void advance(int step, const float* noise, const Guide& guide) const {
         normalise({0, m.horizon});
         const int lda = stride(m.action_dim);
         whole_product(b.y, b.ld, m.horizon, m.head, b.eps, lda);
@@ -658,6 +665,7 @@ struct Query {
                 const float eps = b.eps[t * lda + j];
                 float clean = (sample - c[0] * eps) / c[1];
                 clean = clean > m.clip ? m.clip : clean < -m.clip ? -m.clip : clean;
+                if constexpr (GUIDED) clean += guide.pull[t] * (guide.actions[t * m.action_dim + j] - clean);
                 float next = c[2] * clean + c[3] * sample + c[4] * eps;
                 if constexpr (MEMORY) {
                     const int at = t * lda + j;
@@ -669,7 +677,12 @@ struct Query {
             }
     }
 
-    void run(const uint8_t* pruned, const float* noise, const float* cond, float* actions) const {
+    template <bool GUIDED>
+    void finish(int step, const float* noise, const Guide& guide) const {
+        m.history ? advance<true, GUIDED>(step, noise, guide) : advance<false, GUIDED>(step, noise, guide);
+    }
+
+    void run(const uint8_t* pruned, const float* noise, const float* cond, const Guide& guide, float* actions) const {
         const int lda = stride(m.action_dim), size = m.horizon * m.action_dim, blocks = 3 * m.layers;
         encode(cond);
         Matrix constant = m.embed;  // of a step without a computed block: what all of them add goes into the bias
@@ -689,7 +702,7 @@ struct Query {
                 if (end < blocks) compute(step, end);
             }
             const float* const gaussian = step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr;
-            m.history ? advance<true>(step, gaussian) : advance<false>(step, gaussian);
+            guide.actions ? finish<true>(step, gaussian, guide) : finish<false>(step, gaussian, guide);
         }
         for (int t = rows.first; t < rows.last; t++) copy(b.sample + t * lda, m.action_dim, actions + t * m.action_dim);
     }
@@ -702,8 +715,8 @@ struct Query {
 };
 
 void denoise(const Model& m, const Member& who, const uint8_t* pruned, int slots, const float* noise, const float* cond,
-             float* actions, float* own, float* shared) {
-    Query(m, slots, who, own, shared).run(pruned, noise, cond, actions);
+             const Guide& guide, float* actions, float* own, float* shared) {
+    Query(m, slots, who, own, shared).run(pruned, noise, cond, guide, actions);
 }
 
 void run_blocks(const Model& m, const Member& who, int kind, float* own, float* shared) {

@@ -25,10 +25,11 @@ from torchrl_sparse.blocks.engine.native.library import (
     library,
     native_available,
 )
-from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, units, weight_type
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
@@ -165,14 +166,19 @@ class NativeEngine:
         return f"{INSTRUCTION_SETS[self._level]}, {self._weights} weights, {team}"
 
     def denoise(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None = None,
+        reuse: Reuse = "block",
+        guide: Guide | None = None,
     ) -> Tensor:
         """Return normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
         Raises:
             ValueError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
         """
-        check_query(self._network, self._sampler, noise, cond, mask, reuse)
+        check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
         self._check(mask)
         packed, slots = self._current(), num_buffers(reuse, self._dense.shape[1])
         if mask is None:
@@ -183,10 +189,12 @@ class NativeEngine:
             return actions
         mask, noise, cond = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
         threads = self._num_threads(len(cond))
-        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), actions.data_ptr()
+        drawn = [] if guide is None else [part.detach().contiguous() for part in guide]
+        guided = [part.data_ptr() for part in drawn] or [None, None]
+        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guided, actions.data_ptr()
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
+            library().sparse_guided(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
     def condition(self, state: Tensor, normalizer: Normalizer) -> Tensor | None:
@@ -202,7 +210,7 @@ class NativeEngine:
         state = state.contiguous()
         cond, (rows, steps, dim) = torch.empty_like(state), state.shape
         where = state.data_ptr(), cond.data_ptr()
-        finite = library().sparse_normalise(_units(normalizer), rows * steps, dim, *where)
+        finite = library().sparse_normalise(units(normalizer), rows * steps, dim, *where)
         return cond if finite else None
 
     def answer(
@@ -227,7 +235,7 @@ class NativeEngine:
         tensors = (tensor.data_ptr() for tensor in (cond, actions, chunk))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            query = rows, mask.data_ptr(), slots, noise.data_ptr(), _units(normalizer), *tensors
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), units(normalizer), *tensors
             library().sparse_answer(*where, *query, scratch.data_ptr())
         return chunk
 
@@ -289,9 +297,3 @@ class NativeEngine:
             raise ValueError("network: expected eval mode, got training mode (call network.eval())")
         if mask is not None and not mask.is_cpu:
             raise ValueError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")
-
-
-def _units(normalizer: Normalizer) -> ctypes.Array:
-    """Return ``struct Units`` of units.h, which points to the buffers of ``normalizer``."""
-    names = ("state_scale", "state_offset", "action_scale", "action_offset")
-    return (c_void_p * len(names))(*(normalizer._buffers[name].data_ptr() for name in names))

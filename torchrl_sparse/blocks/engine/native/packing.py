@@ -33,9 +33,10 @@ from torchrl_sparse.blocks.engine.folding import (
 from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.tensors import check_shapes
 
-__all__ = ["Model", "PackedNetwork", "weight_type"]
+__all__ = ["Model", "PackedNetwork", "units", "weight_type"]
 
 _WEIGHTS = ("float32", "float16", "bfloat16", "int8")
 
@@ -198,3 +199,9 @@ def _padded(tensor: Tensor, multiple: int, dim: int) -> Tensor:
     missing = -tensor.shape[dim] % multiple
     behind = tensor.ndim - 1 - dim % tensor.ndim
     return functional.pad(tensor, (0, 0) * behind + (0, missing))
+
+
+def units(normalizer: Normalizer) -> ctypes.Array:
+    """Return ``struct Units`` of units.h, which points to the buffers of ``normalizer``."""
+    names = ("state_scale", "state_offset", "action_scale", "action_offset")
+    return (c_void_p * len(names))(*(normalizer._buffers[name].data_ptr() for name in names))

@@ -25,6 +25,7 @@ from torchrl_sparse.blocks.engine.torch.program import build_loop
 from torchrl_sparse.blocks.engine.torch.tables import Tables
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -80,15 +81,20 @@ class TorchEngine:
         return f"{weight.device.type}, {packed}"
 
     def denoise(
-        self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, reuse: Reuse = "block"
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None = None,
+        reuse: Reuse = "block",
+        guide: Guide | None = None,
     ) -> Tensor:
         """See :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`; no gradients flow."""
-        check_query(self._network, self._sampler, noise, cond, mask, reuse)
+        check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
         if not len(cond):
             return torch.empty_like(noise[:, 0])
         tables, pool = self._current()
         with _in_weights_type(tables.device):
-            actions = self._denoise(tables, pool, noise, cond, mask, reuse)
+            actions = self._denoise(tables, pool, noise, cond, mask, reuse, guide)
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
     def refresh(self) -> None:
@@ -124,14 +130,15 @@ class TorchEngine:
         cond: Tensor,
         mask: Tensor | None,
         reuse: Reuse,
+        guide: Guide | None,
     ) -> Tensor:
         rows, masks = len(noise), self._host_masks(mask)
         if pool.captures:
-            noise, cond, masks = _padded(noise, cond, masks)
+            noise, cond, masks, guide = _padded(noise, cond, masks, guide)
         loop = build_loop(masks, tables.device, gather=not pool.captures)
         slots = 0 if loop.dense else num_buffers(reuse, self._network.num_blocks)
-        with pool.take(len(noise), slots) as workspace:
-            return workspace.denoise(loop, noise, cond)[:rows]
+        with pool.take(len(noise), slots, guide is not None) as workspace:
+            return workspace.denoise(loop, noise, cond, guide)[:rows]
 
     def _host_masks(self, mask: Tensor | None) -> np.ndarray:
         """Return the masks on the host, a single one if that is that of all rows."""
@@ -148,11 +155,13 @@ def _in_weights_type(device: torch.device) -> Iterator[None]:
         yield
 
 
-def _padded(noise: Tensor, cond: Tensor, masks: np.ndarray) -> tuple[Tensor, Tensor, np.ndarray]:
+def _padded(
+    noise: Tensor, cond: Tensor, masks: np.ndarray, guide: Guide | None
+) -> tuple[Tensor, Tensor, np.ndarray, Guide | None]:
     """Repeat the last row of a batch until it has a size that graphs are captured for."""
     rows = len(noise)
     index = np.minimum(np.arange(padded_batch(rows)), rows - 1)
     if len(masks) > 1:
         masks = masks[index]
     place = torch.from_numpy(index).to(noise.device)
-    return noise[place], cond[place], masks
+    return noise[place], cond[place], masks, None if guide is None else guide.rows(place)

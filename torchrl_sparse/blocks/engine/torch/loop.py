@@ -23,6 +23,7 @@ from torchrl_sparse.blocks.engine.torch.memory import Memory
 from torchrl_sparse.blocks.engine.torch.program import Loop, Operation, build_loop
 from torchrl_sparse.blocks.engine.torch.tables import Tables
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
+from torchrl_sparse.networks.diffusion.coefficients import Guide
 
 __all__ = ["Segment", "Workspace"]
 
@@ -42,10 +43,17 @@ class Workspace:
         capture: turns a segment into one that does the same faster; None leaves them as they are. With it, the whole
             dense loop is one segment, and a block that only some rows need computes all of them and keeps those: the
             number of rows is part of a captured segment, and one for each number would be a great many.
+        guided: whether every query has a guide, or none.
     """
 
     def __init__(
-        self, tables: Tables, batch: int, slots: int, capture: Callable[[Segment], Segment] | None = None
+        self,
+        tables: Tables,
+        batch: int,
+        slots: int,
+        capture: Callable[[Segment], Segment] | None = None,
+        *,
+        guided: bool = False,
     ) -> None:
         network, new = tables.network, tables.stem_weight.new_zeros
         rows, width = batch * network.horizon, network.n_emb
@@ -55,6 +63,7 @@ class Workspace:
         self._sample, self._clean, self._eps, *self._earlier = new(
             3 + tables.history, rows, network.input_dim
         ).unbind(0)
+        self._guide = Guide(torch.empty_like(self._sample), new(rows, 1)) if guided else None
         self._step_table = new(tables.num_steps, tables.coefficients.shape[1] + self._sample.numel())
         self._step_table[:, : tables.coefficients.shape[1]] = tables.coefficients
         self._step_row = torch.empty_like(self._step_table[0])
@@ -92,9 +101,12 @@ class Workspace:
         if self._tables.time is None:
             self._fold = capture(self._fold)
 
-    def denoise(self, loop: Loop, noise: Tensor, cond: Tensor) -> Tensor:
+    def denoise(self, loop: Loop, noise: Tensor, cond: Tensor, guide: Guide | None = None) -> Tensor:
         """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
         self._sample.copy_(noise[:, 0].flatten(0, 1))
+        if guide is not None:
+            for part, given in zip(self._guide, guide, strict=True):
+                part.copy_(given.flatten(0, 1))
         for earlier in self._earlier:
             earlier.zero_()
         # What step k adds is the gaussian of the transition to step k + 1; the last step adds none.
@@ -199,6 +211,8 @@ class Workspace:
         )
         torch.addcmul(sample, eps, noise_scale, out=clean)
         clean.div_(signal_scale).clamp_(-tables.clip, tables.clip)
+        if self._guide is not None:
+            clean.addcmul_(self._guide.actions - clean, self._guide.pull)
         torch.addcmul(self._gaussian, sample, sample_weight, out=sample)
         sample.addcmul_(clean, clean_weight)
         if tables.weighs_eps:

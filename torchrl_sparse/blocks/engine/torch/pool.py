@@ -43,20 +43,20 @@ class WorkspacePool:
         return self.new_capture is not None
 
     @contextmanager
-    def take(self, batch: int, slots: int) -> Iterator[Workspace]:
-        """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, for the caller alone."""
+    def take(self, batch: int, slots: int, guided: bool = False) -> Iterator[Workspace]:
+        """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, drawn to a guide or not, for the caller alone."""
         # On a GPU the next query may be launched before the last one has run, but in the same order only in one stream.
         stream = (
             torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None
         )
-        key = (batch, slots, stream)
+        key = (batch, slots, guided, stream)
         with self._lock:
             index = next((i for i, (known, _) in enumerate(self._free) if known == key), None)
             workspace = None if index is None else self._free.pop(index)[1]
         if workspace is None:
             # Each has a capture of its own: workspaces are used at the same time, and one that fails is not tried again.
             capture = self.new_capture() if self.new_capture is not None else None
-            workspace = Workspace(self._tables, batch, slots, capture)
+            workspace = Workspace(self._tables, batch, slots, capture, guided=guided)
         yield workspace
         with self._lock:
             self._free.append((key, workspace))
