@@ -19,6 +19,7 @@ from torchrl_sparse.evaluation.results.parts import (
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry
 from torchrl_sparse.evaluation.results.text import (
+    NONE_SOLVED,
     count_text,
     difference_text,
     mean_text,
@@ -195,6 +196,8 @@ def verdict_line(acceleration: Acceleration) -> str:
     told = f"It solved {count_text(ours.success)}, dense {count_text(dense.success)}"
     if ours.score and dense.score:
         told = f"Its score is {_score_text(ours.score)}, dense's {_score_text(dense.score)}"
+    if not dense.success.k and not dense.score:
+        return f"{chosen} {NONE_SOLVED}"
     if ours.is_right:
         return f"{chosen} {told}: non-inferior to dense in {' and in '.join(ours.verdicts)}."
     found = ", ".join(f"{verdict} in {what}" for what, verdict in ours.verdicts.items())

@@ -14,6 +14,7 @@ from torchrl_sparse.evaluation.results.schema import (
 )
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
+    NONE_SOLVED,
     count_text,
     difference_text,
     mean_text,
@@ -232,6 +233,8 @@ def results_note(results: AnyResults) -> str:
             f"{n} episodes cannot show non-inferiority at this margin even without one differing episode: "
             f"{episodes_needed(margin)} are needed."
         )
+    if not dense.success.k and not scored:
+        lines.append(NONE_SOLVED)
     return "\n".join(lines)
 
 

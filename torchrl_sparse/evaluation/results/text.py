@@ -5,6 +5,7 @@ from __future__ import annotations
 from torchrl_sparse.evaluation.results.parts import Difference, Interval, Success, TimeDifference
 
 __all__ = [
+    "NONE_SOLVED",
     "count_text",
     "difference_text",
     "mean_text",
@@ -15,6 +16,12 @@ __all__ = [
     "threads_text",
     "verdict_text",
 ]
+
+NONE_SOLVED = (
+    "Dense solved none: whatever a method loses, no verdict here can show it. Is the policy observed, and are its chunks "
+    "executed, as it was trained?"
+)
+"""What is said of episodes that tell methods apart by nothing."""
 
 
 def count_text(success: Success) -> str:

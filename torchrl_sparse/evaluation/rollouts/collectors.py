@@ -36,8 +36,7 @@ def running_collector(
 ) -> Iterator[BaseCollector]:
     """Run a collector without end while the block lasts, and deal the seeds among its environments; see `rollout_episodes`.
 
-    Its batches are [workers, environments, steps] of several processes, else [environments, steps]: of this process or, on
-    Ray, of the worker that was ready first.
+    Its batches are [environments, steps]: of this process, else of the worker that was ready first.
 
     Raises:
         WorkerDied: if a worker dies, while it starts or in the block, or has not started after ten minutes.
@@ -64,7 +63,7 @@ def running_collector(
     elif workers == 1:
         running = _here(make[0](), actor, frames_per_batch=count, **transforms, **options)
     else:
-        running = in_processes(make, actor, frames_per_batch=workers * frames, **transforms, **options)
+        running = in_processes(make, actor, frames_per_batch=frames, **transforms, **options)
     with running as collector:
         yield collector
 

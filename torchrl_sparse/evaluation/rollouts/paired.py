@@ -56,7 +56,7 @@ def rollout_episodes(
     """Run one episode per seed in a TorchRL ``Collector`` over a ``SerialEnv``, or several of them in processes.
 
     Seeds are dealt to the environments in turn. An environment that has done its own keeps stepping until the last
-    one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiSyncCollector`` runs as many
+    one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiAsyncCollector`` runs as many
     processes, and with ``backend="ray"`` a ``RayCollector`` as many Ray actors of one CPU, each with a copy of the actor.
     A worker that dies, be it while it starts, is reported as a warning, and the episodes that were under way run again: they
     come out the same, since nothing but its seed fixes an episode. Nothing but rounding, that is: PyTorch sums in another

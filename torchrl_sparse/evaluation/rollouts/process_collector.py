@@ -16,7 +16,7 @@ from typing import Any
 
 import cloudpickle
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import BaseCollector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, MultiAsyncCollector
 from torchrl.envs import EnvBase
 
 from torchrl_sparse.runtime.backends import WorkerDied
@@ -73,7 +73,6 @@ def _start_processes(
             [partial(_make_saved, file) for file in files],
             policy_factory=partial(_load, Path(folder) / "actor"),
             total_frames=-1,
-            cat_results="stack",
             # Without buffers, since words cannot lie in shared memory (tensordict makes arrays of them that no queue takes).
             use_buffers=False,
             num_threads=1,
@@ -91,8 +90,8 @@ def _make_saved(file: Path) -> EnvBase:
     return _load(file)()
 
 
-class _ProcessCollector(MultiSyncCollector):
-    """Workers that all start, in time, or are all ended."""
+class _ProcessCollector(MultiAsyncCollector):
+    """Workers that all start, in time, or are all ended. None waits for another: episodes are of unequal length."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._starting, self._lost = True, ""
