@@ -59,6 +59,8 @@ def test_several_files_are_one_table_or_stand_side_by_side():
     assert uniform[2] == "8.0 [5, 13], 7.94×"
     with pytest.raises(ValueError, match=r"methods: expected some of dense \| .*, got sag_played"):
         table(cells, ASSETS)
+    compared = f'{files} methods="dense | sag" cells="vs dense, points | speed-up"'
+    assert table(compared, ASSETS)[1][1] == "1.00×"  # dense is not compared with itself
 
 
 def test_published_figures_stand_before_ours():

@@ -53,7 +53,7 @@ def side_by_side(
 
     Args:
         tables: of the tasks. Of several of one task the first that has a method counts.
-        cells: columns whose texts, joined by commas, a cell shows.
+        cells: columns whose texts, joined by commas, a cell shows; of those that are empty it shows nothing.
         methods: the rows; all without it.
         published: figures to put in a column before each task's own.
         titles: task -> heading of its column, where that is another.
@@ -66,7 +66,9 @@ def side_by_side(
         for row in table.rows:
             if missing := [cell for cell in cells if cell not in row]:
                 raise ValueError(f"cells: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
-            found[table.task].setdefault(table.name(row), ", ".join(row[cell] for cell in cells))
+            found[table.task].setdefault(
+                table.name(row), ", ".join(filter(None, (row[cell] for cell in cells)))
+            )
     known = list(dict.fromkeys(name for texts in found.values() for name in texts))
     if unknown := [name for name in methods if name not in known]:
         raise ValueError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
