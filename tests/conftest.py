@@ -1,16 +1,10 @@
-"""Ctrl-C as in a terminal for every run of the tests; how many run at a time; where workers run, as a parameter of tests."""
+"""Ctrl-C as in a terminal for every run of the tests; where workers run, as a parameter of tests."""
 
-import os
 import signal
 
 import pytest
 
 from torchrl_sparse.runtime.backends import backend_runtime
-
-
-def pytest_xdist_auto_num_workers():
-    """One more than there are processors: tests of kills and recipes wait for processes of their own."""
-    return (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(scope="session", autouse=True)
