@@ -163,7 +163,9 @@ def test_table_says_when_episodes_cannot_suffice():
 def test_table_says_when_dense_solved_none():
     none = {"dense": run([False] * 4), "bac": run([False] * 4)}
     assert "Dense solved none" in format_table(build(none))
-    assert "Dense solved none" not in format_table(build({"dense": run([False, True]), "bac": run([False] * 2)}))
+    assert "Dense solved none" not in format_table(
+        build({"dense": run([False, True]), "bac": run([False] * 2)})
+    )
 
 
 def test_table_covers_the_methods_that_ran():
