@@ -56,7 +56,8 @@ class ColdStart(TensorDictModuleBase):
 
     A stage of one's own subclasses it, reads what it likes, and writes ``("diffusion", "start")`` f32 [*B, H, A], a
     normalised guess of the actions, and ``("diffusion", "num_steps")`` i64 [*B, 1], how many of the sampler's last steps
-    to take from there; K begins from noise.
+    to take from there; K begins from noise. Or ``("diffusion", "known")`` f32 [*B, H, A] and ``("diffusion", "pull")``
+    f32 [*B, H, 1], normalised actions that every step is drawn to, and how far.
     """
 
     in_keys = []
