@@ -50,10 +50,28 @@ def test_a_push_begins_behind_the_block_and_walks_round_it():
     start = state[3 * block : 3 * block + 2]
     goal = state[10 + 3 * square : 12 + 3 * square]
     ahead = (goal - start) / np.linalg.norm(goal - start)
-    state[8:10] = start - 0.03 * ahead  # in place: push
+    state[8:10] = start - 0.045 * ahead  # in place: push
     assert expert.command(state) @ ahead == pytest.approx(np.linalg.norm(expert.command(state)))
-    state[8:10] = start + 0.06 * ahead  # on the wrong side: round it, not through it
-    assert abs(expert.command(state) @ ahead) < 0.5 * np.linalg.norm(expert.command(state))
+    state[8:10] = start + 0.06 * ahead  # on the wrong side: past it, not through it
+    heading = expert.command(state) / np.linalg.norm(expert.command(state))
+    assert heading @ ahead < 0
+    assert abs(heading[0] * ahead[1] - heading[1] * ahead[0]) * 0.06 > 0.04
+
+
+def test_what_the_expert_means_hardly_changes_where_the_state_hardly_does():
+    """Along straight ways of the tip by and round a block, a quarter of a millimetre at a time."""
+    rng, jumps = np.random.default_rng(0), []
+    state = np.zeros(16)
+    state[[0, 1, 3, 4]] = [0.45, -0.2, 0.3, -0.2]
+    state[[10, 11, 13, 14]] = [0.5, 0.2, 0.3, 0.2]
+    for _ in range(60):
+        begin, end = state[:2] + rng.uniform(-0.12, 0.12, (2, 2))
+        expert, commands = find_task("BlockPush").load_expert()(np.random.default_rng(0)), []
+        for share in np.linspace(0, 1, 1 + int(np.linalg.norm(end - begin) / 0.00025)):
+            state[8:10] = begin + share * (end - begin)
+            commands.append(expert.command(state))
+        jumps.extend(np.linalg.norm(np.diff(commands, axis=0), axis=1) > 0.004)
+    assert np.mean(jumps) < 0.003
 
 
 def test_tasks_without_an_expert_are_named():

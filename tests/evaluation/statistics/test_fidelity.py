@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from torchrl_sparse.evaluation.statistics import fidelity
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors, relative_error
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -52,3 +53,23 @@ def test_errors_begin_where_reuse_begins(query):
     assert torch.equal(errors[3, :2], torch.zeros_like(errors[3, :2]))
     assert (errors[3, 2:] > 0).all()
     assert (errors[5:] > 0).all()
+
+
+def test_many_queries_count_alike_and_few_are_held_at_once(query, monkeypatch):
+    network, sampler, _, _ = query
+    noise, cond = torch.randn(19, STEPS, 5, 4), torch.randn(19, 2, 3)
+    mask = torch.zeros(STEPS, 3 * LAYERS, dtype=torch.bool)
+    mask[2:5] = True
+    alone = [
+        block_errors(network, sampler, noise[i : i + 1], cond[i : i + 1], {"a": mask})["a"] for i in range(19)
+    ]
+    held = []
+    monkeypatch.setattr(
+        fidelity,
+        "relative_error",
+        lambda sparse, dense: held.append(dense.shape[2]) or relative_error(sparse, dense),
+    )
+    together = block_errors(network, sampler, noise, cond, {"a": mask})["a"]
+    torch.testing.assert_close(together, sum(alone) / 19, rtol=1e-4, atol=1e-5)
+    assert max(held) <= 8
+    assert sum(held) == 19

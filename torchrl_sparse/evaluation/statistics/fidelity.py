@@ -13,6 +13,8 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 
 __all__ = ["action_error", "block_errors", "relative_error"]
 
+_AT_ONCE = 8  # queries whose features are held at once: 25 MB each, of the published models
+
 
 def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
     """Return the mean and maximum absolute difference of action entries, in the units of the chunks.
@@ -82,12 +84,23 @@ def block_errors(
     Raises:
         ValueError: if shapes do not fit or a mask prunes its first row.
     """
+    errors = {
+        name: torch.zeros(sampler.num_inference_steps, mask.shape[-1]).double()
+        for name, mask in masks.items()
+    }
+    for part_noise, part_cond in zip(noise.split(_AT_ONCE), cond.split(_AT_ONCE), strict=True):
+        dense = _features(network, sampler, part_noise, part_cond, None)
+        for name, mask in masks.items():
+            sparse = _features(network, sampler, part_noise, part_cond, mask)
+            errors[name] += relative_error(sparse, dense).cpu() * (len(part_cond) / len(cond))
+    return errors
 
-    def features(mask: Tensor | None) -> Tensor:
-        recorder = FeatureRecorder()
-        batched = None if mask is None else mask.expand(len(cond), -1, -1)
-        denoise(network, sampler, noise, cond, batched, record=recorder)
-        return recorder.features()
 
-    dense = features(None)
-    return {name: relative_error(features(mask), dense) for name, mask in masks.items()}
+def _features(
+    network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor, mask: Tensor | None
+) -> Tensor:
+    """Return the output of every block at every step, [3L, K, N, H, D]."""
+    recorder = FeatureRecorder()
+    batched = None if mask is None else mask.expand(len(cond), -1, -1)
+    denoise(network, sampler, noise, cond, batched, record=recorder)
+    return recorder.features()
