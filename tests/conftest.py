@@ -1,5 +1,6 @@
 """Ctrl-C as in a terminal for every run of the tests; where workers run, as a parameter of tests."""
 
+import gc
 import signal
 
 import pytest
@@ -11,6 +12,11 @@ from torchrl_sparse.runtime.backends import backend_runtime
 def ctrl_c_interrupts():
     """A shell hands SIGINT on ignored to what it starts in the background, and Python keeps it so."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish():
+    """Robosuite collects garbage whenever a simulator closes, 0.4 s each time if all that was imported is looked through."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

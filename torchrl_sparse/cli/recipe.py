@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import os
 import sys
@@ -47,6 +48,7 @@ def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Ca
             if {"--help", "-h"} & {*sys.argv[1:]}:
                 print(_help(inspect.getmodule(main).__doc__ or "", folder / f"{name}.yaml"))
                 return
+            gc.freeze()  # robosuite collects garbage whenever a simulator closes, and what was imported never is any
             with _one_line_errors():
                 for config in _read_options(folder, name):
                     check_options(name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
