@@ -41,7 +41,7 @@ class FineLater(torch.nn.Module):
 
 
 class Numbered(Transform):
-    """Says which episode and step it is, as the environments of this library do."""
+    """Says which episode and step it is and how the hand moves, as the environments of this library do."""
 
     def __init__(self, seed):
         super().__init__()
@@ -52,6 +52,7 @@ class Numbered(Transform):
 
     def _step(self, tensordict, next_tensordict):
         next_tensordict.set(keys.EPISODE_SEED, torch.tensor([self.seed]))
+        next_tensordict.set(keys.EEF_VEL, torch.full((6,), 0.01) * next_tensordict["step_count"])
         return next_tensordict.set(keys.EPISODE_STEP, next_tensordict["step_count"].clone())
 
 
@@ -104,6 +105,16 @@ def test_queries_are_timed_in_turn(policy, recorded, monkeypatch):
     warmup = len(asked) - 4
     budgets = [query[keys.TOKEN_BUDGET].item() for query in asked]
     assert budgets == [[1.0, 1.0, 3.0][turn % 3] for turn in range(warmup + 4)]
+
+
+def test_a_pruner_that_reads_how_the_hand_moves_is_measured(policy):
+    looking = policy.with_pruner(SpecPrune(budget=2, look_back=3))
+    recorded = record_methods(["random"], policy, make_env, [0], n_action_steps=4, settings={})
+    times = time_methods(
+        {"looking": looking}, {"looking": recorded["random"]}, repeats=3, threads=1, device="cpu"
+    )
+    assert times["looking"].n == 3
+    assert (replay_all(looking, recorded["random"])[keys.TOKEN_DEPTH] < LAYERS).any()
 
 
 def test_random_tokens_are_the_same_each_time(policy):

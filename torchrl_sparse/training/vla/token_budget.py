@@ -25,7 +25,7 @@ __all__ = ["demonstrated_queries", "measure_errors", "measure_success", "recorde
 Actor = Callable[[TensorDictBase], TensorDictBase]
 
 _FOREVER = 2**31  # environments end an episode themselves
-_BESIDE = (keys.IS_INIT, keys.EPISODE_SEED, keys.EPISODE_STEP, keys.TOKEN_BUDGET, keys.FINE)
+_BESIDE = (keys.IS_INIT, keys.EPISODE_SEED, keys.EPISODE_STEP, keys.EEF_VEL, keys.TOKEN_BUDGET, keys.FINE)
 
 
 # -- queries -----------------------------------------------------------------------------------------------------------
