@@ -9,8 +9,8 @@ from torchrl_sparse.envs.block_push import TOLERANCE
 _SPEED = 0.026  # m per step while walking
 _PUSH_SPEED = 0.012  # m per step while pushing
 _BEHIND = 0.045  # m from a block's centre, where a push begins
+_NEAR = 0.03  # m beyond that, from where on a push is as fast as a walk
 _CLEAR = 0.05  # m from a block's centre that a walk keeps; the corner of a block is at 0.028
-_NEAR = 0.03  # m before a push begins, over which a walk slows down to a push
 _ON_LINE = 0.006  # m beside the line of the push, within which a push begins
 _OFF_LINE = 0.016  # m beside it, beyond which it ends, to begin anew
 _ARRIVAL = 0.6  # share of the way left that a walk makes in a step at most
@@ -22,10 +22,10 @@ _HOME = 0.6 * TOLERANCE  # m to its square at which a block is left
 class BlockPushExpert:
     """A scripted expert for one episode of block pushing.
 
-    What it does follows from the state and from a preference drawn at the start: which block goes first and which square it
-    gets, one of four orders. It recovers by itself: a block that is pushed out of its square is brought back. Its commands jump
-    only where it turns to the other block, begins a push, or ends one that has left its line to begin it anew: a policy has to
-    learn them.
+    What it does follows from the state, from whether it is pushing, and from a preference drawn at the start: which block goes
+    first and which square it gets, one of four orders. It recovers by itself: a block that is pushed out of its square is
+    brought back. Its commands jump only where it turns to the other block, begins a push, or ends one that has left its line to
+    begin it anew: a policy has to learn them.
 
     Args:
         rng: draws the order.
