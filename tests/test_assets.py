@@ -5,14 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
 from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
 FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
+SEEING = [folder for folder in FOLDERS if folder.is_relative_to(ASSETS / "vla")]
 
 
 def name(folder: Path) -> str:
@@ -33,7 +36,7 @@ def outcomes(log: Path) -> dict[int, bool]:
     return {seed: episode.success for seed, episode in EpisodeLog(log, identity(log)).episodes.items()}
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=name)
+@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder not in SEEING], ids=name)
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
     planners = policy_of(folder)
     policy = DiffusionPolicy.from_pretrained(planners)
@@ -41,6 +44,15 @@ def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
         method = make_method(log.stem, policy, num_updates=10, planners=planners, calibration=pytest.fail)
         published = identity(log)
         assert published | method_identity(log.stem, method) == published, log
+
+
+@pytest.mark.parametrize("folder", SEEING, ids=name)
+def test_episodes_belong_to_the_policy_that_sees(folder):
+    pytest.importorskip("transformers")
+    policy = VLAPolicy.from_pretrained(policy_of(folder))
+    weights = tensors_fingerprint(policy.state_dict())
+    for log in (folder / "episodes").glob("*.jsonl"):
+        assert (identity(log)["policy"], identity(log)["method"]) == (weights, log.stem)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=name)
