@@ -48,7 +48,6 @@ def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
 
 @pytest.mark.parametrize("folder", SEEING, ids=name)
 def test_episodes_belong_to_the_policy_that_sees(folder):
-    pytest.importorskip("transformers")
     policy = VLAPolicy.from_pretrained(policy_of(folder))
     weights = tensors_fingerprint(policy.state_dict())
     for log in (folder / "episodes").glob("*.jsonl"):

@@ -84,10 +84,7 @@ def block_errors(
     Raises:
         ValueError: if shapes do not fit or a mask prunes its first row.
     """
-    errors = {
-        name: torch.zeros(sampler.num_inference_steps, mask.shape[-1]).double()
-        for name, mask in masks.items()
-    }
+    errors = {name: torch.zeros(mask.shape, dtype=torch.float64) for name, mask in masks.items()}
     for part_noise, part_cond in zip(noise.split(_AT_ONCE), cond.split(_AT_ONCE), strict=True):
         dense = _features(network, sampler, part_noise, part_cond, None)
         for name, mask in masks.items():
