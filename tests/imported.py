@@ -1,6 +1,5 @@
 """What processes that `tests.forked` makes have imported and used before they begin: all that is slow to import."""
 
-import gc
 from pathlib import Path
 
 import matplotlib.pyplot  # noqa: F401
@@ -19,4 +18,3 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 VLAPolicy(VLANetwork(VLAConfig.tiny()))
 DiffusionPolicy.from_pretrained(Path(__file__).parents[1] / "assets" / "lift")
-gc.freeze()
