@@ -9,8 +9,10 @@ the tail, every query counts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -21,7 +23,7 @@ from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
     exported_call,
     paced_seconds,
-    policy_call,
+    policy_inputs,
     query_parts,
     tail,
     thread_seconds,
@@ -67,12 +69,13 @@ def main(config: DictConfig) -> None:
 def query_tails(policy: DiffusionPolicy, config: DictConfig) -> dict[str, dict[str, float]]:
     """Time many queries from Python and, with a library, as many in C between them."""
     with ExitStack() as stack:
-        calls = {"Python": policy_call(policy)}
+        calls: dict[str, Callable[..., Any]] = {"Python": policy}
         if config.library:
             calls["C"] = stack.enter_context(exported_call(policy, Path(config.library)))
         stack.enter_context(busy_cores(config.busy))
         show = stack.enter_context(progress("tail", "query", config.queries))
-        seconds = paced_seconds(calls, config.queries, config.hz, show)
+        inputs = {"Python": policy_inputs(policy)}
+        seconds = paced_seconds(calls, config.queries, config.hz, show, inputs=inputs)
     return {name: tail(samples) for name, samples in seconds.items()}
 
 

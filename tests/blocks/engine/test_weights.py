@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from torchrl_sparse.blocks.engine import ENGINES, denoise, make_engine
-from torchrl_sparse.blocks.engine.native import engine as native
+from torchrl_sparse.blocks.engine.native import engine as native, weights as native_weights
 from torchrl_sparse.blocks.engine.torch import engine as torch_engine
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
@@ -114,6 +114,7 @@ def test_weights_that_stay_are_not_prepared_again(name, network, query, monkeypa
     network.head.bias[0] = float("nan")  # equal to nothing, not even to itself
     engine = engine_of(name, network)
     monkeypatch.setattr(native, "PackedNetwork", None)
+    monkeypatch.setattr(native_weights, "PackedWeights", None)
     monkeypatch.setattr(torch_engine, "Tables", None)
     assert engine.denoise(*query).isnan().any()
 

@@ -41,6 +41,21 @@ def test_measures_seconds_and_leaves_warmup_out():
     assert 0.002 <= latency.p50 <= latency.p95 < 0.05
 
 
+def test_inputs_are_made_in_order_and_before_the_clock_starts():
+    taken = []
+
+    def slowly():
+        for number in range(5):
+            time.sleep(0.02)
+            yield number
+
+    result = measure_latency(
+        {"take": taken.append, "nothing": lambda: None}, repeats=4, warmup=1, inputs={"take": slowly()}
+    )
+    assert taken == [0, 1, 2, 3, 4]
+    assert result["take"].p50 < 0.02
+
+
 def test_threads_are_set_and_restored_even_after_a_fault():
     before = torch.get_num_threads()
     seen = []

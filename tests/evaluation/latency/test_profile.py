@@ -18,7 +18,7 @@ from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
     exported_call,
     paced_seconds,
-    policy_call,
+    policy_inputs,
     query_parts,
     serial_share,
     tail,
@@ -90,7 +90,9 @@ def test_the_serial_share_of_amdahls_law_is_found_again(share):
 def test_the_tail_keeps_the_latest_and_the_pace_is_kept(policy):
     with busy_cores(1):
         start = perf_counter()
-        samples = paced_seconds({"Python": policy_call(policy)}, queries=4, hz=20)["Python"]
+        samples = paced_seconds(
+            {"Python": policy}, queries=4, hz=20, inputs={"Python": policy_inputs(policy)}
+        )["Python"]
     assert perf_counter() - start > 3 / 20
     assert len(samples) == 4
     assert tail(samples)["max"] == max(samples)

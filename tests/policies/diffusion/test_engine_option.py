@@ -108,6 +108,18 @@ def test_refresh_reads_weights_that_were_written_behind_all_records(policy, engi
     assert (changed - before).abs().max() > 1e-3
 
 
+@pytest.mark.skipif("native" not in ENGINES, reason="the native engine was not built")
+def test_refresh_reads_anew_what_another_policy_of_the_network_has_packed(policy):
+    policy.engine = "native"
+    before = policy(request(2))[keys.CHUNK]
+    policy.network.decoder.layers[1].linear2.bias.data[20:] += 1.0
+    other = policy.with_plan(None)
+    other.refresh()
+    changed = other(request(2))[keys.CHUNK]
+    assert torch.equal(policy(request(2))[keys.CHUNK], changed)
+    assert (changed - before).abs().max() > 1e-3
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_weights_that_were_moved_to_no_device_are_refused_by_name(policy, engine):
     policy.engine = engine

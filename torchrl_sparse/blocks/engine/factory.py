@@ -99,6 +99,7 @@ class EngineSlot:
         check_engine(name)
         self.name = name
         self._made: tuple[Any, Engine | None] = (None, None)
+        self._stale = False
 
     def get(self, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
         """Return the engine for ``network`` and ``sampler``.
@@ -111,12 +112,14 @@ class EngineSlot:
         made_for, engine = self._made  # read and replaced in one go: other threads may do the same
         if engine is None or made_for != wanted:
             engine = make_engine(self.name, network, sampler)
-            self._made = wanted, engine
+            if self._stale:  # what engines of a network share is older than this one
+                engine.refresh()
+            self._made, self._stale = (wanted, engine), False
         return engine
 
     def refresh(self) -> None:
         """Make the engine anew in the next query, from the weights that the network has then."""
-        self._made = (None, None)
+        self._made, self._stale = (None, None), True
 
     def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
         """Say which engine runs and on what; if ``"auto"`` had to pass over others, why."""
@@ -131,4 +134,4 @@ class EngineSlot:
         return text
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"name": self.name, "_made": (None, None)}
+        return {"name": self.name, "_made": (None, None), "_stale": False}

@@ -7,6 +7,7 @@ each parameter are compared besides, because diffusers' weight average writes th
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from itertools import chain
 from operator import attrgetter
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["WeightWatch", "check_weights"]
+__all__ = ["Members", "WeightWatch", "check_weights"]
 
 _SAMPLES = 4
 _VERSION = attrgetter("_version")
@@ -43,10 +44,18 @@ class WeightWatch:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self.network = network
-        self._members = _Members.of(network)
+        self._network = weakref.ref(network)
+        self._members = Members.of(network)
         self._places: tuple[list[int], Any] = ([], None)
         self._refreshed = 0
+
+    @property
+    def network(self) -> nn.Module:
+        """The network, which is not kept alive by being watched."""
+        network = self._network()
+        if network is None:
+            raise ReferenceError("network: expected one that is still in use, it is gone")
+        return network
 
     def refresh(self) -> None:
         """Let the next :meth:`state` differ from all before it."""
@@ -59,8 +68,9 @@ class WeightWatch:
             ValueError: naming a weight that has no values, on the meta device, or that is no floating-point number.
         """
         members = self._members
+        self.approach(members)
         if members.identities() != members.known:
-            members = self._members = _Members.of(self.network)
+            members = self._members = Members.of(self.network)
         # By `map`, which does not come back to the interpreter: all of this has left the caches since it was asked last.
         addresses = [*map(Tensor.data_ptr, members.parameters)]
         addresses += map(Tensor.is_contiguous, members.parameters)  # a matrix may be turned where it lies
@@ -72,6 +82,9 @@ class WeightWatch:
             self._places = addresses, places
         return members.known, addresses, versions, self.read(places), self._refreshed
 
+    def approach(self, members: Members) -> None:
+        """Do what makes it faster to look at ``members``."""
+
     def locate(self, samples: list[Tensor]) -> Any:
         """Return what :meth:`read` needs to read ``samples``, views of each parameter's first values."""
         return samples
@@ -82,7 +95,7 @@ class WeightWatch:
 
 
 @dataclass(frozen=True)
-class _Members:
+class Members:
     """The parameters and modules of a network at one time, held so that no other object can take their identities."""
 
     holders: list[dict]
@@ -92,7 +105,7 @@ class _Members:
     counted: list[nn.Parameter]  # tensors made in inference mode count no versions
 
     @classmethod
-    def of(cls, network: nn.Module) -> _Members:
+    def of(cls, network: nn.Module) -> Members:
         holders = [holder for module in network.modules() for holder in (module._parameters, module._modules)]
         holders = [holder for holder in holders if holder]
         held = [list(holder.values()) for holder in holders]

@@ -8,7 +8,7 @@ import os
 import platform
 import random
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -72,11 +72,12 @@ def summarize_latency(samples: Sequence[float]) -> Latency:
 
 
 def measure_latency(
-    callables: Mapping[str, Callable[[], Any]],
+    callables: Mapping[str, Callable[..., Any]],
     repeats: int = 20,
     warmup: int = 3,
     threads: int | None = None,
     *,
+    inputs: Mapping[str, Iterator[Any]] | None = None,
     device: torch.device | str = "cpu",
     seed: int = 0,
     on_round: Callable[[int, int], None] | None = None,
@@ -84,11 +85,13 @@ def measure_latency(
     """Time several callables against each other, without gradients.
 
     Args:
-        callables: name -> function without arguments; one call is one query.
+        callables: name -> function; one call is one query.
         repeats: timed rounds; every round calls each candidate once.
         warmup: untimed rounds before them.
         threads: intra-op threads of PyTorch while measuring (restored afterwards); None leaves the setting
             alone.
+        inputs: name -> what its function is called with, the next at each call, made before the clock starts; a function
+            that is not in it takes nothing.
         device: synchronised before the clock starts and before it stops.
         seed: of the order within the rounds.
         on_round: called as ``on_round(done, repeats)`` after each timed round.
@@ -107,7 +110,7 @@ def measure_latency(
         raise ValueError("expected at least one callable to time, got none")
     if repeats < 1 or warmup < 0:
         raise ValueError(f"expected repeats >= 1 and warmup >= 0, got {repeats} and {warmup}")
-    device = torch.device(device)
+    device, inputs = torch.device(device), inputs or {}
     order = list(callables)
     generator = random.Random(seed)
     samples: dict[str, list[float]] = {name: [] for name in callables}
@@ -115,7 +118,8 @@ def measure_latency(
         for round_index in range(-warmup, repeats):
             generator.shuffle(order)
             for name in order:
-                seconds = _time_once(callables[name], device)
+                arguments = (next(inputs[name]),) if name in inputs else ()
+                seconds = _time_once(callables[name], arguments, device)
                 if round_index >= 0:
                     samples[name].append(seconds)
             if on_round is not None and round_index >= 0:
@@ -145,10 +149,10 @@ def describe_machine(device: torch.device | str = "cpu", threads: int | None = N
     )
 
 
-def _time_once(call: Callable[[], Any], device: torch.device) -> float:
+def _time_once(call: Callable[..., Any], arguments: Sequence[Any], device: torch.device) -> float:
     _synchronize(device)
     start = time.perf_counter()
-    call()
+    call(*arguments)
     _synchronize(device)
     return time.perf_counter() - start
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import c_size_t, c_uint64, c_void_p
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_sparse.blocks.engine.native.engine import NativeEngine, NativeWatch
+from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine
+from torchrl_sparse.blocks.engine.native.weights import NativeWatch
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -28,7 +31,7 @@ __all__ = [
     "busy_cores",
     "exported_call",
     "paced_seconds",
-    "policy_call",
+    "policy_inputs",
     "query_parts",
     "serial_share",
     "state_query",
@@ -86,18 +89,23 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
             f"plan: expected one that does not look at the observation, got {type(policy.plan).__name__}"
         )
     noise, state, seed = policy.sample_noise(torch.tensor([1])), query["history", "state"], torch.tensor([1])
-    mask, watch = policy.plan.static_mask, NativeWatch(policy.network)
+    mask, watch, normalizer = policy.plan.static_mask, NativeWatch(policy.network), policy.normalizer
+    chunk = policy(query.copy())[keys.CHUNK]
+
+    def answer() -> None:
+        cond = engine.condition(state, normalizer)
+        engine.answer(engine.ready(noise, cond), noise, cond, normalizer, mask, chunk, policy.plan.reuse)
+
     latency = measure_latency(
         {
-            "query": policy_call(policy),
+            "query": policy,
             "noise": partial(policy.sample_noise, seed),
             "weights": watch.state,
-            "answer": lambda: engine.answer(
-                noise, engine.condition(state, policy.normalizer), policy.normalizer, mask, policy.plan.reuse
-            ),
+            "answer": answer,
         },
         repeats,
         warmup,
+        inputs={"query": _again(query)},
     )
     seconds = {name: found.p50 for name, found in latency.items()}
     each = torch.tensor(list(engine.block_seconds().values()), dtype=torch.float64)
@@ -151,40 +159,52 @@ def serial_share(seconds: dict[int, float]) -> float:
 
 @torch.no_grad()
 def paced_seconds(
-    calls: Mapping[str, Callable[[], Any]],
+    calls: Mapping[str, Callable[..., Any]],
     queries: int,
     hz: float | None,
     on_query: Callable[[int, int], None] | None = None,
+    *,
+    inputs: Mapping[str, Iterator[Any]] | None = None,
 ) -> dict[str, list[float]]:
     """Time many queries of each caller, which begin ``hz`` times a second as a control loop's do; None: one after the other.
 
-    Several callers take turns, spread evenly over the period. A query that comes late delays the next; each is timed from its
-    own beginning.
+    Those in ``inputs`` are called with the next of theirs, made before they begin. Several callers take turns, spread evenly
+    over the period. A query that comes late delays the next; each is timed from its own beginning.
 
     Returns:
         name of a caller -> seconds of its ``queries``, in order.
     """
-    for call in calls.values():
-        call()
+    inputs = inputs or {}
+
+    def arguments(name: str) -> tuple[Any, ...]:
+        return (next(inputs[name]),) if name in inputs else ()
+
+    for name, call in calls.items():
+        call(*arguments(name))
     samples: dict[str, list[float]] = {name: [] for name in calls}
     begin = time.perf_counter()
     for number in range(queries):
         for turn, (name, call) in enumerate(calls.items()):
+            given = arguments(name)
             if hz is not None:
                 due = begin + (number + turn / len(calls)) / hz
                 time.sleep(max(0.0, due - time.perf_counter()))
             start = time.perf_counter()
-            call()
+            call(*given)
             samples[name].append(time.perf_counter() - start)
         if on_query is not None:
             on_query(number + 1, queries)
     return samples
 
 
-def policy_call(policy: DiffusionPolicy) -> Callable[[], Any]:
-    """Return a query of the policy in Python, its observation in a new TensorDict."""
-    query = state_query(policy)
-    return lambda: policy(query.copy())
+def _again(query: TensorDict) -> Iterator[TensorDict]:
+    """Yield copies of one query, since a policy writes into what it reads."""
+    return (query.copy() for _ in repeat(None))
+
+
+def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
+    """Yield observations of a policy of states, each in a new TensorDict."""
+    return _again(state_query(policy))
 
 
 @contextmanager

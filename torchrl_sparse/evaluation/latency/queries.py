@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from itertools import cycle
 
 import torch
@@ -33,12 +32,13 @@ def time_queries(
     ``samples`` are asked it so many times at once.
     """
     samples = samples or {}
-    calls = {
-        name: partial(_answer_next, method, cycle(_copied(queries, samples.get(name, 1)).unbind(0)))
-        for name, method in methods.items()
+    inputs = {
+        name: _asked(method, _copied(queries, samples.get(name, 1))) for name, method in methods.items()
     }
     device = next(iter(methods.values())).device
-    return measure_latency(calls, repeats=repeats, threads=threads, device=device, on_round=on_round)
+    return measure_latency(
+        methods, repeats=repeats, threads=threads, inputs=inputs, device=device, on_round=on_round
+    )
 
 
 def time_planning(
@@ -63,8 +63,9 @@ def _copied(queries: TensorDictBase, samples: int) -> TensorDictBase:
     return queries if samples == 1 else queries[:, None].expand(len(queries), samples).contiguous()
 
 
-def _answer_next(policy: DiffusionPolicy, queries: Iterator[TensorDictBase]) -> None:
-    answer(policy, next(queries))
+def _asked(policy: DiffusionPolicy, queries: TensorDictBase) -> Iterator[TensorDictBase]:
+    """Yield what ``policy`` reads of one query after the other, again and again, each in a TensorDict of its own."""
+    return (query.select(*policy.in_keys, strict=False) for query in cycle(queries.unbind(0)))
 
 
 def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import torch
@@ -11,6 +12,16 @@ NOISE_STREAM = 2**32
 """Between the seeds of two noises that an episode could have had; no seed of an episode is as large."""
 
 _BITS = 2**64 - 1
+
+
+class _Own(threading.local):
+    """A generator for each thread: making one takes longer than seeding it."""
+
+    def __init__(self) -> None:
+        self.generator = torch.Generator()
+
+
+_OWN = _Own()
 _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
@@ -48,9 +59,9 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
         ValueError: if seeds are no whole numbers.
     """
     check_whole("seed", seed)
-    noise = torch.empty(len(seed), num_steps, *chunk_shape)
+    noise, generator = torch.empty(len(seed), num_steps, *chunk_shape), _OWN.generator
     for row, value in zip(noise, seed.tolist(), strict=True):
-        generator = torch.Generator().manual_seed(value)
+        generator.manual_seed(value)
         row[:1].normal_(generator=generator)
         row[1:].normal_(generator=generator)
     return noise.to(seed.device)

@@ -72,6 +72,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self.sampler = sampler
         self.engine = EngineSlot(engine)
         self.noise = "torch"
+        self._counted: tuple[Tensor | None, float] = (None, 0.0)
 
     @property
     def in_keys(self):
@@ -133,6 +134,14 @@ class ActionDenoiser(TensorDictModuleBase):
         actions = denoise(network, self.sampler, noise, cond, mask, **options)
         tensordict.set(keys.FEATURES, memory.outputs.reshape(*batch, *shape))
         return actions, mask_flops(NetworkSizes.of(network), mask)
+
+    def static_flops(self, mask: Tensor) -> float:
+        """Count the FLOPs of a query under a planner's mask [K, 3L], once: the planner never writes to it."""
+        known, flops = self._counted  # read and replaced in one go: other threads may do the same
+        if known is not mask:
+            flops = mask_flops(NetworkSizes.of(self.network), mask).item()
+            self._counted = mask, flops
+        return flops
 
     def _denoise(
         self,

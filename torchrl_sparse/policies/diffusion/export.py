@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from torchrl_sparse.blocks.engine.native.engine import native_supports
-from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, PackedWeights, weight_type
 from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner
 from torchrl_sparse.blocks.engine.native.tsp import ExportedPlan, write_tsp
 from torchrl_sparse.blocks.mask import num_buffers
@@ -72,7 +72,7 @@ def export_policy(
         )
     with torch.no_grad():
         exported = _exported_plan(plan, network)
-        packed = PackedNetwork(network, sampler, weight_type(weights))
+        packed = PackedNetwork(network, sampler, PackedWeights(network, weight_type(weights)))
     parts = ("state_scale", "state_offset", "action_scale", "action_offset")
     description = {
         "format": "tsp/1",

@@ -8,16 +8,14 @@ then it gives the chunk. The keys are the same, and so is every bit of them.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
-from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, mask_flops
+from torchrl_sparse.blocks.mask import REUSE_RULES
 from torchrl_sparse.blocks.planner import Planner, StaticPlanner
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
@@ -35,7 +33,8 @@ def answer_directly(
     denoise: ActionDenoiser,
 ) -> bool:
     """Write what the four stages would, or return False and leave everything as it is where they have to run themselves."""
-    if not _known(encode, start, plan, denoise):
+    # A plain TensorDict keeps the tensor that it is given, which can then be filled.
+    if type(tensordict) is not TensorDict or not _known(encode, start, plan, denoise):
         return False
     engine = denoise.engine.get(denoise.network, denoise.sampler)
     state = tensordict.get(keys.HISTORY_STATE, None)
@@ -50,22 +49,20 @@ def answer_directly(
     network, mask, seed = denoise.network, plan.static_mask, encode.seed(tensordict)
     shape = (network.horizon, network.input_dim)
     noise = NOISES[denoise.noise](seed.reshape(-1), denoise.sampler.num_inference_steps, shape)
+    packed, chunk = (
+        engine.ready(noise, cond),
+        torch.empty(*batch, network.horizon - network.n_obs_steps + 1, network.input_dim),
+    )
     # Before the engine's call, which leaves nothing of what writes keys in the caches.
     tensordict.set(keys.COND, cond.view(state.shape))
     tensordict.set(keys.SEED, seed)
     masks = mask.expand(*batch, *mask.shape).clone(memory_format=torch.contiguous_format)
     tensordict.set(keys.PRUNE_MASK, masks)
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
-    tensordict.set(keys.FLOPS, torch.full((*batch, 1), _flops(NetworkSizes.of(network), mask)))
-    chunk = engine.answer(noise, cond, denoise.normalizer, mask, plan.reuse)
-    tensordict.set(keys.CHUNK, chunk.view(*batch, *chunk.shape[1:]))
+    tensordict.set(keys.FLOPS, torch.full((*batch, 1), denoise.static_flops(mask)))
+    tensordict.set(keys.CHUNK, chunk)
+    engine.answer(packed, noise, cond, denoise.normalizer, mask, chunk, plan.reuse)
     return True
-
-
-@lru_cache(maxsize=64)
-def _flops(sizes: NetworkSizes, mask: Tensor) -> float:
-    """Count the FLOPs of a planner's mask, once: it is never written to, and as a key a tensor is itself alone."""
-    return mask_flops(sizes, mask).item()
 
 
 def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise: ActionDenoiser) -> bool:

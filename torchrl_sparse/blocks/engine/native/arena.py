@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["PANEL", "Arena", "Matrix", "pack_panels", "quantise"]
+__all__ = ["PANEL", "Arena", "Matrix", "pack_panels", "padded", "quantise"]
 
 PANEL, PART = 32, 256
 _TYPES = (torch.float32, torch.float16, torch.bfloat16, torch.int8)  # as denoise.h numbers them
@@ -80,6 +80,17 @@ def quantise(weight: Tensor) -> tuple[Tensor, Tensor]:
     return (weight / scale[:, None]).nan_to_num(0).round(), scale
 
 
+def padded(tensor: Tensor, multiple: int, dim: int) -> Tensor:
+    """Append zeros to ``tensor`` until its size in ``dim`` is a multiple of ``multiple``.
+
+    >>> padded(torch.ones(2, 3), 4, dim=1).shape
+    torch.Size([2, 4])
+    """
+    missing = -tensor.shape[dim] % multiple
+    behind = tensor.ndim - 1 - dim % tensor.ndim
+    return functional.pad(tensor, (0, 0) * behind + (0, missing))
+
+
 class Arena:
     """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
 
@@ -103,6 +114,10 @@ class Arena:
     def floats(self, tensor: Tensor) -> int:
         """Copy ``tensor`` as f32 and return the address of the copy."""
         return self.keep(tensor.float())
+
+    def columns(self, tensor: Tensor) -> int:
+        """Copy ``tensor`` [..., d] as f32, with whole panels of columns, and return the address of the copy."""
+        return self.floats(padded(tensor, PANEL, dim=-1))
 
     def matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype = torch.float32) -> Matrix:
         """Pack a layer's ``weight`` [columns, rows] and ``bias`` [columns], or [n, columns] for n rows of a product."""

@@ -8,7 +8,7 @@
 //   its sums stay in registers; and in parts of 256 inputs, of which all rows stay in the L1 cache for all panels.
 // * A query may be shared by the threads of a team. All of them run the same loop; each keeps the residual stream and the
 //   sample for itself, computes its panels of a product and its rows of an attention, and waits for the others where it
-//   needs theirs: seven times in a layer, never in a step without a computed block. Every number is computed by the same
+//   needs theirs: six or seven times in a layer, never in a step without a computed block. Every number comes of the same
 //   sums in the same order whatever the number of threads.
 // * Nothing is allocated: all memory of a query is its `scratch`, so that any number of queries may run at a time.
 // * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.
@@ -413,6 +413,9 @@ struct Query {
         return {panels.first * PANEL, panels.last * PANEL};
     }
 
+    // Whether several blocks leave their outputs in one slot.
+    bool shares_slots() const { return slots < 3 * m.layers; }
+
     // Whether action t may not look at action s or, in the memory, at token s.
     bool hidden(int s, int t) const { return m.causal && s > t; }
 
@@ -551,7 +554,7 @@ struct Query {
     size_t memory(int layer, int observation) const { return ((size_t)layer * m.obs_steps + observation) * m.heads; }
 
     // Scores and outputs are products with the folded memory: 1 + obs_steps vectors for each head and side.
-    void cross_attention(int step, int index, float* d) const {
+    void cross_attention(int step, int index, bool read, float* d) const {
         // Token 0 is the denoising step, which all actions see; token s the observation s - 1.
         const size_t time = ((size_t)step * m.layers + index) * m.heads;
         auto token = [&](int s, const float* of_time, const float* of_observations, int size) {
@@ -566,7 +569,7 @@ struct Query {
                         ? UNSEEN : dot(b.y + t * b.ld, keys + (size_t)h * b.width, b.width) + biases[h];
         }
         softmax(1 + m.obs_steps);
-        who.meet();  // until all have read what another cross-attention left in the same slot
+        if (read || shares_slots()) who.meet();  // until all have read what a cross-attention left in the same slot
         for (int t = rows.first; t < rows.last; t++)
             for (int j = 0; j < b.width; j += VECTOR) {
                 V total = load(m.layer[index].cross_bias + j);
@@ -595,13 +598,13 @@ struct Query {
         product(b.hidden, b.ldh, m.horizon, layer.down, share(layer.down), d, b.ld);
     }
 
-    // x += what a block adds.
-    void compute(int step, int block) const {
+    // x += what a block adds. `read`: whether outputs of blocks have been reused since the block before.
+    void compute(int step, int block, bool read) const {
         float* const d = b.latest + (size_t)(block % slots) * m.horizon * b.ld;
         const int index = block / 3, kind = block % 3;
         normalise(kind == 1 ? rows : Range{0, m.horizon});
         if (kind == 0) self_attention(m.layer[index], d);
-        if (kind == 1) cross_attention(step, index, d);
+        if (kind == 1) cross_attention(step, index, read, d);
         if (kind == 2) feed_forward(m.layer[index], d);
         who.meet();
         for (int i = 0; i < m.horizon * b.ld; i += VECTOR) store(b.x + i, load(b.x + i) + load(d + i));
@@ -609,7 +612,7 @@ struct Query {
 
     // to [horizon, width] = from + what the blocks first .. last-1 add, in one pass.
     void reuse(const float* from, int ld_from, float* to, int ld_to, int first, int last) const {
-        const bool shared = slots < 3 * m.layers;  // a slot counts as often as its blocks occur
+        const bool shared = shares_slots();  // a slot counts as often as its blocks occur
         const int begin = shared ? 0 : first, end = shared ? slots : last;
         for (int t = 0; t < m.horizon; t++)
             for (int j = 0; j < b.width; j += VECTOR) {
@@ -688,6 +691,7 @@ struct Query {
         Matrix constant = m.embed;  // of a step without a computed block: what all of them add goes into the bias
         constant.bias = b.constant;
         bool known = false;  // whether b.constant is of the latest outputs
+        bool read = false;
         for (int t = 0; t < m.horizon; t++) copy(noise + t * m.action_dim, m.action_dim, b.sample + t * lda);
         if (m.history)
             for (int i = 0; i < 2 * m.horizon * lda; i++) b.cleans[i] = 0;
@@ -695,11 +699,13 @@ struct Query {
             const bool empty = run_end(pruned, 0, blocks) == blocks;
             if (empty && !known) reuse(m.embed.bias, b.width, b.constant, b.width, 0, blocks);
             known = empty;
+            read = read || empty;
             whole_product(b.sample, lda, m.horizon, empty ? constant : m.embed, b.x, b.ld);
             for (int block = empty ? blocks : 0, end; block < blocks; block = end + 1) {
                 end = run_end(pruned, block, blocks);
                 if (end > block) reuse(b.x, b.ld, b.x, b.ld, block, end);
-                if (end < blocks) compute(step, end);
+                read = read || end > block;
+                if (end < blocks) compute(step, end, read), read = false;
             }
             const float* const gaussian = step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr;
             guide.actions ? finish<true>(step, gaussian, guide) : finish<false>(step, gaussian, guide);
@@ -721,7 +727,7 @@ void denoise(const Model& m, const Member& who, const uint8_t* pruned, int slots
 
 void run_blocks(const Model& m, const Member& who, int kind, float* own, float* shared) {
     const Query query(m, 3, who, own, shared);
-    for (int layer = 0; layer < m.layers; layer++) query.compute(0, 3 * layer + kind);
+    for (int layer = 0; layer < m.layers; layer++) query.compute(0, 3 * layer + kind, false);
 }
 
 // One observation's logits = relu(relu(cells + observation * obs) * middle) . last, a group of cells after the other.

@@ -7,10 +7,9 @@ the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes import byref, c_float, c_void_p
+from ctypes import byref
 from functools import partial
 
 import torch
@@ -26,8 +25,8 @@ from torchrl_sparse.blocks.engine.native.library import (
     native_available,
 )
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, units, weight_type
+from torchrl_sparse.blocks.engine.native.weights import SharedWeights
 from torchrl_sparse.blocks.engine.timing import time_blocks
-from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -35,7 +34,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["MAX_THREADS", "NativeEngine", "NativeWatch", "native_supports"]
+__all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
 
 MAX_THREADS = 64  # of a team, see team.h
 
@@ -65,32 +64,14 @@ def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
     return True, ""
 
 
-class NativeWatch(WeightWatch):
-    """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them."""
-
-    def locate(self, samples: list[Tensor]) -> ctypes.Array:
-        for sample in samples:
-            if not sample.is_cpu or sample.dtype != torch.float32:
-                raise ValueError(
-                    f"native engine: it reads float32 weights on the CPU, the network was changed to {sample.dtype} on "
-                    f"{sample.device}"
-                )
-        places = [value.data_ptr() for sample in samples for value in sample]
-        return (c_void_p * len(places))(*places)
-
-    def read(self, places: ctypes.Array) -> bytes:
-        values = (c_float * len(places))()
-        library().sparse_gather(len(places), places, values)
-        return bytes(values)
-
-
 class NativeEngine:
     """Runs queries in compiled code. Not differentiable.
 
-    The weights are packed when the engine is made, and again when the network's have changed (see
-    :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). A row of a batch is computed exactly as it would be
-    alone, and with the same sums in the same order on any number of threads. Of a batch every thread takes whole rows;
-    rows that are left and fewer than threads are each computed by all threads together, as a single query is.
+    The weights are packed when the first engine of a network is made, and again when the network's have changed (see
+    :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`); all engines of the network share them. A row of a batch is
+    computed exactly as it would be alone, and with the same sums in the same order on any number of threads. Of a batch every
+    thread takes whole rows; rows that are left and fewer than threads are each computed by all threads together, as a single
+    query is.
 
     Calls from several threads, and to several engines, may overlap: one of them has the threads, the others run in the
     caller's. Between queries the threads sleep.
@@ -143,14 +124,13 @@ class NativeEngine:
         if threads is not None:
             check_size("threads", threads, MAX_THREADS)
         self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
-        self._dtype = weight_type(weights)
+        self._shared = SharedWeights.of(network, weight_type(weights))
         self._level = instruction_level(instruction_set)
         self._dense = torch.zeros(
             sampler.num_inference_steps, network.num_blocks, dtype=torch.bool, device="cpu"
         )
         self._stock: list[Tensor] = []
-        self._watch = NativeWatch(network)
-        self._packed = (None, None)
+        self._packed: PackedNetwork | None = None
         self._current()
 
     def __reduce__(self) -> tuple:
@@ -213,31 +193,46 @@ class NativeEngine:
         finite = library().sparse_normalise(units(normalizer), rows * steps, dim, *where)
         return cond if finite else None
 
+    def ready(self, noise: Tensor, cond: Tensor) -> PackedNetwork:
+        """Return what :meth:`answer` reads of the network, as its weights are now.
+
+        Raises:
+            ValueError: if a query does not fit them, or naming a weight that cannot be packed.
+        """
+        packed = self._current()
+        packed.check(noise=noise, cond=cond)
+        return packed
+
     def answer(
-        self, noise: Tensor, cond: Tensor, normalizer: Normalizer, mask: Tensor, reuse: Reuse = "block"
-    ) -> Tensor:
-        """Return chunks f32 [B, H - To + 1, A] in the units of the environment, as PyTorch rounds them, in one call.
+        self,
+        packed: PackedNetwork,
+        noise: Tensor,
+        cond: Tensor,
+        normalizer: Normalizer,
+        mask: Tensor,
+        chunks: Tensor,
+        reuse: Reuse = "block",
+    ) -> None:
+        """Write chunks in the units of the environment, as PyTorch rounds them, in one call.
 
         Args:
+            packed: see :meth:`ready`.
             noise: f32 [B, K, H, A].
             cond: f32 [B, To, D], see :meth:`condition`.
             normalizer: with f32 buffers on the CPU.
             mask: bool [K, 3L], valid, of every row.
+            chunks: f32 [B, H - To + 1, A], contiguous, to be written.
             reuse: see :meth:`denoise`.
         """
-        packed, rows = self._current(), len(cond)
-        packed.check(noise=noise, cond=cond)
         noise, cond, mask = noise.contiguous(), cond.contiguous(), mask.contiguous()
-        threads, (_, _, horizon, dim) = self._num_threads(rows), noise.shape
+        rows, _, horizon, dim = noise.shape
+        threads, slots = self._num_threads(rows), num_buffers(reuse, self._dense.shape[1])
         actions = noise.new_empty(rows, horizon, dim)
-        chunk = noise.new_empty(rows, horizon - cond.shape[1] + 1, dim)
-        slots = num_buffers(reuse, self._dense.shape[1])
-        tensors = (tensor.data_ptr() for tensor in (cond, actions, chunk))
+        tensors = (tensor.data_ptr() for tensor in (cond, actions, chunks))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
             query = rows, mask.data_ptr(), slots, noise.data_ptr(), units(normalizer), *tensors
             library().sparse_answer(*where, *query, scratch.data_ptr())
-        return chunk
 
     def _num_threads(self, rows: int) -> int:
         """Return how many threads a batch of ``rows`` uses; more than there are panels in the narrowest product would wait."""
@@ -247,7 +242,7 @@ class NativeEngine:
 
     def refresh(self) -> None:
         """Pack the weights anew in the next query."""
-        self._watch.refresh()
+        self._shared.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
@@ -284,12 +279,10 @@ class NativeEngine:
         return library().sparse_scratch(byref(packed.model), self._dense.shape[1])
 
     def _current(self) -> PackedNetwork:
-        """Return the packed weights, packed anew if the network has changed."""
-        version = self._watch.state()
-        known, packed = self._packed  # read and replaced in one go: other threads may do the same
-        if known != version:
-            packed = PackedNetwork(self._network, self._sampler, self._dtype)
-            self._packed = (version, packed)
+        """Return what the network and the sampler are packed into, anew if the network has changed."""
+        weights, packed = self._shared.current(), self._packed
+        if packed is None or packed.weights is not weights:
+            packed = self._packed = PackedNetwork(self._network, self._sampler, weights)
         return packed
 
     def _check(self, mask: Tensor | None) -> None:

@@ -95,6 +95,11 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
     run(threads, task);
 }
 
+// Asks the caches for what lies at n places, if anything does.
+void sparse_fetch(int32_t n, const void* const* places) {
+    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);
+}
+
 // What lies at n places.
 void sparse_gather(int32_t n, const float* const* places, float* values) {
     for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);  // none is in a cache, and they are nowhere near each other

@@ -19,7 +19,6 @@ from ctypes import POINTER, c_float, c_int32, c_void_p
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.folding import (
     Affine,
@@ -30,13 +29,13 @@ from torchrl_sparse.blocks.engine.folding import (
     fold_observation_stem,
     fold_tokens,
 )
-from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
+from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix, padded
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.tensors import check_shapes
 
-__all__ = ["Model", "PackedNetwork", "units", "weight_type"]
+__all__ = ["Model", "PackedNetwork", "PackedWeights", "units", "weight_type"]
 
 _WEIGHTS = ("float32", "float16", "bfloat16", "int8")
 
@@ -64,80 +63,52 @@ class Model(ctypes.Structure):
     ]
 
 
-class PackedNetwork:
-    """A network and a sampler as the native engine computes with them; owns the memory that ``model`` points into.
+class PackedWeights:
+    """The weights of a network as the native engine computes with them, whatever the sampler; owns their memory.
 
     Args:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
-        sampler: the denoising steps.
-        weights: type of the trunk's matrices and of the condition encoder's but the first, one of those of
+        dtype: type of the trunk's matrices and of the condition encoder's but the first, one of those of
             :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`; of int8, the encoder's and what folds its
             tokens, which are read once a query, stay f32.
 
     Attributes:
-        model: the structure that denoise.h reads.
+        members: of the structure `Model`.
 
     Raises:
         ValueError: naming a weight that has another shape than the network was made with.
     """
 
-    def __init__(self, network: TransformerForDiffusion, sampler: Sampler, weights: torch.dtype) -> None:
-        self._weights, self._once = weights, torch.float32 if weights == torch.int8 else weights
+    def __init__(self, network: TransformerForDiffusion, dtype: torch.dtype) -> None:
+        self._weights, self._once = dtype, torch.float32 if dtype == torch.int8 else dtype
         self._arena = Arena()
         self._arrays: list[ctypes.Array] = []  # structures only point to theirs
         # What is read beyond its end would not be noticed.
         check_shapes("network", network.present_shapes(), network.made_shapes)
-        self._sizes = {
-            "noise": (sampler.num_inference_steps, network.horizon, network.input_dim),
-            "cond": (network.n_obs_steps, network.cond_dim),
-            "mask": (sampler.num_inference_steps, network.num_blocks),
-        }
         with torch.no_grad():
-            self.model = self._pack(network, sampler)
+            self.members = self._pack(network)
 
-    def check(self, **query: Tensor) -> None:
-        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a query have the sizes that were packed."""
-        for name, tensor in query.items():
-            if tuple(tensor.shape[1:]) != self._sizes[name]:
-                raise ValueError(
-                    f"{name}: expected [B, *{self._sizes[name]}] as it was packed, got {list(tensor.shape)}"
-                )
-
-    def _pack(self, network: TransformerForDiffusion, sampler: Sampler) -> Model:
+    def _pack(self, network: TransformerForDiffusion) -> dict[str, object]:
         layers, head = fold_layers(network), network.head
         # What follows each other in the loop or before it does so in memory.
         loop = [self._pack_loop(layer) for layer in layers]
         packed = [
             _Layer(**blocks, **self._pack_memory(layer)) for blocks, layer in zip(loop, layers, strict=True)
         ]
-        tables = self._time_tables(layers, MemoryEncoder(network, sampler.timesteps, torch.float64))
-        return Model(
-            horizon=network.horizon,
-            width=network.n_emb,
-            layers=network.n_layer,
-            heads=network.n_head,
-            obs_steps=network.n_obs_steps,
-            action_dim=network.input_dim,
-            cond_dim=network.cond_dim,
-            steps=sampler.num_inference_steps,
-            causal=network.causal_attn,
-            history=sampler.coefficients.history,
-            clip=sampler.coefficients.clip,
-            layer=self._array(_Layer, packed),
-            embed=self._arena.matrix(
+        return {
+            "layer": self._array(_Layer, packed),
+            "embed": self._arena.matrix(
                 network.input_emb.weight, network.input_emb.bias + network.pos_emb[0].double()
             ),
-            head=self._arena.matrix(*after_norm(network.ln_f, Affine(head.weight, head.bias))),
-            encode_up=self._arena.matrix(*fold_observation_stem(network)),
-            encode_down=self._arena.matrix(network.encoder[2].weight, network.encoder[2].bias, self._once),
-            coefficients=self._arena.floats(sampler.coefficients.table()),
-            valid=self._columns(torch.ones(network.n_emb)),
-            **tables,
-        )
+            "head": self._arena.matrix(*after_norm(network.ln_f, Affine(head.weight, head.bias))),
+            "encode_up": self._arena.matrix(*fold_observation_stem(network)),
+            "encode_down": self._arena.matrix(network.encoder[2].weight, network.encoder[2].bias, self._once),
+            "valid": self._arena.columns(torch.ones(network.n_emb)),
+        }
 
     def _pack_loop(self, layer: FoldedLayer) -> dict[str, Matrix]:
         """Pack the matrices of self-attention and of the feed-forward network."""
-        weight = _padded(layer.out.weight, _HEAD, dim=2).flatten(1)
+        weight = padded(layer.out.weight, _HEAD, dim=2).flatten(1)
         return {
             "qkv": self._matrix(*map(_parts, layer.qkv)),
             "out": self._matrix(weight, layer.out.bias),
@@ -149,24 +120,14 @@ class PackedNetwork:
         """Pack what folds memory tokens into cross-attention."""
         query, out = layer.query.weight, layer.cross_out.weight.movedim(0, 2)
         kv = self._arena.matrix(*map(_parts, layer.key_value), self._once)
-        heads = [_padded(head, _HEAD, dim=0).T for side in (query, out) for head in side]
+        heads = [padded(head, _HEAD, dim=0).T for side in (query, out) for head in side]
         return {
             "kv": kv,
             "fold": self._array(
                 Matrix, [self._arena.matrix(head, torch.zeros(len(head)), self._once) for head in heads]
             ),
-            "query_bias": self._arena.floats(_padded(layer.query.bias, _HEAD, dim=1)),
-            "cross_bias": self._columns(layer.cross_out.bias),
-        }
-
-    def _time_tables(self, layers: list[FoldedLayer], encoder: MemoryEncoder) -> dict[str, int]:
-        """Tabulate folded keys, values [K, L, heads, width] and score biases [K, L, heads] of the time tokens."""
-        vectors, bias = fold_tokens(layers, encoder.time_tokens())
-        keys, values = vectors.permute(1, 2, 0, 3, 4)
-        return {
-            "time_key": self._columns(keys),
-            "time_value": self._columns(values),
-            "time_bias": self._arena.floats(bias.transpose(0, 1)),
+            "query_bias": self._arena.floats(padded(layer.query.bias, _HEAD, dim=1)),
+            "cross_bias": self._arena.columns(layer.cross_out.bias),
         }
 
     def _array(self, kind: type[ctypes.Structure], members: list) -> ctypes.Array:
@@ -174,12 +135,66 @@ class PackedNetwork:
         self._arrays.append(array)
         return array
 
-    def _columns(self, tensor: Tensor) -> int:
-        """Keep ``tensor`` [..., d] with whole panels of columns, as f32."""
-        return self._arena.floats(_padded(tensor, PANEL, dim=-1))
-
     def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
         return self._arena.matrix(weight, bias, self._weights)
+
+
+class PackedNetwork:
+    """A network and a sampler as the native engine computes with them; owns the memory that ``model`` points into.
+
+    Args:
+        network: that was packed.
+        sampler: the denoising steps.
+        weights: of the network.
+
+    Attributes:
+        model: the structure that denoise.h reads.
+        weights: as given.
+    """
+
+    def __init__(self, network: TransformerForDiffusion, sampler: Sampler, weights: PackedWeights) -> None:
+        self.weights, self._arena = weights, Arena()
+        self._sizes = {
+            "noise": (sampler.num_inference_steps, network.horizon, network.input_dim),
+            "cond": (network.n_obs_steps, network.cond_dim),
+            "mask": (sampler.num_inference_steps, network.num_blocks),
+        }
+        with torch.no_grad():
+            self.model = Model(
+                horizon=network.horizon,
+                width=network.n_emb,
+                layers=network.n_layer,
+                heads=network.n_head,
+                obs_steps=network.n_obs_steps,
+                action_dim=network.input_dim,
+                cond_dim=network.cond_dim,
+                steps=sampler.num_inference_steps,
+                causal=network.causal_attn,
+                history=sampler.coefficients.history,
+                clip=sampler.coefficients.clip,
+                coefficients=self._arena.floats(sampler.coefficients.table()),
+                **weights.members,
+                **self._time_tables(network, sampler),
+            )
+
+    def check(self, **query: Tensor) -> None:
+        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a query have the sizes that were packed."""
+        for name, tensor in query.items():
+            if tuple(tensor.shape[1:]) != self._sizes[name]:
+                raise ValueError(
+                    f"{name}: expected [B, *{self._sizes[name]}] as it was packed, got {list(tensor.shape)}"
+                )
+
+    def _time_tables(self, network: TransformerForDiffusion, sampler: Sampler) -> dict[str, int]:
+        """Tabulate folded keys, values [K, L, heads, width] and score biases [K, L, heads] of the time tokens."""
+        encoder = MemoryEncoder(network, sampler.timesteps, torch.float64)
+        vectors, bias = fold_tokens(fold_layers(network), encoder.time_tokens())
+        keys, values = vectors.permute(1, 2, 0, 3, 4)
+        return {
+            "time_key": self._arena.columns(keys),
+            "time_value": self._arena.columns(values),
+            "time_bias": self._arena.floats(bias.transpose(0, 1)),
+        }
 
 
 def weight_type(name: str) -> torch.dtype:
@@ -191,14 +206,7 @@ def weight_type(name: str) -> torch.dtype:
 
 def _parts(tensor: Tensor) -> Tensor:
     """Flatten [n, heads, size, ...] into [n * part, ...]: heads are padded, and every part to whole panels."""
-    return _padded(_padded(tensor, _HEAD, dim=2).flatten(1, 2), PANEL, dim=1).flatten(0, 1)
-
-
-def _padded(tensor: Tensor, multiple: int, dim: int) -> Tensor:
-    """Append zeros to ``tensor`` until its size in ``dim`` is a multiple of ``multiple``."""
-    missing = -tensor.shape[dim] % multiple
-    behind = tensor.ndim - 1 - dim % tensor.ndim
-    return functional.pad(tensor, (0, 0) * behind + (0, missing))
+    return padded(padded(tensor, _HEAD, dim=2).flatten(1, 2), PANEL, dim=1).flatten(0, 1)
 
 
 def units(normalizer: Normalizer) -> ctypes.Array:

@@ -48,12 +48,10 @@ class alignas(64) Counter {
 
     // Returns when the value is another than `seen`.
     void wait(uint32_t seen) {
+        if (changes(seen)) return;  // before the clock is asked: most waits are shorter
         const auto end = std::chrono::steady_clock::now() + SPIN;
         do
-            for (int i = 0; i < 64; i++) {
-                if (value() != seen) return;
-                breathe();
-            }
+            if (changes(seen)) return;
         while (std::chrono::steady_clock::now() < end);
         std::unique_lock<std::mutex> lock(mutex_);
         sleepers_++;
@@ -62,6 +60,15 @@ class alignas(64) Counter {
     }
 
   private:
+    // Whether the value is another than `seen`, or becomes one within a microsecond or so.
+    bool changes(uint32_t seen) const {
+        for (int i = 0; i < 64; i++) {
+            if (value() != seen) return true;
+            breathe();
+        }
+        return false;
+    }
+
     std::atomic<uint32_t> value_{0}, sleepers_{0};
     std::mutex mutex_;
     std::condition_variable woken_;
