@@ -72,7 +72,7 @@ def export_policy(
         )
     with torch.no_grad():
         exported = _exported_plan(plan, network)
-        packed = PackedNetwork(network, sampler, PackedWeights(network, weight_type(weights)))
+        packed = PackedNetwork(network, sampler, PackedWeights(network, weight_type(weights), narrow=False))
     parts = ("state_scale", "state_offset", "action_scale", "action_offset")
     description = {
         "format": "tsp/1",

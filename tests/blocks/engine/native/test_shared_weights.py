@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from functools import partial
 
 import pytest
 import torch
@@ -56,6 +57,25 @@ def test_an_engine_beside_others_answers_as_it_does_alone(network):
     for engine, steps in zip(beside, (3, 5), strict=True):
         engine.denoise(*query(steps))
     assert torch.equal(NativeEngine(network, Sampler("ddim", 5)).denoise(noise, cond), alone)
+
+
+@pytest.mark.parametrize("instruction_set", [None, "portable"])
+def test_weights_that_are_half_precision_numbers_are_read_as_such_without_a_bit_lost(
+    network, monkeypatch, instruction_set
+):
+    for parameter in network.parameters():
+        parameter.copy_(parameter.half())
+    engine = NativeEngine(network, Sampler("ddim", 5), instruction_set=instruction_set)
+    noise, cond = query(5)
+    narrow = engine.denoise(noise, cond)
+    wide = partial(PackedWeights, narrow=False)
+    monkeypatch.setattr("torchrl_sparse.blocks.engine.native.weights.PackedWeights", wide)
+    engine.refresh()
+    assert torch.equal(engine.denoise(noise, cond), narrow)
+    types = [
+        PackedWeights(network, torch.float32, narrow=n).members["layer"][0].kv.type for n in (True, False)
+    ]
+    assert types == [1, 0]  # F16 and F32 of denoise.h
 
 
 def test_nothing_shared_keeps_a_network_alive(network):

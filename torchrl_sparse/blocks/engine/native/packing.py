@@ -71,6 +71,8 @@ class PackedWeights:
         dtype: type of the trunk's matrices and of the condition encoder's but the first, one of those of
             :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`; of int8, the encoder's and what folds its
             tokens, which are read once a query, stay f32.
+        narrow: keep f32 matrices that are read once a query as f16 where all their weights are f16 numbers, as those of
+            files in fp16 are: the same numbers in half the memory.
 
     Attributes:
         members: of the structure `Model`.
@@ -79,8 +81,9 @@ class PackedWeights:
         ValueError: naming a weight that has another shape than the network was made with.
     """
 
-    def __init__(self, network: TransformerForDiffusion, dtype: torch.dtype) -> None:
+    def __init__(self, network: TransformerForDiffusion, dtype: torch.dtype, *, narrow: bool = True) -> None:
         self._weights, self._once = dtype, torch.float32 if dtype == torch.int8 else dtype
+        self._narrow = narrow
         self._arena = Arena()
         self._arrays: list[ctypes.Array] = []  # structures only point to theirs
         # What is read beyond its end would not be noticed.
@@ -102,7 +105,7 @@ class PackedWeights:
             ),
             "head": self._arena.matrix(*after_norm(network.ln_f, Affine(head.weight, head.bias))),
             "encode_up": self._arena.matrix(*fold_observation_stem(network)),
-            "encode_down": self._arena.matrix(network.encoder[2].weight, network.encoder[2].bias, self._once),
+            "encode_down": self._read_once(network.encoder[2].weight, network.encoder[2].bias),
             "valid": self._arena.columns(torch.ones(network.n_emb)),
         }
 
@@ -119,13 +122,11 @@ class PackedWeights:
     def _pack_memory(self, layer: FoldedLayer) -> dict[str, object]:
         """Pack what folds memory tokens into cross-attention."""
         query, out = layer.query.weight, layer.cross_out.weight.movedim(0, 2)
-        kv = self._arena.matrix(*map(_parts, layer.key_value), self._once)
+        kv = self._read_once(*map(_parts, layer.key_value))
         heads = [padded(head, _HEAD, dim=0).T for side in (query, out) for head in side]
         return {
             "kv": kv,
-            "fold": self._array(
-                Matrix, [self._arena.matrix(head, torch.zeros(len(head)), self._once) for head in heads]
-            ),
+            "fold": self._array(Matrix, [self._read_once(head, torch.zeros(len(head))) for head in heads]),
             "query_bias": self._arena.floats(padded(layer.query.bias, _HEAD, dim=1)),
             "cross_bias": self._arena.columns(layer.cross_out.bias),
         }
@@ -137,6 +138,13 @@ class PackedWeights:
 
     def _matrix(self, weight: Tensor, bias: Tensor) -> Matrix:
         return self._arena.matrix(weight, bias, self._weights)
+
+    def _read_once(self, weight: Tensor, bias: Tensor) -> Matrix:
+        """Pack a matrix that takes longer to read than to multiply: in half the memory if nothing of it is lost so."""
+        dtype = self._once
+        if self._narrow and dtype == torch.float32 and torch.equal(weight.half().to(weight.dtype), weight):
+            dtype = torch.float16
+        return self._arena.matrix(weight, bias, dtype)
 
 
 class PackedNetwork:
