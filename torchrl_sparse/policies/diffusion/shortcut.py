@@ -36,19 +36,20 @@ def answer_directly(
     # A plain TensorDict keeps the tensor that it is given, which can then be filled.
     if type(tensordict) is not TensorDict or not _known(encode, start, plan, denoise):
         return False
-    engine = denoise.engine.get(denoise.network, denoise.sampler)
+    network, sampler, normalizer = denoise.network, denoise.sampler, denoise.normalizer
+    engine = denoise.engine.get(network, sampler)
     state = tensordict.get(keys.HISTORY_STATE, None)
     if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
         return False
     batch = tensordict.batch_size
     if state.shape != (*batch, *encode.state_shape):
         return False
-    cond = engine.condition(state.reshape(-1, *encode.state_shape), denoise.normalizer)
+    cond = engine.condition(state.reshape(-1, *encode.state_shape), normalizer)
     if cond is None:  # the encoder says what is wrong with the state
         return False
-    network, mask, seed = denoise.network, plan.static_mask, encode.seed(tensordict)
+    mask, seed = plan.static_mask, encode.seed(tensordict)
     shape = (network.horizon, network.input_dim)
-    noise = NOISES[denoise.noise](seed.reshape(-1), denoise.sampler.num_inference_steps, shape)
+    noise = NOISES[denoise.noise](seed.reshape(-1), sampler.num_inference_steps, shape)
     packed, chunk = (
         engine.ready(noise, cond),
         torch.empty(*batch, network.horizon - network.n_obs_steps + 1, network.input_dim),
@@ -61,25 +62,25 @@ def answer_directly(
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), denoise.static_flops(mask)))
     tensordict.set(keys.CHUNK, chunk)
-    engine.answer(packed, noise, cond, denoise.normalizer, mask, chunk, plan.reuse)
+    engine.answer(packed, noise, cond, normalizer, mask, chunk, plan.reuse)
     return True
 
 
 def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise: ActionDenoiser) -> bool:
     """Return whether the stages do what they do in the library, without anybody looking in between."""
-    kind, stages = type(plan), (encode, start, plan, denoise)
+    kind, condition, normalizer = type(plan), encode.condition, denoise.normalizer
     return (
         kind.forward is Planner.forward
         and getattr(kind, "masks", None) is StaticPlanner.masks
         and type(encode) is ObservationEncoder
         and type(start) is ColdStart
         and type(denoise) is ActionDenoiser
-        and encode.condition.vision is None
-        and type(denoise.normalizer) is Normalizer
-        and encode.condition.normalizer is denoise.normalizer
-        and all(map(_is_plain, denoise.normalizer._buffers.values()))
+        and condition.vision is None
+        and type(normalizer) is Normalizer
+        and condition.normalizer is normalizer
+        and all(map(_is_plain, normalizer._buffers.values()))
         and not denoise.network.training
-        and not any(_is_watched(stage) for stage in stages)
+        and not any(map(_is_watched, (encode, start, plan, denoise)))
     )
 
 
