@@ -50,10 +50,8 @@ def answer_directly(
     mask, seed = plan.static_mask, encode.seed(tensordict)
     shape = (network.horizon, network.input_dim)
     noise = NOISES[denoise.noise](seed.reshape(-1), sampler.num_inference_steps, shape)
-    packed, chunk = (
-        engine.ready(noise, cond),
-        torch.empty(*batch, network.horizon - network.n_obs_steps + 1, network.input_dim),
-    )
+    packed = engine.ready(noise, cond)
+    chunk = torch.empty(*batch, network.horizon - network.n_obs_steps + 1, network.input_dim)
     # Before the engine's call, which leaves nothing of what writes keys in the caches.
     tensordict.set(keys.COND, cond.view(state.shape))
     tensordict.set(keys.SEED, seed)
