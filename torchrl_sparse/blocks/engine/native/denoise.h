@@ -8,7 +8,7 @@
 //   its sums stay in registers; and in parts of 256 inputs, of which all rows stay in the L1 cache for all panels.
 // * A query may be shared by the threads of a team. All of them run the same loop; each keeps the residual stream and the
 //   sample for itself, computes its panels of a product and its rows of an attention, and waits for the others where it
-//   needs theirs: six or seven times in a layer, never in a step without a computed block. Every number comes of the same
+//   needs theirs: six or seven times in a layer, never in a step without a computed block. Every number comes from the same
 //   sums in the same order whatever the number of threads.
 // * Nothing is allocated: all memory of a query is its `scratch`, so that any number of queries may run at a time.
 // * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.

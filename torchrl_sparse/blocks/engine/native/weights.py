@@ -81,7 +81,7 @@ def _words(place: int, first: int, last: int) -> list[int]:
 class SharedWeights:
     """The packed weights of one network in one type: engines of whatever sampler, plan and policy read the same memory.
 
-    So a network's methods beside each other need its 36 MB once, and do not drive each other's out of the caches.
+    So a network's methods beside each other need its weights in memory once, and do not drive each other's out of the caches.
 
     Attributes:
         of: get the one of a network and a type.
