@@ -1,6 +1,7 @@
 """Cameras' features from packed weights are those of the encoder, follow its weights, and give way where somebody looks."""
 
 import copy
+import gc
 import pickle
 
 import pytest
@@ -64,6 +65,16 @@ def test_weights_that_change_are_seen_and_those_that_stay_are_packed_once():
             torch.testing.assert_close(after, vision(frames), atol=1e-5, rtol=0)
             assert (after - before).abs().max() > 1e-4
             before = after
+        other = make_vision()
+        torch.testing.assert_close(slot.get(other, frames=2)(frames), other(frames), atol=1e-5, rtol=0)
+
+
+@needs_packing
+def test_another_encoder_is_packed_where_the_one_before_is_gone():
+    slot, frames = CameraSlot(), make_frames(1, 2)
+    with torch.no_grad():
+        slot.get(make_vision(), frames=2)
+        gc.collect()
         other = make_vision()
         torch.testing.assert_close(slot.get(other, frames=2)(frames), other(frames), atol=1e-5, rtol=0)
 

@@ -57,6 +57,10 @@ class WeightWatch:
             raise ReferenceError("network: expected one that is still in use, it is gone")
         return network
 
+    def watches(self, network: nn.Module) -> bool:
+        """Tell whether that is the network, also where its own is gone."""
+        return self._network() is network
+
     def refresh(self) -> None:
         """Let the next :meth:`state` differ from all before it."""
         self._refreshed += 1

@@ -40,8 +40,9 @@ class CameraSlot:
             return vision
         # Read and replaced in one go: other threads may do the same.
         watch, (known, packed) = self._watch, self._made
-        if watch is None or watch.network is not vision:
-            watch = self._watch = WeightWatch(vision)
+        if watch is None or not watch.watches(vision):
+            watch, packed = WeightWatch(vision), None
+            self._watch = watch
         state = id(vision), watch.state()
         if packed is None or known != state:
             packed = pack_vision(vision, frames)
