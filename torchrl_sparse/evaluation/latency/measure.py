@@ -19,7 +19,15 @@ import torch
 
 from torchrl_sparse.runtime.threads import num_threads
 
-__all__ = ["Latency", "Machine", "describe_machine", "measure_latency", "summarize_latency", "usable_cores"]
+__all__ = [
+    "Latency",
+    "Machine",
+    "describe_machine",
+    "measure_latency",
+    "next_arguments",
+    "summarize_latency",
+    "usable_cores",
+]
 
 
 @dataclass(frozen=True)
@@ -118,13 +126,21 @@ def measure_latency(
         for round_index in range(-warmup, repeats):
             generator.shuffle(order)
             for name in order:
-                arguments = (next(inputs[name]),) if name in inputs else ()
-                seconds = _time_once(callables[name], arguments, device)
+                seconds = _time_once(callables[name], next_arguments(inputs, name), device)
                 if round_index >= 0:
                     samples[name].append(seconds)
             if on_round is not None and round_index >= 0:
                 on_round(round_index + 1, repeats)
     return {name: summarize_latency(values) for name, values in samples.items()}
+
+
+def next_arguments(inputs: Mapping[str, Iterator[Any]], name: str) -> tuple[Any, ...]:
+    """Return what the function ``name`` is called with next: one thing where it has inputs, else nothing.
+
+    >>> next_arguments({"add": iter([5])}, "add"), next_arguments({}, "add")
+    ((5,), ())
+    """
+    return (next(inputs[name]),) if name in inputs else ()
 
 
 def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> Machine:

@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch
-from torchrl_sparse.evaluation.latency.measure import measure_latency
+from torchrl_sparse.evaluation.latency.measure import measure_latency, next_arguments
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -105,7 +105,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
         },
         repeats,
         warmup,
-        inputs={"query": _again(query)},
+        inputs={"query": policy_inputs(policy)},
     )
     seconds = {name: found.p50 for name, found in latency.items()}
     each = torch.tensor(list(engine.block_seconds().values()), dtype=torch.float64)
@@ -175,17 +175,13 @@ def paced_seconds(
         name of a caller -> seconds of its ``queries``, in order.
     """
     inputs = inputs or {}
-
-    def arguments(name: str) -> tuple[Any, ...]:
-        return (next(inputs[name]),) if name in inputs else ()
-
     for name, call in calls.items():
-        call(*arguments(name))
+        call(*next_arguments(inputs, name))
     samples: dict[str, list[float]] = {name: [] for name in calls}
     begin = time.perf_counter()
     for number in range(queries):
         for turn, (name, call) in enumerate(calls.items()):
-            given = arguments(name)
+            given = next_arguments(inputs, name)
             if hz is not None:
                 due = begin + (number + turn / len(calls)) / hz
                 time.sleep(max(0.0, due - time.perf_counter()))
@@ -197,14 +193,10 @@ def paced_seconds(
     return samples
 
 
-def _again(query: TensorDict) -> Iterator[TensorDict]:
-    """Yield copies of one query, since a policy writes into what it reads."""
-    return (query.copy() for _ in repeat(None))
-
-
 def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
-    """Yield observations of a policy of states, each in a new TensorDict."""
-    return _again(state_query(policy))
+    """Yield one observation of a policy of states again and again, in new TensorDicts, since a policy writes into them."""
+    query = state_query(policy)
+    return (query.copy() for _ in repeat(None))
 
 
 @contextmanager

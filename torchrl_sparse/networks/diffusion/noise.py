@@ -12,6 +12,7 @@ NOISE_STREAM = 2**32
 """Between the seeds of two noises that an episode could have had; no seed of an episode is as large."""
 
 _BITS = 2**64 - 1
+_WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 class _Own(threading.local):
@@ -22,7 +23,6 @@ class _Own(threading.local):
 
 
 _OWN = _Own()
-_WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 
 def query_seed(episode_seed: Tensor, episode_step: Tensor, stream: int = 0) -> Tensor:

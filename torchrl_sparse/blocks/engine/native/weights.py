@@ -24,7 +24,7 @@ class NativeWatch(WeightWatch):
     """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them.
 
     They have lost what Python and PyTorch know of the weights as well, some 2,000 places that lead to one another. All of
-    them are asked for at once, before Python goes from one to the next; that halves the time of :meth:`state`.
+    them are asked for at once, before Python goes from one to the next.
     """
 
     def __init__(self, network: torch.nn.Module) -> None:
@@ -82,9 +82,7 @@ class SharedWeights:
     """The packed weights of one network in one type: engines of whatever sampler, plan and policy read the same memory.
 
     So a network's methods beside each other need its weights in memory once, and do not drive each other's out of the caches.
-
-    Attributes:
-        of: get the one of a network and a type.
+    :meth:`of` gives the one of a network and a type.
     """
 
     _all: WeakKeyDictionary[TransformerForDiffusion, dict[torch.dtype, SharedWeights]] = WeakKeyDictionary()
