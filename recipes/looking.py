@@ -2,7 +2,8 @@
 
     python recipes/looking.py task=lift policy=assets/lift pruner=assets/lift/sag
 
-Without a pruner only the similarities of what could be reused are measured.
+Without a pruner only the similarities of what could be reused are measured. With ``oracle.attempts=200`` masks for all queries,
+for each phase of an episode and for each query are climbed to, which says what a pruner that looks could gain at most.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tqdm import tqdm
 
 from torchrl_sparse.blocks.sag.planner import SAGPruner
 from torchrl_sparse.cli.recipe import recipe
@@ -22,6 +25,7 @@ from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.looking import plot_looking, plot_reuse_sources
 from torchrl_sparse.evaluation.statistics.looking import looking
+from torchrl_sparse.evaluation.statistics.oracle import oracle
 from torchrl_sparse.evaluation.statistics.reuse_sources import reuse_sources
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -33,6 +37,8 @@ from torchrl_sparse.training.diffusion.published import published_shape
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
+    if config.oracle.attempts and not config.pruner:
+        raise ValueError(f"oracle.attempts: expected 0 without a pruner, got {config.oracle.attempts}")
     policy, task = make_policy(config), find_task(config.task).name
     n_action_steps = published_shape(task).n_action_steps
     seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
@@ -53,10 +59,25 @@ def main(config: DictConfig) -> None:
         for name in ("own_minus_mean", "own_minus_others"):
             mean, low, high = getattr(found, name)
             print(f"{name}: {mean:+.4f} [{low:+.4f}, {high:+.4f}]")
+    if config.oracle.attempts:
+        results["oracle"] = climbed(policy, queries, n_action_steps, config)
     write_json(out / f"looking_{task}.json", results)
     for name in ("own", "type", "query"):
         alike = torch.tensor(results["sources"][name])[:, 1:].mean().item()
         print(f"reuse of {name}: cosine similarity {alike:.3f}")
+
+
+def climbed(
+    policy: DiffusionPolicy, queries: TensorDictBase, n_action_steps: int, config: DictConfig
+) -> dict:
+    """Return, and print, what masks of each query's own could gain."""
+    total = 3 * config.oracle.attempts
+    with tqdm(desc=f"{'oracle':>14}", total=total, unit="attempt", mininterval=2) as bar:
+        found = oracle(policy, queries, **config.oracle, n_action_steps=n_action_steps, on_attempt=bar.update)
+    print("climbed to: " + ", ".join(f"{name} {error:.4f}" for name, error in found.error.items()))
+    for name, (mean, low, high) in found.over_all.items():
+        print(f"{name} minus all: {mean:+.4f} [{low:+.4f}, {high:+.4f}]")
+    return asdict(found)
 
 
 def make_policy(config: DictConfig) -> DiffusionPolicy:

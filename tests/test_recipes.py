@@ -219,9 +219,12 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         f"pruner={work}/sag/pruner",
         "episodes=2",
         "samples=2",
+        "oracle.attempts=2",
+        "oracle.draws=1",
         f"out={work}/looking",
     )
     assert "own_minus_mean: " in looked
+    assert "query minus all: " in looked
     assert "reuse of own: cosine similarity" in looked
     for name in ("looking_Lift.png", "reuse_sources_Lift.png"):
         assert iio.imread(work / "looking" / name).std() > 5

@@ -21,7 +21,7 @@ from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH, dense_answer
 from torchrl_sparse.training.pruner.loss import varying_share
 from torchrl_sparse.training.pruner.trainer import mean_mask
 
-__all__ = ["Looking", "looking"]
+__all__ = ["Looking", "episode_phases", "episode_rows", "looking", "paired_interval"]
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,7 @@ def looking(
     """
     policy = policy.with_plan(policy.plan)
     encoded = policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
-    masks, episodes = encoded[keys.PRUNE_MASK], encoded[keys.EPISODE_SEED].flatten()
-    starts = [rows.nonzero().flatten() for rows in (episodes == number for number in episodes.unique())]
-    if len(starts) < 2:
-        raise ValueError(f"queries: expected those of two episodes at least, got {len(starts)}")
+    masks, starts = encoded[keys.PRUNE_MASK], episode_rows(encoded)
     mean = mean_mask(masks.float().mean(dim=0))
     other = torch.randperm(len(masks), generator=torch.Generator().manual_seed(seed)).roll(1)
     dense = dense_answers(policy.with_plan(Dense()), encoded)
@@ -100,8 +97,8 @@ def looking(
         varying_in_episode=float(np.mean([varying_share(masks[rows]).item() for rows in repeated])),
         differing=(masks != mean).float().mean().item(),
         error={name: error.mean().item() for name, error in errors.items()},
-        own_minus_mean=_paired(errors["own"] - errors["mean"], starts),
-        own_minus_others=_paired(errors["own"] - errors["others"], starts),
+        own_minus_mean=paired_interval(errors["own"] - errors["mean"], starts),
+        own_minus_others=paired_interval(errors["own"] - errors["others"], starts),
         phases=_phases(masks, starts, phases).tolist(),
     )
 
@@ -113,18 +110,37 @@ def _actions(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) ->
     return torch.cat([policy.denoise(*part, reuse=policy.plan.reuse) for part in parts])
 
 
-def _paired(difference: Tensor, starts: list[Tensor]) -> tuple[float, float, float]:
+def episode_rows(queries: TensorDictBase) -> list[Tensor]:
+    """Return the rows of each episode, in their order.
+
+    Raises:
+        ValueError: if there are fewer than two.
+    """
+    episodes = queries[keys.EPISODE_SEED].flatten()
+    rows = [(episodes == number).nonzero().flatten() for number in episodes.unique()]
+    if len(rows) < 2:
+        raise ValueError(f"queries: expected those of two episodes at least, got {len(rows)}")
+    return rows
+
+
+def episode_phases(episodes: list[Tensor], count: int, phases: int) -> Tensor:
+    """Return i64 [count]: in which of the equal parts of its episode each query is."""
+    phase = torch.empty(count, dtype=torch.long)
+    for rows in episodes:
+        phase[rows.cpu()] = torch.arange(len(rows)) * phases // len(rows)
+    return phase
+
+
+def paired_interval(difference: Tensor, episodes: list[Tensor]) -> tuple[float, float, float]:
     """Return the mean over episodes and its 95 % interval; an episode's queries are no independent samples."""
-    by_episode = torch.stack([difference[rows].mean() for rows in starts])
-    mean, half = by_episode.mean().item(), 1.96 * by_episode.std().item() / len(starts) ** 0.5
+    by_episode = torch.stack([difference[rows].mean() for rows in episodes])
+    mean, half = by_episode.mean().item(), 1.96 * by_episode.std().item() / len(episodes) ** 0.5
     return mean, mean - half, mean + half
 
 
-def _phases(masks: Tensor, starts: list[Tensor], phases: int) -> Tensor:
+def _phases(masks: Tensor, episodes: list[Tensor], phases: int) -> Tensor:
     """Return f32 [P, K, 3L]: how much more often than on average each cell is pruned in each phase, 0 without a query."""
-    masks, phase = masks.cpu(), torch.empty(len(masks), dtype=torch.long)
-    for rows in starts:
-        phase[rows.cpu()] = torch.arange(len(rows)) * phases // len(rows)
+    masks, phase = masks.cpu(), episode_phases(episodes, len(masks), phases)
     change = torch.zeros(phases, *masks.shape[1:])
     for number in phase.unique().tolist():
         change[number] = masks[phase == number].float().mean(dim=0) - masks.float().mean(dim=0)
