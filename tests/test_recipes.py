@@ -220,7 +220,7 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "episodes=2",
         "samples=2",
         "oracle.attempts=2",
-        "oracle.draws=1",
+        "oracle.draws=3",
         f"out={work}/looking",
     )
     assert "own_minus_mean: " in looked

@@ -95,7 +95,7 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(
         ("base", "equal_to", "calibrate_bac.sampler", "looking.sampler", "looking.pruner"), Word | None
     ),
-    **dict.fromkeys(("candidates", "search"), Section),
+    **dict.fromkeys(("candidates", "search", "oracle"), Section),
     **dict.fromkeys(("accelerate_policy.candidates.samplers", "searched", "cached", "rounded"), list[Word]),
     **dict.fromkeys(("updates", "intervals", "lengths"), list[Count]),
     "played": Literal["pruned", "dense"],
@@ -171,7 +171,7 @@ OPTIONS: dict[str, Any] = {
     "targets": Section,
     "share": Share,
     "source": Word,
-    "rollouts": Whole,
+    **dict.fromkeys(("rollouts", "attempts"), Whole),
     "grounding": Section,
     "locate_steps": Whole,
     "refer_steps": Whole,
