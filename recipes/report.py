@@ -6,6 +6,10 @@ Or make a `results.json` of schema 1 anew in schema 2, with times from the episo
 
     python recipes/report.py upgrade=[assets/can/results.json,assets/can/results_400.json]
     python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results_400.json] out=outputs/aggregate.json
+
+Or draw what methods gain and lose on all tasks in one picture; of several files of a task the first that has a method counts:
+
+    python recipes/report.py fronts=[assets/lift/test_split/results.json,assets/pusht/results.json] out=outputs/fronts.png
 """
 
 from __future__ import annotations
@@ -17,9 +21,10 @@ from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
+from torchrl_sparse.evaluation.figures.fronts import plot_fronts
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
-from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 
@@ -33,6 +38,8 @@ def main(config: DictConfig) -> None:
         results = aggregate_results(config.aggregate)
         save_aggregate(results, config.out)
         print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
+    elif config.fronts:
+        print(plot_fronts([load_results(path) for path in config.fronts], config.out))
     else:
         faults = write_report(config.runs, config.out, title=config.title)
         for fault in faults.values():

@@ -1,0 +1,78 @@
+"""The picture over all tasks: what is in it, on which scale, and which of two files of a task counts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.evaluation.figures.test_plots import has_color
+from torchrl_sparse.evaluation.figures import fronts
+from torchrl_sparse.evaluation.results.schema import load_results
+
+LIFT, CAN, SQUARE = (Path("assets", task, "test_split/results.json") for task in ("lift", "can", "square"))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What is drawn on, kept."""
+    kept = []
+    make = fronts.make_figure
+
+    def keep(*args, **kwargs):
+        figure, grid = make(*args, **kwargs)
+        kept.append(grid)
+        return figure, grid
+
+    monkeypatch.setattr(fronts, "make_figure", keep)
+    return kept
+
+
+def test_each_task_has_its_methods_on_the_scales_of_all(tmp_path, drawn):
+    import numpy as np
+    from PIL import Image
+
+    results = [load_results(path) for path in (LIFT, SQUARE)]
+    path = fronts.plot_fronts(results, tmp_path / "fronts.png")
+    (grid,) = drawn
+    for row in grid:
+        assert len({axes.get_ylim() for axes in row}) == 1
+        assert len({axes.get_xlim() for axes in row}) == 1
+    for column, found in enumerate(results):
+        assert grid[0][column].get_title(loc="left") == found.task
+        steps = [
+            f"ddpm{number}{rule}"
+            for number, rule in ((10, ""), (5, "_logsnr"), (3, "_logsnr"), (2, "_logsnr"))
+        ]
+        (line,) = [line for line in grid[1][column].lines if line.get_color() == "#0072B2"]
+        expected = [found.methods[name] for name in steps]
+        assert line.get_xdata().tolist() == [method.speedup_vs_dense for method in expected]
+        assert line.get_ydata().tolist() == [method.time_vs_dense.ratio for method in expected]
+        assert [text.get_text() for text in grid[1][column].texts if text.get_color() == "#0072B2"] == [
+            "10",
+            "5",
+            "3",
+            "2",
+        ]
+    pixels = np.asarray(Image.open(path).convert("RGB"))
+    assert all(has_color(pixels, color) for color in ("#0072B2", "#B2182B", "#CC79A7"))
+
+
+def test_of_two_files_of_a_task_the_first_counts(tmp_path, drawn):
+    lift, square = load_results(LIFT), load_results(SQUARE)
+    slow = replace(lift, methods={**lift.methods, "bac": replace(lift.methods["bac"], speedup_vs_dense=1.5)})
+    fronts.plot_fronts([lift, square, slow], tmp_path / "fronts.png")
+    fronts.plot_fronts([slow, square, lift], tmp_path / "fronts.png")
+    speeds = [
+        [line.get_xdata()[0] for line in grid[0][0].lines if line.get_color() == "#B2182B"] for grid in drawn
+    ]
+    assert speeds == [[lift.methods["bac"].speedup_vs_dense], [1.5]]
+
+
+def test_one_task_alone_and_results_without_times_are_refused(tmp_path):
+    lift = load_results(LIFT)
+    with pytest.raises(ValueError, match=r"fronts: expected results of two tasks at least, got \['Lift'\]"):
+        fronts.plot_fronts([lift, lift], tmp_path / "fronts.png")
+    old = load_results("assets/vla/results.json")
+    with pytest.raises(ValueError, match="fronts: expected results of schema 2, got 1 of lift_named"):
+        fronts.plot_fronts([lift, old], tmp_path / "fronts.png")
+    assert not [*tmp_path.iterdir()]

@@ -1,0 +1,173 @@
+"""All tasks in one picture: how much faster methods are, and what that costs in success and in time to success."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.evaluation.figures.pareto import plain_log_ticks
+from torchrl_sparse.evaluation.results.parts import Interval
+from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
+__all__ = ["plot_fronts"]
+
+Estimate = tuple[float, Interval]
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Methods of one kind, which have one colour; in order of their steps, where they have such."""
+
+    label: str
+    names: str
+    color: str
+    marker: str
+
+    def members(self, methods: Iterable[str]) -> list[str]:
+        found = [name for name in methods if re.fullmatch(self.names, name)]
+        return sorted(found, key=lambda name: -_steps(name))
+
+
+_FAMILIES = (
+    _Family("dense, other noise", "dense_noise", "#8A8A8F", "s"),
+    _Family("stochastic steps", r"ddpm\d+(_logsnr)?", "#0072B2", "o"),
+    _Family("deterministic steps", r"ddim\d+(_logsnr)?", "#E69F00", "^"),
+    _Family("stochastic steps, 8 bits", r"ddpm\d+(_logsnr)?:int8", "#56B4E9", "o"),
+    _Family("dense, 8 bits", "dense:int8", "#56B4E9", "s"),
+    _Family("SAG", "sag", "#CC79A7", "D"),
+    _Family("its mean mask", "sag_fixed", "#E7B5D0", "D"),
+    _Family("L2C", "l2c", "#009E73", "v"),
+    _Family("BAC", "bac", "#B2182B", "P"),
+    _Family("fixed interval", "uniform7", "#4D4D4D", "X"),
+    _Family("BAC on ten stochastic steps", "bac_ddpm10", "#F2A19B", "P"),
+    _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
+)
+
+
+def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
+    """Draw, for each task, what methods lose to dense against how many times as fast as dense a query is.
+
+    Above is success in points, or the score; below the ratio of times to success. Bars are 95 % intervals, the dashed
+    lines the margins. Methods that are of no known kind are left out. Steps of one sampler are joined and numbered.
+
+    Args:
+        results: of two tasks at least; of several of one task the first that has a method counts.
+        path: of the PNG.
+
+    Raises:
+        ValueError: if there are fewer tasks, or results of schema 1, which have no times.
+
+    """
+    tasks = _by_task(results)
+    figure, grid = make_figure(1.5 + 2.9 * len(tasks), 7.2, rows=2, columns=len(tasks), sharex=True)
+    handles: dict[str, Line2D] = {}
+    for (title, found), upper, lower in zip(tasks.items(), *grid, strict=True):
+        methods = _of_first(found)
+        for family in _FAMILIES:
+            for axes, point in ((upper, _lost), (lower, _time)):
+                if (line := _draw(axes, family, methods, point)) is not None:
+                    handles[family.label] = line
+        _margins(upper, 0, -100 * found[0].dense.judged.margin)
+        _margins(lower, 1, 1 + found[0].dense.time_vs_dense.margin)
+        upper.set_title(title, loc="left")
+        lower.set_xlabel("times as fast as dense")
+    _share_scales(*grid)
+    grid[0][0].set_ylabel("success or score,\npoints over dense's")
+    grid[1][0].set_ylabel("time to success over dense's,\nlog scale, less is further up")
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+    )
+    return save_figure(figure, path)
+
+
+def _by_task(results: Sequence[AnyResults]) -> dict[str, list[Results]]:
+    """Return what is drawn under each title."""
+    tasks: dict[str, list[Results]] = {}
+    for one in results:
+        if not isinstance(one, Results):
+            raise ValueError(f"fronts: expected results of schema 2, got {one.schema} of {one.task}")
+        tasks.setdefault(f"{one.task}, score" if one.by_degrees else one.task, []).append(one)
+    if len(tasks) < 2:
+        raise ValueError(f"fronts: expected results of two tasks at least, got {[*tasks]}")
+    return tasks
+
+
+def _of_first(found: Sequence[Results]) -> dict[str, MethodEntry]:
+    """Return the methods of all results, each of the first that has it."""
+    methods: dict[str, MethodEntry] = {}
+    for one in reversed(found):
+        methods |= one.methods
+    return methods
+
+
+def _share_scales(upper: Sequence[Axes], lower: Sequence[Axes]) -> None:
+    """Give all tasks the same scales, on which every point is; intervals may reach beyond."""
+    shown = [[y for axes in row for line in axes.lines for y in line.get_ydata()] for row in (upper, lower)]
+    for axes in upper:
+        axes.set_ylim(min(shown[0]) - 4, max(shown[0]) + 7)
+    low, high = min(shown[1]) / 1.15, max(shown[1]) * 1.1
+    for axes in lower:
+        axes.set_yscale("log")
+        axes.set_ylim(high, low)
+        axes.set_yticks(*plain_log_ticks(low, high))
+        axes.set_xticks(*plain_log_ticks(*axes.get_xlim()))
+        axes.minorticks_off()
+
+
+def _lost(method: MethodEntry) -> Estimate:
+    judged = method.judged
+    return 100 * judged.diff, (100 * judged.ci95[0], 100 * judged.ci95[1])
+
+
+def _time(method: MethodEntry) -> Estimate | None:
+    time = method.time_vs_dense
+    return None if time is None else (time.ratio, time.ci95)
+
+
+def _draw(
+    axes: Axes,
+    family: _Family,
+    methods: Mapping[str, MethodEntry],
+    point: Callable[[MethodEntry], Estimate | None],
+) -> Line2D | None:
+    """Draw the methods of a family, and return what stands for them in the legend, None where there is none."""
+    known = {name: point(methods[name]) for name in family.members(methods)}
+    names = [name for name, value in known.items() if value is not None]
+    if not names:
+        return None
+    at, values = [methods[name].speedup_vs_dense for name in names], [known[name] for name in names]
+    for x, (_, interval) in zip(at, values, strict=True):
+        axes.vlines(x, *interval, color=family.color, linewidth=1.6, alpha=0.5)
+    heights = [value for value, _ in values]
+    (line,) = axes.plot(at, heights, f"{family.marker}-", color=family.color, markersize=6, linewidth=1)
+    for name, x, y in zip(names, at, heights, strict=True):
+        if steps := _steps(name):
+            axes.annotate(
+                f"{steps}", (x, y), xytext=(5, 3), textcoords="offset points", fontsize=8, color=family.color
+            )
+    return line
+
+
+def _steps(name: str) -> int:
+    """Return the steps of a few-step chain, 0 of other methods.
+
+    >>> _steps("ddpm5_logsnr:int8"), _steps("uniform2_ddpm10")
+    (5, 0)
+    """
+    found = re.match(r"dd[pi]m(\d+)", name)
+    return int(found[1]) if found else 0
+
+
+def _margins(axes: Axes, dense: float, margin: float) -> None:
+    axes.set_xscale("log")
+    axes.axhline(dense, color="#333333", linewidth=1)
+    axes.axhline(margin, color="#333333", linewidth=1, linestyle=(0, (4, 3)), alpha=0.6)
