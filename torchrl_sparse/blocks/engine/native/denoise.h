@@ -285,6 +285,29 @@ INLINE float sum(V v) {
 #endif
 }
 
+INLINE V lesser(V a, V c) { return a < c ? a : c; }
+INLINE V greater(V a, V c) { return a > c ? a : c; }
+
+INLINE float least(V v) {
+#if VECTOR == 16
+    return _mm512_reduce_min_ps(v);
+#else
+    float found = v[0];
+    for (int i = 1; i < VECTOR; i++) found = v[i] < found ? v[i] : found;
+    return found;
+#endif
+}
+
+INLINE float greatest(V v) {
+#if VECTOR == 16
+    return _mm512_reduce_max_ps(v);
+#else
+    float found = v[0];
+    for (int i = 1; i < VECTOR; i++) found = v[i] > found ? v[i] : found;
+    return found;
+#endif
+}
+
 // e^x for x <= 88, to 1e-7; at most e^-87 instead of anything smaller.
 INLINE V exponential(V x) {
     x = x > -87.f ? x : splat(-87.f);
@@ -462,17 +485,14 @@ struct Query {
 
     // A row of f32 to 256 levels, of which one is 0, from its least to its largest number. `x` is padded to whole vectors.
     static void quantise(const float* x, int n, uint8_t* bytes, float* grid) {
-        V least{}, most{};
-        for (int j = 0; j < n; j += VECTOR) {
-            const V v = load(x + j);
-            least = v < least ? v : least;
-            most = v > most ? v : most;
-        }
-        float low = 0, high = 0;
-        for (int i = 0; i < VECTOR; i++) {
-            low = least[i] < low ? least[i] : low;
-            high = most[i] > high ? most[i] : high;
-        }
+        V below[2]{}, above[2]{};  // of every other vector: a comparison need not wait for the one before
+        for (int j = 0; j < n; j += 2 * VECTOR)
+            for (int i = 0; i < 2; i++) {
+                const V v = load(x + (j + i * VECTOR < n ? j + i * VECTOR : j));
+                below[i] = lesser(v, below[i]);
+                above[i] = greater(v, above[i]);
+            }
+        const float low = least(lesser(below[0], below[1])), high = greatest(greater(above[0], above[1]));
         const float step = (high - low) / 255, inverse = step > 0 ? 1 / step : 0;
         const float zero = (float)(int32_t)(.5f - low * inverse);
         for (int j = 0; j < n; j += VECTOR) {
@@ -553,6 +573,15 @@ struct Query {
     // Index of the first folded vector of a layer and an observation.
     size_t memory(int layer, int observation) const { return ((size_t)layer * m.obs_steps + observation) * m.heads; }
 
+    // What cross-attention reads of a step that no other reads. Weights have driven it out of the caches.
+    void fetch(int step, int index) const {
+        const size_t first = ((size_t)step * m.layers + index) * m.heads * b.width;
+        for (int j = 0; j < m.heads * b.width; j += 16) {
+            __builtin_prefetch(m.time_key + first + j, 0, 2);
+            __builtin_prefetch(m.time_value + first + j, 0, 2);
+        }
+    }
+
     // Scores and outputs are products with the folded memory: 1 + obs_steps vectors for each head and side.
     void cross_attention(int step, int index, bool read, float* d) const {
         // Token 0 is the denoising step, which all actions see; token s the observation s - 1.
@@ -602,6 +631,7 @@ struct Query {
     void compute(int step, int block, bool read) const {
         float* const d = b.latest + (size_t)(block % slots) * m.horizon * b.ld;
         const int index = block / 3, kind = block % 3;
+        if (kind == 0) fetch(step, index);
         normalise(kind == 1 ? rows : Range{0, m.horizon});
         if (kind == 0) self_attention(m.layer[index], d);
         if (kind == 1) cross_attention(step, index, read, d);
