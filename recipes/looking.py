@@ -3,7 +3,8 @@
     python recipes/looking.py task=lift policy=assets/lift pruner=assets/lift/sag
 
 Without a pruner only the similarities of what could be reused are measured. With ``oracle.attempts=200`` masks for all queries,
-for each phase of an episode and for each query are climbed to, which says what a pruner that looks could gain at most.
+for each phase of an episode and for each query are climbed to, which says what a pruner that looks could gain, as far as a
+search finds it.
 """
 
 from __future__ import annotations

@@ -225,6 +225,8 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
     )
     assert "own_minus_mean: " in looked
     assert "query minus all: " in looked
+    refused = run("looking", f"policy={policy}", "oracle.attempts=1", f"out={work}/no", expect=2)
+    assert "oracle.attempts: expected 0 without a pruner, got 1" in refused
     assert "reuse of own: cosine similarity" in looked
     for name in ("looking_Lift.png", "reuse_sources_Lift.png"):
         assert iio.imread(work / "looking" / name).std() > 5

@@ -73,6 +73,8 @@ def test_one_task_alone_and_results_without_times_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"fronts: expected results of two tasks at least, got \['Lift'\]"):
         fronts.plot_fronts([lift, lift], tmp_path / "fronts.png")
     old = load_results("assets/vla/results.json")
-    with pytest.raises(ValueError, match="fronts: expected results of schema 2, got 1 of lift_named"):
+    with pytest.raises(
+        ValueError, match="fronts: expected results with times to success, got lift_named without"
+    ):
         fronts.plot_fronts([lift, old], tmp_path / "fronts.png")
     assert not [*tmp_path.iterdir()]

@@ -64,8 +64,7 @@ def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
         path: of the PNG.
 
     Raises:
-        ValueError: if there are fewer tasks, or results of schema 1, which have no times.
-
+        ValueError: if there are fewer tasks, or results without times to success.
     """
     tasks = _by_task(results)
     figure, grid = make_figure(1.5 + 2.9 * len(tasks), 7.2, rows=2, columns=len(tasks), sharex=True)
@@ -93,8 +92,8 @@ def _by_task(results: Sequence[AnyResults]) -> dict[str, list[Results]]:
     """Return what is drawn under each title."""
     tasks: dict[str, list[Results]] = {}
     for one in results:
-        if not isinstance(one, Results):
-            raise ValueError(f"fronts: expected results of schema 2, got {one.schema} of {one.task}")
+        if not isinstance(one, Results) or one.dense.time_vs_dense is None:
+            raise ValueError(f"fronts: expected results with times to success, got {one.task} without them")
         tasks.setdefault(f"{one.task}, score" if one.by_degrees else one.task, []).append(one)
     if len(tasks) < 2:
         raise ValueError(f"fronts: expected results of two tasks at least, got {[*tasks]}")

@@ -1,8 +1,8 @@
-"""What looking could gain at most: a mask for all queries, one for each phase of an episode, one for each query.
+"""What looking could gain, as far as a search finds it: masks for all queries, for each phase of an episode, for each query.
 
-No pruner that reads the observation does better than the best mask of every query. So such masks are climbed to, from one that
-all share, with the answers of the dense policy known, which no pruner knows, on some draws of noise; and they are judged on
-others. If masks of their own gain nothing there, nothing that looks can; if they do, they are what a pruner should learn.
+Masks are climbed to, from one that all share, with the answers of the dense policy known, which no pruner knows, on some draws
+of noise; and they are judged on others. What masks of their own gain there is what a pruner that reads the observation could
+learn. It is no upper bound: a query's own mask is found with few draws of noise, and a part of what it fits is those.
 
 Each attempt swaps a few cells that are computed for as many pruned ones of the same type, so every mask costs what the first
 one does. It is kept where the mean error of the queries that share the mask falls. All are given as many attempts.
