@@ -36,6 +36,19 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
     return np.stack([row0, row1, np.cross(row0, row1)], axis=-2)
 
 
+def fixes_rotation(rot6d: np.ndarray) -> bool:
+    """Return whether 6 numbers fix a rotation, which parallel rows do not.
+
+    >>> fixes_rotation(np.array([1.0, 0, 0, 0, 1, 0])), fixes_rotation(np.ones(6))
+    (True, False)
+    """
+    try:
+        rot6d_to_matrix(rot6d)
+    except ValueError:
+        return False
+    return True
+
+
 def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
     """Convert [..., 3] rotation vectors (rad) to [..., 6].
 

@@ -64,6 +64,20 @@ def test_seed_fixes_the_whole_episode_and_successive_episodes_differ(lift):
     assert not torch.equal(first[0], second[0])
 
 
+@pytest.mark.parametrize("task", ["Lift", "TwoArmTransport"])
+def test_a_hand_whose_numbers_fix_no_rotation_stays_turned_as_it_is(task):
+    env = RobosuiteEnv(task, seeds=[7, 7])
+    arms, start = env.task.arms, env.reset()
+    held = hold_pose(env).view(arms, 10)
+    held[:, 2] += 0.02
+    saturated = held.clone()
+    saturated[0, 3:9] = 1.0  # both rows the same
+    lifted = run(env, start, held.view(-1), steps=1)
+    found = run(env, env.reset(), saturated.view(-1), steps=1)
+    torch.testing.assert_close(found, lifted, rtol=0, atol=1e-5)  # the held rotation is rounded to f32
+    env.close()
+
+
 def test_seeds_are_taken_in_turn_and_reported():
     env = RobosuiteEnv("Lift", seeds=[11, 3])
     resets = [env.reset() for _ in range(3)]

@@ -17,7 +17,14 @@ from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
 from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.rotations import ABSOLUTE_DIM, POSE_DIM, absolute_to_pose, downward_quaternion
+from torchrl_sparse.rotations import (
+    ABSOLUTE_DIM,
+    POSE_DIM,
+    absolute_to_pose,
+    downward_quaternion,
+    fixes_rotation,
+    matrix_to_rot6d,
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +52,8 @@ class RobosuiteEnv(SeededEnv):
     Args:
         task: one of `torchrl_sparse.envs.tasks.TASKS`.
         action_mode: "absolute", 10 numbers per arm (position in m, 6-D rotation of the grip site in the world frame, gripper
-            -1 open to 1 closed), or "delta", robosuite's 7 normalised OSC_POSE numbers per arm.
+            -1 open to 1 closed), or "delta", robosuite's 7 normalised OSC_POSE numbers per arm. Where six numbers fix no
+            rotation, the hand stays turned as it is.
         horizon: steps until truncation; the task's own by default.
         seeds: seeds of successive episodes, repeated when used up. For paired evaluations.
         camera: camera of ``("observation", "image")``, e.g. "agentview"; none by default.
@@ -193,8 +201,22 @@ class RobosuiteEnv(SeededEnv):
     # -- steps ---------------------------------------------------------------------------------------------------------
 
     def _advance(self, action: np.ndarray) -> float:
-        command = absolute_to_pose(action) if self.action_mode == "absolute" else action
+        command = absolute_to_pose(self._turned(action)) if self.action_mode == "absolute" else action
         return self.sim_env.step(command)[1]
+
+    def _turned(self, action: np.ndarray) -> np.ndarray:
+        """Return the action with the hand's own rotation where it fixes none.
+
+        A policy that is pruned too far may saturate to two equal rows. That is its failure, and not the end of an evaluation.
+        """
+        arms = action.reshape(self.task.arms, ABSOLUTE_DIM).copy()
+        for arm, site in zip(arms, self._grip_sites(), strict=True):
+            if not fixes_rotation(arm[3:9]):
+                arm[3:9] = matrix_to_rot6d(self.sim_env.sim.data.get_site_xmat(site))
+        return arms.reshape(-1)
+
+    def _grip_sites(self) -> list[str]:
+        return [robot.gripper["right"].important_sites["grip_site"] for robot in self.sim_env.robots]
 
     def _is_solved(self) -> bool:
         return bool(self.sim_env._check_success())
@@ -241,8 +263,7 @@ class RobosuiteEnv(SeededEnv):
     def _eef_velocity(self) -> np.ndarray:
         """Return the velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
         data = self.sim_env.sim.data
-        sites = [robot.gripper["right"].important_sites["grip_site"] for robot in self.sim_env.robots]
-        twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in sites]
+        twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in self._grip_sites()]
         return np.concatenate([part for twist in twists for part in twist])
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
