@@ -201,14 +201,21 @@ class RobosuiteEnv(SeededEnv):
     # -- steps ---------------------------------------------------------------------------------------------------------
 
     def _advance(self, action: np.ndarray) -> float:
-        command = absolute_to_pose(self._turned(action)) if self.action_mode == "absolute" else action
+        command = self._pose(action) if self.action_mode == "absolute" else action
         return self.sim_env.step(command)[1]
 
-    def _turned(self, action: np.ndarray) -> np.ndarray:
-        """Return the action with the hand's own rotation where it fixes none.
+    def _pose(self, action: np.ndarray) -> np.ndarray:
+        """Return robosuite's command of an absolute action.
 
         A policy that is pruned too far may saturate to two equal rows. That is its failure, and not the end of an evaluation.
         """
+        try:
+            return absolute_to_pose(action)
+        except ValueError:
+            return absolute_to_pose(self._turned(action))
+
+    def _turned(self, action: np.ndarray) -> np.ndarray:
+        """Return the action with the hand's own rotation where it fixes none."""
         arms = action.reshape(self.task.arms, ABSOLUTE_DIM).copy()
         for arm, site in zip(arms, self._grip_sites(), strict=True):
             if not fixes_rotation(arm[3:9]):

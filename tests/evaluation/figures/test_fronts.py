@@ -3,7 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.evaluation.figures.test_plots import has_color
 from torchrl_sparse.evaluation.figures import fronts
@@ -28,9 +30,6 @@ def drawn(monkeypatch):
 
 
 def test_each_task_has_its_methods_on_the_scales_of_all(tmp_path, drawn):
-    import numpy as np
-    from PIL import Image
-
     results = [load_results(path) for path in (LIFT, SQUARE)]
     path = fronts.plot_fronts(results, tmp_path / "fronts.png")
     (grid,) = drawn

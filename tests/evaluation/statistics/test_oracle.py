@@ -43,7 +43,7 @@ def test_where_nothing_can_be_swapped_nothing_is(value):
 
 
 def test_errors_are_those_of_the_executed_actions_to_dense_on_the_same_noise(policy, encoded):
-    climber = Climber(policy, encoded, draws=3, n_action_steps=4, reuse="block", seed=5)
+    climber = Climber(policy, encoded, draws=3, n_action_steps=4, seed=5)
     masks = BySign.masks(policy.plan, encoded[keys.COND])
     seeds = torch.randint(2**62, (36, 1), generator=torch.Generator().manual_seed(5)).view(12, 3)
     for query, found in enumerate(climber.errors(masks)):
@@ -58,7 +58,7 @@ def test_errors_are_those_of_the_executed_actions_to_dense_on_the_same_noise(pol
 
 def test_each_group_climbs_to_the_mask_that_its_own_queries_want(policy, encoded, monkeypatch):
     wanted = BySign.masks(policy.plan, encoded[keys.COND])
-    climber = Climber(policy, encoded, draws=1, n_action_steps=4, reuse="block", seed=0)
+    climber = Climber(policy, encoded, draws=1, n_action_steps=4, seed=0)
     monkeypatch.setattr(climber, "errors", lambda masks: (masks != wanted).float().mean(dim=(1, 2)))
     start = torch.zeros(STEPS, BLOCKS, dtype=torch.bool)
     start[1, :3], start[2] = True, True  # as many of each type as either wants, or half

@@ -21,7 +21,15 @@ from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH, dense_answer
 from torchrl_sparse.training.pruner.loss import varying_share
 from torchrl_sparse.training.pruner.trainer import mean_mask
 
-__all__ = ["Looking", "episode_phases", "episode_rows", "looking", "paired_interval"]
+__all__ = [
+    "Looking",
+    "actions_under",
+    "episode_phases",
+    "episode_rows",
+    "looking",
+    "paired_interval",
+    "planned_queries",
+]
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ def looking(
         ValueError: if there are fewer than two episodes.
     """
     policy = policy.with_plan(policy.plan)
-    encoded = policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
+    encoded = planned_queries(policy, queries)
     masks, starts = encoded[keys.PRUNE_MASK], episode_rows(encoded)
     mean = mean_mask(masks.float().mean(dim=0))
     other = torch.randperm(len(masks), generator=torch.Generator().manual_seed(seed)).roll(1)
@@ -83,7 +91,7 @@ def looking(
     candidates = {"own": masks, "mean": mean.expand_as(masks).contiguous(), "others": masks[other]}
     first = policy.n_obs_steps - 1
     errors = {
-        name: (_actions(policy, encoded, asked) - dense)[:, first : first + n_action_steps]
+        name: (actions_under(policy, encoded, asked) - dense)[:, first : first + n_action_steps]
         .abs()
         .mean(dim=(1, 2))
         for name, asked in candidates.items()
@@ -103,8 +111,13 @@ def looking(
     )
 
 
-def _actions(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) -> Tensor:
-    """Return normalised actions [N, H, A] of queries under ``masks``."""
+def planned_queries(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDictBase:
+    """Return queries with their conditions and the masks that the policy's planner has for them."""
+    return policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
+
+
+def actions_under(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) -> Tensor:
+    """Return normalised actions [N, H, A] of queries under ``masks``, by the planner's rule of reuse."""
     noise = policy.sample_noise(encoded[keys.SEED].flatten())
     parts = zip(*(part.split(ANSWER_BATCH) for part in (noise, encoded[keys.COND], masks)), strict=True)
     return torch.cat([policy.denoise(*part, reuse=policy.plan.reuse) for part in parts])

@@ -19,10 +19,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
-from torchrl_sparse.evaluation.statistics.looking import episode_phases, episode_rows, paired_interval
+from torchrl_sparse.blocks.mask import BLOCK_TYPES
+from torchrl_sparse.evaluation.statistics.looking import (
+    actions_under,
+    episode_phases,
+    episode_rows,
+    paired_interval,
+    planned_queries,
+)
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH, dense_answers
+from torchrl_sparse.training.diffusion.targets import dense_answers
 from torchrl_sparse.training.pruner.trainer import mean_mask
 
 __all__ = ["Climber", "Oracle", "oracle", "swap_cells"]
@@ -55,11 +61,10 @@ class Climber:
     """Says what masks are worth on some draws of noise.
 
     Args:
-        policy: with the sampler that is pruned.
+        policy: with the sampler that is pruned, and the planner whose rule of reuse holds.
         queries: [N], with ``("diffusion", "cond")``.
         draws: of noise for each query.
         n_action_steps: actions of a chunk that are executed.
-        reuse: what pruned blocks add.
         seed: of the noise.
     """
 
@@ -70,10 +75,9 @@ class Climber:
         *,
         draws: int,
         n_action_steps: int,
-        reuse: Reuse,
         seed: int,
     ) -> None:
-        self._policy, self._reuse, self._draws = policy, reuse, draws
+        self._policy, self._draws = policy, draws
         generator = torch.Generator().manual_seed(seed)
         seeds = torch.randint(2**62, (len(queries) * draws, 1), generator=generator).to(policy.device)
         cond = queries[keys.COND].repeat_interleave(draws, dim=0)
@@ -86,13 +90,8 @@ class Climber:
     def errors(self, masks: Tensor) -> Tensor:
         """Return f32 [N] on the CPU, of each query under its own of ``masks``, bool [N, K, 3L]."""
         repeated = masks.to(self._policy.device).repeat_interleave(self._draws, dim=0)
-        answers = [
-            self._policy.denoise(
-                self._policy.sample_noise(part[keys.SEED].flatten()), part[keys.COND], mask, reuse=self._reuse
-            )
-            for part, mask in zip(self._asked.split(ANSWER_BATCH), repeated.split(ANSWER_BATCH), strict=True)
-        ]
-        error = (torch.cat(answers)[:, self._executed] - self._dense).abs().mean(dim=(1, 2))
+        answers = actions_under(self._policy, self._asked, repeated)[:, self._executed]
+        error = (answers - self._dense).abs().mean(dim=(1, 2))
         return error.unflatten(0, (-1, self._draws)).mean(dim=1).cpu()
 
     def climb(
@@ -186,7 +185,7 @@ def oracle(
         ValueError: if there are fewer than two episodes.
     """
     policy = policy.with_plan(policy.plan)
-    encoded = policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
+    encoded = planned_queries(policy, queries)
     start = mean_mask(encoded[keys.PRUNE_MASK].float().mean(dim=0)).cpu()
     episodes = episode_rows(encoded)
     shared = {
@@ -194,7 +193,7 @@ def oracle(
         "phase": episode_phases(episodes, len(queries), phases).unique(return_inverse=True)[1],
         "query": torch.arange(len(queries)),
     }
-    options = {"draws": draws, "n_action_steps": n_action_steps, "reuse": policy.plan.reuse}
+    options = {"draws": draws, "n_action_steps": n_action_steps}
     climber, judge = (Climber(policy, encoded, **options, seed=2 * seed + part) for part in range(2))
     masks = {"start": start.expand(len(queries), *start.shape)}
     for name, groups in shared.items():
