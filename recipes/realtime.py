@@ -3,6 +3,7 @@
     python recipes/realtime.py task=lift_moving policy=runs/lift_moving/policy methods=[dense,ddim10,bac] episodes=100
 
 Kill it and run it again to go on: finished episodes are read from OUT/episodes. Latency 0 is the ordinary evaluation.
+``NAME_ahead`` shows the policy the state in which its answer will begin; ``demos`` is what the model of the state is fitted to.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ from omegaconf import DictConfig
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
-from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
+from torchrl_sparse.control.realtime_executor import delay_steps
+from torchrl_sparse.control.roll_forward import StateModel
+from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
-from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
+from torchrl_sparse.evaluation.benchmarks.late import evaluate_late
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
@@ -30,14 +34,14 @@ from torchrl_sparse.evaluation.results.realtime import (
     format_realtime,
     save_realtime,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.methods.diffusion import check_method, method_identity
-from torchrl_sparse.methods.executor import executed_every, execution_options
+from torchrl_sparse.methods.diffusion import check_method
+from torchrl_sparse.methods.executor import execution_options
+from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import executed_steps
+from torchrl_sparse.training.state_model import fit_state_model
 
 
 @recipe("realtime")
@@ -45,6 +49,7 @@ def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
+    model = state_model(config, task)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     if (seen := observed_keys(task.name, policy)) != task.state_keys:  # from which the pose to hold is read
         raise ValueError(
@@ -64,12 +69,15 @@ def main(config: DictConfig) -> None:
         methods, queries, repeats=config.latency_repeats, threads=config.threads, samples=samples
     )
 
+    shared = {name: config[name] for name in ("control_freq", "out", "num_envs", "workers", "backend")}
+    settings = {name: config[name] for name in ("task", "horizon", "n_action_steps")}
+    shared |= {"model": model, "settings": settings, "policy_device": config.device}
     runs = {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all runs
         for name, method in methods.items():
             delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), config.control_freq)
             episodes = {
-                steps: evaluate_delayed(name, method, steps, make_env, seeds, config)
+                steps: evaluate_late(name, method, steps, make_env, seeds, **shared)
                 for steps in delays.unique().tolist()
             }
             runs[name] = RealtimeRun(latency[name].p50, episodes)
@@ -87,32 +95,18 @@ def main(config: DictConfig) -> None:
     print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
 
 
-def evaluate_delayed(
-    name: str, policy: DiffusionPolicy, steps: int, make_env, seeds: range, config: DictConfig
-) -> list[EpisodeResult]:
-    """Run the episodes of one method whose answers come ``steps`` late."""
-    hold = HoldPose(find_robosuite_task(config.task).pose_slices)
-    actor = RealtimeExecutor(
-        policy,
-        hold,
-        executed_every(name, policy, config.n_action_steps),
-        latency=steps / config.control_freq,
-        control_freq=config.control_freq,
-        **execution_options(name),
+def state_model(config: DictConfig, task: RobosuiteTask) -> StateModel | None:
+    """Fit what methods named ``_ahead`` roll the state forward with; None if there are none."""
+    if not any(MethodName.parse(name).ahead for name in config.methods):
+        return None
+    if config.demos is None:
+        raise ValueError("demos: expected demonstrations to fit the _ahead methods' model to, got null")
+    demos, steps = read_demos(config.demos, task.state_keys, task=task.name), 3
+    model, error = fit_state_model(demos, steps)
+    print(
+        f"{config.demos}: {steps} steps ahead the model of the state errs by {error:.2f} of what no model does"
     )
-    settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": actor.n_action_steps}
-    return evaluate(
-        f"{name} +{steps}",
-        actor,
-        make_env,
-        seeds,
-        log=episode_log(config.out, f"{name}_delay{steps}"),
-        identity={**method_identity(name, policy), **settings, "delay_steps": steps},
-        num_envs=config.num_envs,
-        policy_device=config.device,
-        workers=config.workers,
-        backend=config.backend,
-    )
+    return model
 
 
 if __name__ == "__main__":

@@ -178,15 +178,15 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
         assert (out / "episodes" / name).read_bytes().startswith(log)
 
 
-def test_realtime_leaves_a_curve_per_method(work, policy):
+def test_realtime_leaves_a_curve_per_method(work, demos, policy):
     out = work / "realtime"
-    options = (
-        "task=lift_moving", f"policy={policy}", "methods=[ddim2_every2_of3]", "latencies=[0,0.1]", "episodes=1", "horizon=12",
-        "latency_repeats=1", f"out={out}",
-    )  # fmt: skip
-    output = run("realtime", *options)
+    few = ("latencies=[0,0.1]", "episodes=1", "horizon=12", "latency_repeats=1")
+    options = (f"policy={policy}", "methods=[ddim2_every2_of3_ahead]", *few, f"out={out}")
+    assert "demos: expected demonstrations to fit" in run("realtime", *options, expect=2)
+    output = run("realtime", *options, f"demos={demos}")
+    assert "3 steps ahead the model of the state errs by " in output
     results = load_realtime(out / "realtime.json")
-    assert list(results.methods) == ["dense", "ddim2_every2_of3"]
+    assert list(results.methods) == ["dense", "ddim2_every2_of3_ahead"]
     for name, method in results.methods.items():
         assert name in output
         assert {0, 2} <= {point.delay_steps for point in method.points}

@@ -11,4 +11,8 @@ from .realtime_executor import (
     HoldPose as HoldPose,
     RealtimeExecutor as RealtimeExecutor,
 )
+from .roll_forward import (
+    RollForward as RollForward,
+    StateModel as StateModel,
+)
 from .selectors import CoherentChunk as CoherentChunk

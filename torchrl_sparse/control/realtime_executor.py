@@ -4,9 +4,7 @@ A query takes ``latency`` seconds, in which the environment makes ``ceil(latency
 the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
 asynchronous inference. What the seam between the chunks is mended with: `RealtimeChunking`, a start of the policy, draws each
 query to the actions that play meanwhile; `WarmStart` begins from them; with ``num_samples`` the chunk that goes on best is
-played. Not done here is VLASH (arXiv:2512.01031), which shows the policy its robot's state rolled forward to when the answer
-begins and trains it for that. The policies here were not trained so, and half of their state, such as the vector from hand
-to cube, is what no commanded pose tells.
+played. `RollForward` shows the policy the state in which its answer will begin.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
+from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 from torchrl_sparse.rotations import quaternion_to_rot6d
 
 
@@ -117,7 +116,8 @@ class RealtimeExecutor(ChunkExecutor):
     def _play_on(self, tensordict: TensorDictBase, before: TensorDictBase) -> Tensor:
         """Return f32 [*B, n, A]: what is left of the chunk played ``before``; entry 0 is for the present step."""
         chunk = tensordict.get(keys.CHUNK)
-        left = _shift(keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0), self._age(before) + 1)
+        old = keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0)
+        left = shift_chunk(old, self._age(before) + 1, chunk.shape[-2])
         hold = self.hold(tensordict.select(*self.hold.in_keys)).get(keys.HOLD)
         return torch.where(tensordict.get(keys.IS_INIT)[..., None], hold[..., None, :], left)
 
@@ -168,10 +168,3 @@ def delay_steps(latency: Tensor, control_freq: float = 20.0) -> Tensor:
     [0, 1, 1, 2]
     """
     return (latency.double() * control_freq - 1e-3).ceil().long()  # rounding errors are no delay
-
-
-def _shift(chunk: Tensor, by: Tensor) -> Tensor:
-    """Return [*B, n, A] from entry ``by``, i64 [*B, 1], on; the last entry is repeated."""
-    length = chunk.shape[-2]
-    index = (by + torch.arange(length, device=chunk.device)).clamp(max=length - 1)
-    return chunk.gather(-2, index[..., None].expand(*index.shape, chunk.shape[-1]))

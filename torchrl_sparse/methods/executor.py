@@ -7,12 +7,14 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.realtime_executor import RealtimeExecutor
+from torchrl_sparse.control.roll_forward import RollForward, StateModel
 from torchrl_sparse.control.selectors import CoherentChunk
 from torchrl_sparse.methods.diffusion import make_controller
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["execution_options", "executed_every", "make_executor"]
+__all__ = ["execution_options", "executed_every", "make_executor", "make_realtime_executor"]
 
 
 def executed_every(text: str, policy: DiffusionPolicy, n_action_steps: int) -> int:
@@ -42,11 +44,48 @@ def execution_options(text: str) -> dict[str, Any]:
 def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> ChunkExecutor:
     """Return what executes the chunks of a method; the arguments are those of `executed_every`.
 
+    Raises:
+        ValueError: as `executed_every`, and for a method that looks ahead to when its answer begins: this world waits.
+
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> actor = make_executor("dense_every2_of4", policy, 8)
         >>> actor.n_action_steps, actor.num_samples
         (2, 4)
     """
+    if MethodName.parse(text).ahead:
+        raise ValueError(f"methods: {text}: expected no _ahead where the world waits for an answer")
     steps = executed_every(text, policy, n_action_steps)
     return ChunkExecutor(policy, steps, make_controller(text), **execution_options(text))
+
+
+def make_realtime_executor(
+    text: str,
+    policy: DiffusionPolicy,
+    n_action_steps: int,
+    *,
+    hold: TensorDictModuleBase,
+    latency: float,
+    control_freq: float,
+    model: StateModel | None = None,
+) -> RealtimeExecutor:
+    """Return what executes the chunks of a method in a world that does not wait.
+
+    Args:
+        text, policy, n_action_steps: of `executed_every`.
+        hold, latency, control_freq: of `RealtimeExecutor`.
+        model: what methods named ``_ahead`` roll the state forward with.
+
+    Raises:
+        ValueError: as `executed_every`, and for an ``_ahead`` without a model.
+    """
+    asked: TensorDictModuleBase = policy
+    if MethodName.parse(text).ahead:
+        if model is None:
+            raise ValueError(
+                f"methods: {text}: expected demos, to which the model of the state is fitted, got none"
+            )
+        asked = RollForward(policy, model)
+    every = executed_every(text, policy, n_action_steps)
+    timing = {"latency": latency, "control_freq": control_freq}
+    return RealtimeExecutor(asked, hold, every, **timing, **execution_options(text))

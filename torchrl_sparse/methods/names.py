@@ -10,7 +10,7 @@ __all__ = ["WEIGHTS", "MethodName"]
 WEIGHTS = ("bf16", "int8")
 
 _PATTERN = re.compile(
-    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?"  # the policy, and how its chunks are executed
+    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?(_ahead)?"  # the policy, and how its chunks are executed
     rf"(?::({'|'.join(WEIGHTS)}))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
 )
 
@@ -18,7 +18,7 @@ _PATTERN = re.compile(
 @dataclass(frozen=True)
 class MethodName:
     """A method as it is written: ``NAME``, ``NAME_everyN``, ``NAME_ofS`` or ``NAME_everyN_ofS``, behind that perhaps
-    ``:WEIGHTS``, and behind that ``@RATE`` or ``@COARSE-FINE``.
+    ``_ahead``, then ``:WEIGHTS``, and then ``@RATE`` or ``@COARSE-FINE``.
 
     Attributes:
         name: see `torchrl_sparse.methods.diffusion`.
@@ -26,6 +26,7 @@ class MethodName:
         weights: ``"bf16"``, ``"int8"``, or None, which rounds nothing.
         every: environment steps from one query to the next; None leaves them to the benchmark.
         samples: chunks that a query samples, of which the one that agrees best with the last chunk is played.
+        ahead: in a world that does not wait, the policy is shown the state in which its answer will begin.
     """
 
     name: str
@@ -33,11 +34,12 @@ class MethodName:
     weights: str | None = None
     every: int | None = None
     samples: int = 1
+    ahead: bool = False
 
     @property
     def asked_as_usual(self) -> bool:
         """True where episodes follow from the method's answers, not from how often or for how many it is asked."""
-        return self.every is None and self.samples == 1
+        return self.every is None and self.samples == 1 and not self.ahead
 
     @classmethod
     def parse(cls, text: str) -> MethodName:
@@ -48,19 +50,20 @@ class MethodName:
         >>> MethodName.parse("dense:int8").weights
         'int8'
         >>> MethodName.parse("ddpm3_logsnr_every2_of8")
-        MethodName(name='ddpm3_logsnr', rates=(), weights=None, every=2, samples=8)
+        MethodName(name='ddpm3_logsnr', rates=(), weights=None, every=2, samples=8, ahead=False)
         """
         match = _PATTERN.fullmatch(text)
         if match is None:
             raise ValueError(
-                "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME:bf16 or "
-                f"NAME:int8, got {text!r}"
+                "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME_ahead, "
+                f"NAME:bf16 or NAME:int8, got {text!r}"
             )
-        name, every, samples, weights, *rates = match.groups()
+        name, every, samples, ahead, weights, *rates = match.groups()
         return cls(
             name,
             tuple(float(rate) for rate in rates if rate is not None),
             weights,
             None if every is None else int(every),
             int(samples or 1),
+            ahead is not None,
         )

@@ -8,6 +8,7 @@ from .pruner import (
     PrunerConfig as PrunerConfig,
     PrunerTrainer as PrunerTrainer,
 )
+from .state_model import fit_state_model as fit_state_model
 from .trainer import Trainer as Trainer
 from .vla import (
     VLATrainer as VLATrainer,

@@ -9,6 +9,7 @@ from .film import (
     film_masks as film_masks,
     film_tokens as film_tokens,
 )
+from .late import evaluate_late as evaluate_late
 from .rounds import (
     episode_horizon as episode_horizon,
     make_design as make_design,
