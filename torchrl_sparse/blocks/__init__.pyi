@@ -17,7 +17,10 @@ from .planner import (
     PlanSpec as PlanSpec,
     StaticPlanner as StaticPlanner,
 )
-from .recall import Recall as Recall
+from .recall import (
+    Recall as Recall,
+    RecallSchedule as RecallSchedule,
+)
 from .sag import (
     PrunerInfo as PrunerInfo,
     PrunerNetwork as PrunerNetwork,

@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.blocks import schedule
+from torchrl_sparse.blocks import recall, schedule
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.blocks.sag import planner as sag
 from torchrl_sparse.storage.json import read_json
@@ -21,6 +21,7 @@ __all__ = ["PLANNERS", "load_planner", "save_beside", "saved_planners"]
 PLANNERS: dict[str, type[Planner]] = {
     schedule.FORMAT: schedule.SchedulePlanner,
     sag.FORMAT: sag.SAGPruner,
+    recall.FORMAT: recall.RecallSchedule,
 }
 """Format of a planner's file -> the class whose ``from_pretrained`` reads it."""
 

@@ -46,7 +46,7 @@ OPTIONS: dict[str, Any] = {
     "policy": Word,
     **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy", "collect_demos.policy"), Word | None),
     "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
-    "planners": Word,
+    **dict.fromkeys(("planners", "schedule"), Word),
     "demos": Word | None,
     "train_policy.demos": Annotated[Any, AfterValidator(_path_or_paths)],
     "out": Word,
