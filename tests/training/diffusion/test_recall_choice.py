@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.fixtures.recipes import demos, policy, schedules, work  # noqa: F401
+from tests.fixtures.recipes import demos, policy, work  # noqa: F401
 from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, Sampler, keys, load_planner
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
@@ -104,11 +104,11 @@ def test_episodes_of_one_query_say_nothing(lift):
         make_judge(lift, 1, 1)
 
 
-def test_the_recipe_goes_on_from_its_files(work, policy, schedules):
-    out = work / "recall"
-    options = (
-        f"policy={policy}", f"schedule={work}/schedules/bac.json", "episodes=2", "draws=3", "checkpoint_every=1", f"out={out}",
-    )  # fmt: skip
+def test_the_recipe_goes_on_from_its_files(work, policy):
+    out, few = work / "recall", ("sampler=ddpm4", "methods=[bac_unified]", "num_updates=2")
+    run("calibrate_bac", f"policy={policy}", *few, f"out={work}/few")
+    small = ("episodes=2", "draws=3", "checkpoint_every=1")
+    options = (f"policy={policy}", f"schedule={work}/few/bac_unified_ddpm4.json", *small, f"out={out}")
     assert "methods=[dense,swapped,recalling]" in run("search_recall", *options, "attempts=1")
     output = run("search_recall", *options, "attempts=3")
     assert "error: start 0." in output
