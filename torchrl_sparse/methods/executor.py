@@ -85,7 +85,7 @@ def make_realtime_executor(
             raise ValueError(
                 f"methods: {text}: expected demos, to which the model of the state is fitted, got none"
             )
-        asked = RollForward(policy, model)
+        asked = RollForward(policy, model.to(policy.device))
     every = executed_every(text, policy, n_action_steps)
     timing = {"latency": latency, "control_freq": control_freq}
     return RealtimeExecutor(asked, hold, every, **timing, **execution_options(text))
