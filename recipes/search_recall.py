@@ -27,7 +27,7 @@ from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.statistics.looking import episode_rows, planned_queries
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.storage.json import write_json
+from torchrl_sparse.storage.json import describe_differences, write_json
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.recall_choice import Choice, RecallJudge, climb_choice
 
@@ -81,8 +81,8 @@ def climb(
     if path.exists():
         written = (RecallSchedule if recalls else CacheSchedule).from_pretrained(path)
         done = written.settings.get("attempts", 0)
-        if written.settings != made_for | {"attempts": done}:
-            raise ValueError(f"{path}: made with other settings: {written.settings}, got {made_for}")
+        if differing := describe_differences(written.settings, made_for | {"attempts": done}):
+            raise ValueError(f"{path}: made with other settings: {differing}")
         mask = written.mask if recalls else written.mask()
         start = Choice(mask, written.chosen if recalls else torch.zeros_like(mask))
     keep = partial(write_choice, schedule, made_for, path, recalls=recalls)
@@ -91,13 +91,15 @@ def climb(
     ) as bar:
 
         def on_attempt(best: Choice, attempt: int) -> None:
-            if attempt % config.checkpoint_every == 0 or attempt == config.attempts:
+            if attempt % config.checkpoint_every == 0:
                 keep(best, attempt)
             bar.update()
 
-        return climb_choice(
+        best = climb_choice(
             judge, start, config.attempts, done=done, recalls=recalls, seed=config.seed, on_attempt=on_attempt
         )
+    keep(best, max(done, config.attempts))
+    return best
 
 
 def write_choice(

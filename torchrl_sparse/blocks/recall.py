@@ -26,7 +26,6 @@ A letter for each step in execution order: C computes, - reuses by the rule, R r
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -43,8 +42,7 @@ from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
 from torchrl_sparse.networks.diffusion.transformer import MAX_LAYERS
 from torchrl_sparse.networks.sizes import check_size
-from torchrl_sparse.storage.atomic import atomic_path
-from torchrl_sparse.storage.json import read_json
+from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = ["FORMAT", "Recall", "RecallSchedule", "recalled_steps"]
 
@@ -90,8 +88,8 @@ class _Counting(Planner):
         return tensordict.set(RECALL, self.recalled(tensordict.get(PRUNE_MASK)))
 
     def recalled(self, mask: Tensor) -> Tensor:
-        """Return the cells that are recalled of the pruned ones, both bool [*B, K, 3L]."""
-        raise NotImplementedError
+        """Return the cells that are recalled of the pruned ones, both bool [*B, K, 3L]: all, if nothing else is said."""
+        return mask.clone()
 
 
 class Recall(_Counting):
@@ -125,9 +123,6 @@ class Recall(_Counting):
         """Return masks bool [B, K, 3L] for queries of these numbers, i64 [B, 1]."""
         steps = recalled_steps(query, self.spec.num_inference_steps, self.interval)
         return steps[..., None].repeat(1, 1, self.spec.num_blocks)
-
-    def recalled(self, mask: Tensor) -> Tensor:
-        return mask.clone()
 
 
 class RecallSchedule(_Counting):
@@ -185,12 +180,9 @@ class RecallSchedule(_Counting):
     def save_pretrained(self, path: str | os.PathLike) -> None:
         """Write the file under a temporary name and move it into place."""
         spec = self.made_for
-        head = {"format": FORMAT, "policy": spec.policy, "sampler": spec.sampler}
-        head |= {"num_inference_steps": spec.num_inference_steps, "num_layers": spec.num_layers}
-        head |= {"reuse": self.reuse, "settings": self.settings, "cells": self.cells()}
-        text = json.dumps(head, indent=1, ensure_ascii=False) + "\n"
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        sizes = spec.num_inference_steps, spec.num_layers
+        made = self.reuse, self.settings, self.cells()
+        write_json(path, _RecallFile(FORMAT, spec.policy, spec.sampler, *sizes, *made))
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> RecallSchedule:
@@ -200,11 +192,7 @@ class RecallSchedule(_Counting):
             FileNotFoundError: if there is no such file.
             ValueError: naming the file, what was expected and what came, if it is no valid schedule.
         """
-        stored = read_json(path, _RecallFile)
-        try:
-            return stored.schedule()
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+        return read_json(path, _RecallFile).schedule()
 
 
 @dataclass(frozen=True)
@@ -220,8 +208,8 @@ class _RecallFile:
     settings: dict[str, Any]
     cells: dict[str, str]
 
-    def schedule(self) -> RecallSchedule:
-        """Return the schedule; ValueError if its blocks or letters are not those of the network."""
+    def __post_init__(self) -> None:
+        """Raise ValueError, which `read_json` puts the file before, if blocks or letters are not those of the network."""
         check_size("num_inference_steps", self.num_inference_steps, MAX_TRAIN_TIMESTEPS)
         check_size("num_layers", self.num_layers, MAX_LAYERS)
         SamplerName.parse(self.sampler)
@@ -234,7 +222,11 @@ class _RecallFile:
         for name, letters in self.cells.items():
             if len(letters) != steps or set(letters) - {_COMPUTED, _REUSED, _RECALLED}:
                 raise ValueError(f"cells of {name}: expected {steps} letters of C, - and R, got {letters!r}")
-        spec = PlanSpec(steps, self.num_layers, self.policy, self.sampler)
+        self.schedule()  # which refuses what is pruned in the first step
+
+    def schedule(self) -> RecallSchedule:
+        """Return the schedule."""
+        spec = PlanSpec(self.num_inference_steps, self.num_layers, self.policy, self.sampler)
         blocks = self.cells.values()
         mask, recalled = (
             torch.tensor([[letter in kinds for letter in letters] for letters in blocks]).T

@@ -109,7 +109,8 @@ class RollForward(TensorDictModuleBase):
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands
     to a policy that asks for them, and rolls ``("history", "state")`` forward through what plays until the answer is there.
     The first ``delay`` actions of the chunk are those, the answer's own follow, so that entry 0 is for the present step as in
-    any policy. An episode's first query, which waits at rest, and one without delay, are the policy's own.
+    any policy. An episode's first query, which waits at rest, and one without delay, are the policy's own. So is the
+    latency that it writes: rolling is not in it.
 
     Args:
         policy: reads ``("history", "state")``, two observation steps or more, and writes ``("vla_action", "chunk")``.

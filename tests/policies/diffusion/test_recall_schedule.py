@@ -102,9 +102,11 @@ def test_a_file_that_is_none_is_named(policy, tmp_path, change, message):
     path = tmp_path / "odd.json"
     schedule_for(policy).save_pretrained(path)
     stored = json.loads(path.read_text())
-    if letters := change.pop("letter", None):
-        stored["cells"]["layers.0.CA"] = letters
-    path.write_text(json.dumps(stored | change))
+    if "letter" in change:
+        stored["cells"]["layers.0.CA"] = change["letter"]
+    else:
+        stored |= change
+    path.write_text(json.dumps(stored))
     with pytest.raises(ValueError, match=rf"odd.json: .*{message}"):
         load_planner(path)
 

@@ -122,4 +122,4 @@ def test_the_recipe_goes_on_from_its_files(work, policy):
     for name in ("recalling.json", "swapped.json", "choice.json"):
         assert (work / "recall_alone" / name).read_bytes() == (out / name).read_bytes()
     refused = run("search_recall", *options, "attempts=3", "seed=1", expect=2)
-    assert "swapped.json: made with other settings" in refused
+    assert "swapped.json: made with other settings: seed is 1 here and 0 there" in refused

@@ -167,8 +167,6 @@ def mutate_choice(choice: Choice, rng: np.random.Generator, *, recalls: bool) ->
 
 
 def _some(places: list[list[int]], number: int, rng: np.random.Generator) -> list[list[int]]:
-    return (
-        [places[index] for index in rng.choice(len(places), min(number, len(places)), replace=False)]
-        if places
-        else []
-    )
+    if not places:
+        return []
+    return [places[index] for index in rng.choice(len(places), min(number, len(places)), replace=False)]
