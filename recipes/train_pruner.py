@@ -2,10 +2,9 @@
 
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
-``method=l2c reuse=block`` learns with SAG's objective what needs no observation, and with ``objective=noise rate=0.45
-train.norm=l2 targets.source=data`` as Learning-to-Cache does. Stop it at any moment; the same command resumes it, equal
-to the last bit. ``out/pruner`` is for `SAGPruner.from_pretrained`, and ``out/fixed.json`` beside it is its mean mask, the
-ablation; ``out/l2c.json`` and ``out/l2c_noise.json`` are for `SchedulePlanner`; ``out/curves.png`` shows how it went.
+``method=tts targets.turns=4`` also learns what is recalled of earlier queries, ``method=l2c reuse=block`` what needs no
+observation, with SAG's objective or, with ``objective=noise rate=0.45 train.norm=l2 targets.source=data``, L2C's own. Stop it
+at any moment; the same command resumes it, equal to the last bit. `load_planner` reads ``pruner`` and its mean, ``fixed.json``.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner, exported
 from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
+from torchrl_sparse.training.pruner.recalls import pruner_trainer
 from torchrl_sparse.training.pruner.rollouts import closed_loop_queries
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
@@ -43,13 +43,13 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(config.threads or torch.get_num_threads())
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     masks = [CacheSchedule.from_pretrained(path).mask() for path in initial_schedules(config)]
-    if config.spread and (masks or config.method != "sag"):
-        raise ValueError(f"spread: expected null with an init or without method=sag, got {config.spread}")
+    if config.spread and (masks or config.method == "l2c"):
+        raise ValueError(f"spread: expected null with an init or with method=l2c, got {config.spread}")
     trainer = make_trainer(config)
     if not (out / CHECKPOINT).exists():
         begin(trainer, masks, config)
-    made = {"init": initial_schedules(config), "targets": settings["targets"]}
-    made |= {name: settings[name] for name in ("spread", "rollouts")}
+    made = {name: settings[name] for name in ("targets", "spread", "rollouts")}
+    made["init"] = initial_schedules(config)
     train(trainer, settings, export=partial(export_planner, trainer, out, made))
     if config.logger == "csv" and trainer.step >= config.log_every:
         plot_pruner_curves(read_scalars(out / "log"), out / "curves.png", rate=trainer.config.rate)
@@ -65,7 +65,7 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
     sizes = {**config.network, "rate_input": options.rate_range is not None}
     gates = make_gates(config.method, policy, seed=options.seed, **sizes)
-    return PrunerTrainer(gates, policy, calibration_set(policy, config), options)
+    return pruner_trainer(gates, policy, calibration_set(policy, config), options)
 
 
 def initial_schedules(config: DictConfig) -> list[str]:
@@ -94,10 +94,9 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
-        if config.targets.source != "teacher":
-            raise ValueError(
-                f"targets.source: expected 'teacher' with rollouts, got {config.targets.source!r}"
-            )
+        for name, only in (("source", "teacher"), ("turns", 1)):
+            if (got := config.targets[name]) != only:
+                raise ValueError(f"targets.{name}: expected {only!r} with rollouts, got {got!r}")
         queries = closed_loop_queries(policy, config.task, config.rollouts, *initial_schedules(config)[:1])
         with progress("targets", "query") as show:
             targets = add_queries(policy, targets, queries, seed=config.targets.seed, on_progress=show)
@@ -107,12 +106,13 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
 
 def begin(trainer: PrunerTrainer, masks: list[Tensor], config: DictConfig) -> None:
     """Fit the gates to the masks of ``init``, or spread their logits; else leave them as they are."""
+    queries = trainer.train_set.reshape(-1)
     if config.spread:
-        spread_logits(trainer.gates, trainer.train_set, config.spread)
+        spread_logits(trainer.gates, queries, config.spread)
     if not masks:
         return
     with progress("fit to schedules", "step") as show:
-        fit_to_masks(trainer.gates, masks, trainer.train_set, seed=trainer.config.seed, on_progress=show)
+        fit_to_masks(trainer.gates, masks, queries, seed=trainer.config.seed, on_progress=show)
     print(f"{', '.join(initial_schedules(config))}: fitted, {trainer.validate()}")
 
 

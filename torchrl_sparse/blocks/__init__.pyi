@@ -35,4 +35,5 @@ from .schedule import (
     CacheSchedule as CacheSchedule,
     SchedulePlanner as SchedulePlanner,
 )
+from .tts import TTSPruner as TTSPruner
 from .uniform import Uniform as Uniform

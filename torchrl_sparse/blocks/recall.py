@@ -44,7 +44,7 @@ from torchrl_sparse.networks.diffusion.transformer import MAX_LAYERS
 from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.storage.json import read_json, write_json
 
-__all__ = ["FORMAT", "Recall", "RecallSchedule", "recalled_steps"]
+__all__ = ["FORMAT", "Recall", "RecallSchedule", "Recalling", "recalled_steps"]
 
 FORMAT = "torchrl_sparse.recall/1"
 
@@ -64,12 +64,12 @@ def recalled_steps(query: Tensor, num_steps: int, interval: int) -> Tensor:
     return ((step + query) % interval != 0) & (step > 0) & (query > 0)
 
 
-class _Counting(Planner):
-    """Counts the queries of an episode, and writes what they recall.
+class Recalling(Planner):
+    """Base of planners that recall: counts the queries of an episode, which `masks` gets the numbers of.
 
     Reads ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for it; queries that come without it,
     or without a query before them, are the first of their episode. Writes ``("diffusion", "recall")`` and
-    ``("diffusion", "query")`` beside the mask.
+    ``("diffusion", "query")`` beside the mask. A subclass writes :meth:`recalled`, unless all that is pruned is recalled.
     """
 
     in_keys = [COND, ELAPSED, QUERY]
@@ -85,14 +85,14 @@ class _Counting(Planner):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write mask and reuse rule as any planner, and which pruned cells are recalled."""
         tensordict = super().forward(tensordict)
-        return tensordict.set(RECALL, self.recalled(tensordict.get(PRUNE_MASK)))
+        return tensordict.set(RECALL, self.recalled(tensordict.get(COND), tensordict.get(PRUNE_MASK)))
 
-    def recalled(self, mask: Tensor) -> Tensor:
-        """Return the cells that are recalled of the pruned ones, both bool [*B, K, 3L]: all, if nothing else is said."""
+    def recalled(self, cond: Tensor, mask: Tensor) -> Tensor:
+        """Return the cells of ``mask`` that are recalled, both bool [*B, K, 3L], for ``cond`` f32 [*B, To, D]."""
         return mask.clone()
 
 
-class Recall(_Counting):
+class Recall(Recalling):
     """Writes which steps a query recalls, see the module.
 
     Args:
@@ -125,7 +125,7 @@ class Recall(_Counting):
         return steps[..., None].repeat(1, 1, self.spec.num_blocks)
 
 
-class RecallSchedule(_Counting):
+class RecallSchedule(Recalling):
     """Computes, reuses or recalls each cell as it was chosen, in every query of an episode but the first; see the module.
 
     Args:
@@ -166,7 +166,7 @@ class RecallSchedule(_Counting):
         """Return masks bool [B, K, 3L] for queries of these numbers, i64 [B, 1]: nothing is pruned in the first."""
         return self.mask & (query > 0)[..., None]
 
-    def recalled(self, mask: Tensor) -> Tensor:
+    def recalled(self, cond: Tensor, mask: Tensor) -> Tensor:
         return mask & self.chosen
 
     def cells(self) -> dict[str, str]:

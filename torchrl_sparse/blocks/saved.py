@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.blocks import recall, schedule
+from torchrl_sparse.blocks import recall, schedule, tts
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.blocks.sag import planner as sag
 from torchrl_sparse.storage.json import read_json
@@ -22,6 +22,7 @@ PLANNERS: dict[str, type[Planner]] = {
     schedule.FORMAT: schedule.SchedulePlanner,
     sag.FORMAT: sag.SAGPruner,
     recall.FORMAT: recall.RecallSchedule,
+    tts.FORMAT: tts.TTSPruner,
 }
 """Format of a planner's file -> the class whose ``from_pretrained`` reads it."""
 

@@ -123,7 +123,7 @@ OPTIONS: dict[str, Any] = {
     "seed": Whole,
     "evaluate_policy.seed": Whole | None,
     "horizon": Count | None,
-    "steps": Count,
+    **dict.fromkeys(("steps", "turns"), Count),
     "n_action_steps": Count | None,
     "control_freq": Positive,
     "latencies": Annotated[list[NotNegative], Field(min_length=1)],

@@ -1,4 +1,4 @@
-"""A choice for each cell: against queries written out, and through its file."""
+"""A choice for each cell, one for all queries or one of each: against queries written out, and a schedule through its file."""
 
 import json
 
@@ -10,6 +10,9 @@ from torchrl_sparse import ChunkExecutor, DiffusionPolicy, keys, load_planner
 from torchrl_sparse.blocks.mask import MaskError
 from torchrl_sparse.blocks.planner import PlanSpec
 from torchrl_sparse.blocks.recall import RecallSchedule
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo
+from torchrl_sparse.blocks.tts import TTSPruner
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 
 
@@ -24,30 +27,45 @@ def schedule_for(policy, reuse="block"):
     return RecallSchedule(*some_cells(8, policy.num_blocks), policy.plan.spec, reuse)
 
 
-def slow_query(policy, query, plan, memory):
+def pruner_for(policy, reuse="block"):
+    """An untrained one: whatever it chooses, it chooses for each observation."""
+    torch.manual_seed(0)
+    shape = policy.n_obs_steps, policy.network.cond_dim
+    network = PrunerNetwork(policy.sampler.timesteps.tolist(), policy.num_blocks, shape, recalls=True)
+    with torch.no_grad():
+        network.obs.weight *= 30
+        network.mlp[-1].bias.zero_()
+    spec = policy.plan.spec
+    return TTSPruner(network, PrunerInfo(spec.policy, spec.sampler, 0.5, reuse=reuse))
+
+
+def slow_query(policy, query, reuse, memory):
     """The chunk of one query []; ``memory`` maps (step, block) to what was computed last, and is empty in the first query."""
     network, sampler, first = policy.network, policy.sampler, not memory
     cond = policy.normalizer.normalize_state(query[keys.HISTORY_STATE])[None]
     noise = sample_noise(query[keys.SEED], sampler.num_inference_steps, (network.horizon, network.input_dim))
-    sample, latest, slots = noise[:, 0], {}, 3 if plan.reuse == "type" else network.num_blocks
+    sample, latest, slots = noise[:, 0], {}, 3 if reuse == "type" else network.num_blocks
+    mask, recalled = query[keys.PRUNE_MASK], query[keys.RECALL]
+    assert not (first and mask.any())
     for k, timestep in enumerate(sampler.timesteps.tolist()):
         x, tokens = network.embed(sample), network.memory(timestep, cond)
         for block in range(network.num_blocks):
-            if first or not plan.mask[k, block]:
+            if not mask[k, block]:
                 latest[block % slots] = memory[k, block] = network.block(block, x, tokens)
                 x = x + latest[block % slots]
             else:
-                x = x + (memory[k, block] if plan.chosen[k, block] else latest[block % slots])
+                x = x + (memory[k, block] if recalled[k, block] else latest[block % slots])
         gaussian = noise[:, k + 1] if k + 1 < sampler.num_inference_steps else None
         sample = sampler.step(network.head_out(x), k, sample, gaussian)
     return policy.normalizer.unnormalize_action(sample[0, network.n_obs_steps - 1 :])
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("make", [schedule_for, pruner_for])
 @pytest.mark.parametrize("reuse", ["block", "type"])
-def test_cells_are_computed_reused_and_recalled_in_each_sample_of_its_own(policy, reuse):
+def test_cells_are_computed_reused_and_recalled_in_each_sample_of_its_own(policy, make, reuse):
     """Two samples, four queries; the second sample begins a new episode at the third."""
-    policy.plan = plan = schedule_for(policy, reuse)
+    policy.plan = plan = make(policy, reuse)
     executor = ChunkExecutor(policy, n_action_steps=3)
     generator, td, memories = torch.Generator().manual_seed(0), TensorDict(batch_size=[2]), [{}, {}]
     for at in range(12):
@@ -60,10 +78,16 @@ def test_cells_are_computed_reused_and_recalled_in_each_sample_of_its_own(policy
             continue
         for row, query in enumerate(td.unbind(0)):
             memories[row] = {} if begins[row] else memories[row]
-            chunk = slow_query(policy, query, plan, memories[row])
+            chunk = slow_query(policy, query, reuse, memories[row])
             torch.testing.assert_close(query[keys.CHUNK], chunk, rtol=0, atol=1e-5)
-    assert torch.equal(td[keys.PRUNE_MASK], plan.mask.expand(2, -1, -1))
-    assert torch.equal(td[keys.RECALL], plan.chosen.expand(2, -1, -1))
+    mask, recalled = td[keys.PRUNE_MASK], td[keys.RECALL]
+    assert recalled.any()
+    if make is schedule_for:
+        assert torch.equal(mask, plan.mask.expand(2, -1, -1))
+        assert torch.equal(recalled, plan.chosen.expand(2, -1, -1))
+    else:
+        assert (mask[0] != mask[1]).any()
+        assert (recalled[0] != recalled[1]).any()
 
 
 def test_its_file_says_what_is_done_with_each_cell(policy, tmp_path):

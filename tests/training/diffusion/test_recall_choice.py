@@ -123,3 +123,24 @@ def test_the_recipe_goes_on_from_its_files(work, policy):
         assert (work / "recall_alone" / name).read_bytes() == (out / name).read_bytes()
     refused = run("search_recall", *options, "attempts=3", "seed=1", expect=2)
     assert "swapped.json: made with other settings: seed is 1 here and 0 there" in refused
+
+
+def test_gates_that_recall_are_trained_and_benchmarked_by_name(work, demos, policy):
+    small = ("targets.share=0.4", "train.batch_size=2", "train.max_updates=2", "log_every=1")
+    options = (
+        "method=tts",
+        f"policy={policy}",
+        f"demos={demos}",
+        "sampler={kind: ddpm, num_inference_steps: 4}",
+    )
+    training = (*options, *small, "rate=0.5", "spread=1", f"out={work}/tts", "targets.turns=2")
+    assert f"planners={work}/tts methods=[dense,pruner,fixed]" in run("train_pruner", *training)
+    assert "resumed from step 2" in run("train_pruner", *training)
+    few = ("episodes=1", "horizon=20", "latency_repeats=1", "videos=[]", f"out={work}/tts_benchmark")
+    run("benchmark", f"policy={policy}", f"planners={work}/tts", "methods=[dense,pruner,fixed]", *few)
+    rates = json.loads((work / "tts_benchmark" / "results.json").read_text())["methods"]
+    assert 0 < rates["pruner"]["prune_rate"] < 1
+    refused = run("looking", f"policy={policy}", f"pruner={work}/tts/pruner", f"out={work}/no", expect=2)
+    assert "config.json: format: expected 'torchrl_sparse.sag/1', got 'torchrl_sparse.tts/1'" in refused
+    refused = run("train_pruner", *training[:-2], "targets.turns=2", "rollouts=1", f"out={work}/no", expect=2)
+    assert "targets.turns: expected 1 with rollouts, got 2" in refused

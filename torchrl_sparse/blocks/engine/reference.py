@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import check_query
+from torchrl_sparse.blocks.engine.recall import Memory
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
@@ -18,7 +19,7 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
+__all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise", "denoise_recalling"]
 
 
 class FeatureRecorder:
@@ -119,6 +120,34 @@ def denoise(
         sample = sampler.step(eps, step, before, noise_k, cleans, guide)
         cleans = sampler.remember(cleans, eps, step, before, guide)
     return sample
+
+
+def denoise_recalling(
+    network: TransformerForDiffusion,
+    sampler: Sampler,
+    noise: Tensor,
+    cond: Tensor,
+    mask: Tensor,
+    recalled: Tensor,
+    memory: Tensor,
+    *,
+    reuse: Reuse = "block",
+) -> tuple[Tensor, Tensor]:
+    """Denoise with cells that recall earlier queries, see :mod:`torchrl_sparse.blocks.engine.recall`.
+
+    Args:
+        network, sampler, noise, cond, mask, reuse: as of :func:`denoise`.
+        recalled: bool [B, K, 3L], the pruned cells that recall.
+        memory: what was computed last in each cell, f32 [B, K, 3L, H, d]; it is not written to.
+
+    Returns:
+        normalised actions [B, H, A], and the memory that this query leaves to the next.
+
+    Raises:
+        ValueError: as ``denoise`` does, or if a cell is recalled that is not pruned.
+    """
+    kept = Memory(mask, recalled, memory)
+    return denoise(network, sampler, noise, cond, mask, reuse=reuse, replace=kept), kept.outputs
 
 
 def _block_output(

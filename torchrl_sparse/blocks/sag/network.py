@@ -43,6 +43,7 @@ class PrunerNetwork(nn.Module):
         hidden: of the MLP.
         n_layer, n_head: of the transformer encoder over the coordinates.
         rate_input: whether the target prune rate is an input.
+        recalls: whether there is a third logit, of recalling an earlier query, see :mod:`torchrl_sparse.blocks.tts`.
 
     Raises:
         ValueError: if a size is no positive number or far too large, or ``width`` no multiple of ``n_head``.
@@ -67,10 +68,11 @@ class PrunerNetwork(nn.Module):
         n_layer: int = 1,
         n_head: int = 4,
         rate_input: bool = False,
+        recalls: bool = False,
     ) -> None:
         super().__init__()
         self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input = rate_input
+        self.rate_input, self.recalls = rate_input, recalls
         self.config: dict[str, Any] = {
             "timesteps": self.timesteps,
             "num_blocks": num_blocks,
@@ -81,6 +83,7 @@ class PrunerNetwork(nn.Module):
             "n_layer": n_layer,
             "n_head": n_head,
             "rate_input": self.rate_input,
+            "recalls": self.recalls,
         }
         _check(**self.config)
         self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
@@ -94,18 +97,21 @@ class PrunerNetwork(nn.Module):
         self.fuse_obs = nn.Linear(obs_width, hidden)
         self.fuse_z = nn.Linear(width, hidden, bias=False)
         self.mlp = nn.Sequential(
-            nn.ReLU(inplace=True), nn.Linear(hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 2)
+            nn.ReLU(inplace=True),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(inplace=True),
+            nn.Linear(hidden, 2 + recalls),
         )
         self._forget()
 
     def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Return logits (keep, prune) f32 [B, K, 3L, 2].
+        """Return logits (keep, prune) f32 [B, K, 3L, 2], with ``recalls`` (keep, prune, recall) [B, K, 3L, 3].
 
         Args:
             cond: encoded observations f32 [B, To, D].
             rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
         """
-        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, 2)
+        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, -1)
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Return f32 [B, K, 3L], by how much pruning is preferred to keeping, at less cost than both logits.
@@ -118,6 +124,10 @@ class PrunerNetwork(nn.Module):
         hidden = functional.linear(self._fused(cond, rate).relu_(), middle.weight, middle.bias).relu_()
         logits = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
+
+    def recall_logits(self, cond: Tensor) -> Tensor:
+        """Return f32 [B, K, 3L], positive where a cell recalls if it is pruned; for networks with ``recalls``."""
+        return self(cond)[..., 2]
 
     def prune_masks(self, cond: Tensor) -> Tensor:
         """Return bool [B, K, 3L], where pruning is preferred, the first step left out; for networks without a rate as input."""
@@ -142,7 +152,7 @@ class PrunerNetwork(nn.Module):
             (layer.weight, layer.bias) for layer in (self.obs, self.fuse_obs, middle, last)
         )
         cells = self.cells().view(len(self.timesteps), self.num_blocks, -1)
-        return PrunerWeights(obs, fuse, cells, middle, last)
+        return PrunerWeights(obs, fuse, cells, middle, tuple(some[:2] for some in last))
 
     def _can_be_native(self) -> bool:
         small = self.fuse_obs.out_features <= MAX_HIDDEN
@@ -195,7 +205,7 @@ class PrunerNetwork(nn.Module):
         return (
             obs.in_features * obs.out_features
             + obs.out_features * hidden
-            + len(self.coordinates) * (hidden * hidden + 2 * hidden)
+            + len(self.coordinates) * (hidden * hidden + self.mlp[-1].out_features * hidden)
         )
 
     def _encode(self) -> Tensor:
@@ -211,13 +221,16 @@ def _is_f32_on_cpu(tensor: Tensor) -> bool:
     return tensor.is_cpu and tensor.dtype == torch.float32
 
 
-def _check(timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool, **sizes: int) -> None:
+def _check(
+    timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool, recalls: bool, **sizes: int
+) -> None:
     if len(cond_shape) != 2:
         raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
     if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
         raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
-    if not isinstance(rate_input, bool):
-        raise ValueError(f"rate_input: expected true or false, got {reprlib.repr(rate_input)}")
+    for name, flag in (("rate_input", rate_input), ("recalls", recalls)):
+        if not isinstance(flag, bool):
+            raise ValueError(f"{name}: expected true or false, got {reprlib.repr(flag)}")
     check_size("timesteps", len(timesteps), _MAX_CELLS)
     check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
     check_size("width", sizes["width"], _MAX_TOKEN)

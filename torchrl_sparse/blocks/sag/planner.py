@@ -25,7 +25,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -96,7 +96,7 @@ class PrunerInfo:
 class _Config(PrunerInfo):
     """The content of ``config.json``."""
 
-    format: Literal["torchrl_sparse.sag/1"]
+    format: str
     network: dict[str, Any]
 
 
@@ -122,6 +122,7 @@ class SAGPruner(Planner):
 
     Attributes:
         rate: prune rate of the queries that do not bring their own. Assign another within ``info.rate_range``.
+        format: what its ``config.json`` says that it holds.
 
     Examples:
         >>> from torchrl_sparse.blocks.sag.network import PrunerNetwork
@@ -131,6 +132,8 @@ class SAGPruner(Planner):
         >>> pruner.masks(torch.zeros(3, 2, 5)).shape
         torch.Size([3, 4, 6])
     """
+
+    format: ClassVar[str] = FORMAT
 
     def __init__(self, network: PrunerNetwork, info: PrunerInfo) -> None:
         super().__init__()
@@ -207,7 +210,12 @@ class SAGPruner(Planner):
         """Write ``config.json``, with the rate that is set now, and ``pruner.safetensors`` into the folder ``path``."""
         path = Path(path)
         write_tensors(path / "pruner.safetensors", self.network.state_dict())
-        config = {"format": FORMAT, **asdict(self.info), "rate": self.rate, "network": self.network.config}
+        config = {
+            "format": self.format,
+            **asdict(self.info),
+            "rate": self.rate,
+            "network": self.network.config,
+        }
         write_json(path / "config.json", config)
 
     @classmethod
@@ -220,6 +228,10 @@ class SAGPruner(Planner):
         """
         path = Path(path)
         config = read_json(path / "config.json", _Config)
+        if config.format != cls.format:
+            raise ValueError(
+                f"{path / 'config.json'}: format: expected {cls.format!r}, got {config.format!r}"
+            )
         info = PrunerInfo(**{field.name: getattr(config, field.name) for field in fields(PrunerInfo)})
         try:
             with torch.device("meta"):  # compared with the weights before memory is taken for it

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
-from torchrl_sparse.blocks.engine.recall import Memory
-from torchrl_sparse.blocks.engine.reference import ReferenceEngine, denoise
+from torchrl_sparse.blocks.engine.reference import ReferenceEngine, denoise, denoise_recalling
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
@@ -128,11 +127,11 @@ class ActionDenoiser(TensorDictModuleBase):
         network, batch = self.network, tensordict.batch_size
         shape = (*mask.shape[1:], network.horizon, network.n_emb)
         before = _flat(keys.recall(tensordict, keys.FEATURES, shape, 0.0, cond.dtype), batch)
-        memory = Memory(mask, _flat(keys.read(tensordict, keys.RECALL), batch), before)
+        recalled = _flat(keys.read(tensordict, keys.RECALL), batch)
         (code,) = set(rules.tolist()) or {0}
-        options = {"reuse": REUSE_RULES[code], "replace": memory}
-        actions = denoise(network, self.sampler, noise, cond, mask, **options)
-        tensordict.set(keys.FEATURES, memory.outputs.reshape(*batch, *shape))
+        query = network, self.sampler, noise, cond, mask, recalled, before
+        actions, memory = denoise_recalling(*query, reuse=REUSE_RULES[code])
+        tensordict.set(keys.FEATURES, memory.reshape(*batch, *shape))
         return actions, mask_flops(NetworkSizes.of(network), mask)
 
     def static_flops(self, mask: Tensor) -> float:

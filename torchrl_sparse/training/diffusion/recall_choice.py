@@ -17,8 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.engine.recall import Memory
-from torchrl_sparse.blocks.engine.reference import denoise
+from torchrl_sparse.blocks.engine.reference import denoise_recalling
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import dense_answers
@@ -99,9 +98,8 @@ class RecallJudge:
         mask, recalled = (
             cells.to(cond.device).expand(len(cond), *cells.shape) for cells in (choice.mask, choice.recalled)
         )
-        kept = Memory(mask, recalled, memory[: len(cond)])
-        query = policy.network, policy.sampler, policy.sample_noise(seeds), cond, mask
-        return denoise(*query, reuse=self._reuse, replace=kept), kept.outputs
+        query = policy.network, policy.sampler, policy.sample_noise(seeds), cond, mask, recalled
+        return denoise_recalling(*query, memory[: len(cond)], reuse=self._reuse)
 
     def error(self, choice: Choice) -> float:
         """Return the mean of `errors` over all queries."""

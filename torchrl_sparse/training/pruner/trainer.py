@@ -23,7 +23,13 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import noise_errors
 from torchrl_sparse.blocks.sag.planner import rate_threshold
-from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
+from torchrl_sparse.blocks.sag.relaxed import (
+    Recalled,
+    denoise_relaxed,
+    gumbel_gate,
+    step_errors,
+    straight_through_gate,
+)
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -51,10 +57,13 @@ class PrunerTrainer(Trainer):
 
     Attributes:
         weight: cost of each block, f32 [3L], as ``config.cost`` counts it.
+        batch_dims: dimensions of ``targets``: one, of queries that know nothing of each other.
 
     Raises:
         ValueError: if calibration set, configuration and gates do not fit each other.
     """
+
+    batch_dims = 1
 
     def __init__(
         self, gates: Gates, policy: DiffusionPolicy, targets: TensorDict, config: PrunerConfig
@@ -71,6 +80,11 @@ class PrunerTrainer(Trainer):
         if (asked := max(config.rate_range or (config.rate,))) > highest:
             kept = "every other step" if config.objective == "noise" else "the first step"
             raise ValueError(f"rate: expected at most {highest:g}, since {kept} is kept, got {asked}")
+        if targets.batch_dims != self.batch_dims:
+            expected = "1" if self.batch_dims == 1 else "2 or more"
+            raise ValueError(
+                f"turns: expected {expected} for such gates, got targets of shape {list(targets.shape)}"
+            )
         if len(targets) < 2:
             raise ValueError(f"targets: expected at least 2 observations, got {len(targets)}")
         self.gates, self.policy = gates, policy
@@ -92,11 +106,14 @@ class PrunerTrainer(Trainer):
 
     def batch_losses(self, index: Tensor) -> dict[str, Tensor]:
         """Return the loss, its parts ``"fidelity"`` and ``"sparsity"``, and the prune rates of samples ``index``, i64 [B]."""
-        config, batch = self.config, self.train_set[index]
+        batch = self.train_set[index]
         rate = self._draw_rates(len(batch))
         logits = self._logits(batch[keys.COND], rate)
         gate = self._gate(logits)
-        fidelity = self._fidelity(batch, gate)
+        return self._losses(self._fidelity(batch, gate), logits, gate, rate)
+
+    def _losses(self, fidelity: Tensor, logits: Tensor, gate: Tensor, rate: Tensor) -> dict[str, Tensor]:
+        config = self.config
         sparsity = sparsity_loss(gate, rate, self.weight, per_block=config.sparsity == "block")
         information = mutual_information(logits)
         loss = fidelity + config.beta * sparsity
@@ -136,8 +153,9 @@ class PrunerTrainer(Trainer):
     def fixed_mask(self) -> Tensor:
         """Return the mean of the masks of all training observations, bool [K, 3L]: the cells that the gates prune most often,
         as many as they prune on average. L2C's result, and SAG's ablation that does not read the observation."""
-        parts = self.train_set[keys.COND].split(ANSWER_BATCH)
-        return mean_mask(sum(self._masks(part).sum(dim=0) for part in parts) / len(self.train_set))
+        cond = self.train_set.reshape(-1)[keys.COND]
+        masks = (self._masks(part) for part in cond.split(ANSWER_BATCH))
+        return mean_mask(sum(mask.sum(dim=0) for mask in masks) / len(cond))
 
     def header(self) -> dict[str, dict[str, Any]]:
         size = len(self.train_set) + len(self.held_out)
@@ -183,23 +201,29 @@ class PrunerTrainer(Trainer):
         return low + (high - low) * torch.rand(batch, 1).to(self.policy.device)
 
     def _fidelity(self, batch: TensorDict, gate: Tensor) -> Tensor:
-        config, policy = self.config, self.policy
-        if config.objective == "noise":
+        if self.config.objective == "noise":
             error = self._noise_errors(batch, gate)
+        elif self.config.gradient == "step":
+            error = step_errors(*self._query(batch, gate), **self._relaxed_options())
         else:
-            noise = policy.sample_noise(batch[keys.SEED].squeeze(-1))
-            query = policy.network, policy.sampler, noise, batch[keys.COND], gate
-            options = {
-                "reuse": config.reuse,
-                "explore": config.explore,
-                "checkpointed": config.checkpointed,
-                "detached": config.detached,
-            }
-            if config.gradient == "step":
-                error = step_errors(*query, **options)
-            else:
-                error = denoise_relaxed(*query, **options) - batch["target"]
-        return error.abs().mean() if config.norm == "l1" else error.square().mean()
+            error = self._chain_errors(batch, gate)
+        return self._norm(error)
+
+    def _chain_errors(self, batch: TensorDict, gate: Tensor, recalled: Recalled | None = None) -> Tensor:
+        """Return the errors of the whole chain's actions, [B, H, A]."""
+        actions = denoise_relaxed(*self._query(batch, gate), **self._relaxed_options(), recalled=recalled)
+        return actions - batch["target"]
+
+    def _query(self, batch: TensorDict, gate: Tensor) -> tuple:
+        """Return what a query of the policy is made of: network, sampler, noise, condition and gates or mask."""
+        noise = self.policy.sample_noise(batch[keys.SEED].squeeze(-1))
+        return self.policy.network, self.policy.sampler, noise, batch[keys.COND], gate
+
+    def _relaxed_options(self) -> dict[str, Any]:
+        return {name: getattr(self.config, name) for name in ("reuse", "explore", "checkpointed", "detached")}
+
+    def _norm(self, error: Tensor) -> Tensor:
+        return error.abs().mean() if self.config.norm == "l1" else error.square().mean()
 
     def _noise_errors(self, batch: TensorDict, gate: Tensor) -> Tensor:
         """Return the errors of one step for the whole batch, drawn with its noise, as L2C's release does."""
