@@ -10,6 +10,8 @@ Or make a `results.json` of schema 1 anew in schema 2, with times from the episo
 Or draw what methods gain and lose on all tasks in one picture; of several files of a task the first that has a method counts:
 
     python recipes/report.py fronts=[assets/lift/test_split/results.json,assets/pusht/results.json] out=outputs/fronts.png
+
+and ``spending=`` what methods that ask more often, or for several samples, spend a second.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
-from torchrl_sparse.evaluation.figures.fronts import plot_fronts
+from torchrl_sparse.evaluation.figures.fronts import plot_fronts, plot_spending
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
@@ -40,6 +42,8 @@ def main(config: DictConfig) -> None:
         print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
     elif config.fronts:
         print(plot_fronts([load_results(path) for path in config.fronts], config.out))
+    elif config.spending:
+        print(plot_spending([load_results(path) for path in config.spending], config.out))
     else:
         faults = write_report(config.runs, config.out, title=config.title)
         for fault in faults.values():

@@ -53,7 +53,7 @@ OPTIONS: dict[str, Any] = {
     "dense_log": Word | None,
     "runs": Word,
     "results": Words,
-    **dict.fromkeys(("upgrade", "aggregate", "fronts"), list[Word]),
+    **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending"), list[Word]),
     "root": Word,
     "title": str,
     "sweep": Word,

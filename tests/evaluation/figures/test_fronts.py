@@ -67,13 +67,31 @@ def test_of_two_files_of_a_task_the_first_counts(tmp_path, drawn):
     assert speeds == [[lift.methods["bac"].speedup_vs_dense], [1.5]]
 
 
-def test_one_task_alone_and_results_without_times_are_refused(tmp_path):
+def test_spending_is_by_what_a_second_costs_and_marked_with_the_interval(tmp_path, drawn):
+    asked_often = load_results("assets/statistics/results_replanning_can.json")
+    path = fronts.plot_spending([asked_often, load_results(LIFT)], tmp_path / "spending.png")
+    ((upper, lower),) = drawn
+    assert not [
+        line for line in upper[1].lines if line.get_color() == "#0072B2"
+    ]  # nothing is said of a second there
+    plain, chosen = [line for line in lower[0].lines if line.get_color() == "#0072B2"]
+    names = [f"ddpm3_logsnr{every}" for every in ("", "_every4", "_every2", "_every1")]
+    methods = [asked_often.methods[name] for name in names]
+    assert plain.get_xdata().tolist() == [method.per_episode.flops_per_step_to_dense for method in methods]
+    assert plain.get_ydata().tolist() == [method.time_vs_dense.ratio for method in methods]
+    assert [text.get_text() for text in lower[0].texts] == ["8", "4", "2", "1", "2"]
+    assert chosen.get_xdata()[0] > 0.9
+    assert has_color(np.asarray(Image.open(path).convert("RGB")), "#0072B2")
+
+
+def test_one_task_is_enough_and_results_without_times_are_refused(tmp_path, drawn):
     lift = load_results(LIFT)
-    with pytest.raises(ValueError, match=r"fronts: expected results of two tasks at least, got \['Lift'\]"):
-        fronts.plot_fronts([lift, lift], tmp_path / "fronts.png")
+    fronts.plot_fronts([lift, lift], tmp_path / "lift.png")
+    assert drawn[0].shape == (2, 1)
     old = load_results("assets/vla/results.json")
-    with pytest.raises(
-        ValueError, match="fronts: expected results with times to success, got lift_named without"
-    ):
-        fronts.plot_fronts([lift, old], tmp_path / "fronts.png")
-    assert not [*tmp_path.iterdir()]
+    for plot in (fronts.plot_fronts, fronts.plot_spending):
+        with pytest.raises(
+            ValueError, match="fronts: expected results with times to success, got lift_named without"
+        ):
+            plot([lift, old], tmp_path / "fronts.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["lift.png"]

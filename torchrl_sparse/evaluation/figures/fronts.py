@@ -1,4 +1,4 @@
-"""All tasks in one picture: how much faster methods are, and what that costs in success and in time to success."""
+"""All tasks in one picture: how much faster methods are, or what they spend, and what that does to success and its time."""
 
 from __future__ import annotations
 
@@ -18,23 +18,40 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-__all__ = ["plot_fronts"]
+__all__ = ["plot_fronts", "plot_spending"]
 
 Estimate = tuple[float, Interval]
 
 
 @dataclass(frozen=True)
 class _Family:
-    """Methods of one kind, which have one colour; in order of their steps, where they have such."""
+    """Methods of one kind, which have one colour; joined in the order of their numbers, where they have such."""
 
     label: str
     names: str
     color: str
     marker: str
 
-    def members(self, methods: Iterable[str]) -> list[str]:
+    def members(self, methods: Iterable[str], number: Callable[[str], int]) -> list[str]:
         found = [name for name in methods if re.fullmatch(self.names, name)]
-        return sorted(found, key=lambda name: -_steps(name))
+        return sorted(found, key=lambda name: -number(name))
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """What methods are drawn against.
+
+    Attributes:
+        label: of the axis.
+        families: that are drawn.
+        number: of a method's name, which its point is marked with; 0 for none.
+        of: where a method lies; None where its results do not say.
+    """
+
+    label: str
+    families: tuple[_Family, ...]
+    number: Callable[[str], int]
+    of: Callable[[MethodEntry], float | None]
 
 
 _FAMILIES = (
@@ -52,6 +69,18 @@ _FAMILIES = (
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
 )
 
+_FEW_STEPS = {2: "#56B4E9", 3: "#0072B2", 5: "#009E73", 10: "#E69F00"}
+_SPENDERS = (
+    _Family("dense, other noise", "dense_noise", "#8A8A8F", "s"),
+    *(
+        _Family(
+            f"{steps} stochastic steps{label}", rf"ddpm{steps}(_logsnr)?(_every\d+)?{names}", color, marker
+        )
+        for steps, color in _FEW_STEPS.items()
+        for label, names, marker in (("", "", "o"), (", one of eight samples", "_of8", "D"))
+    ),
+)
+
 
 def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
     """Draw, for each task, what methods lose to dense against how many times as fast as dense a query is.
@@ -60,25 +89,43 @@ def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
     lines the margins. Methods that are of no known kind are left out. Steps of one sampler are joined and numbered.
 
     Args:
-        results: of two tasks at least; of several of one task the first that has a method counts.
+        results: of any number of tasks; of several of one task the first that has a method counts.
         path: of the PNG.
 
     Raises:
-        ValueError: if there are fewer tasks, or results without times to success.
+        ValueError: if there are results without times to success.
     """
+    return _plot(results, path, _SPEED)
+
+
+def plot_spending(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
+    """Draw the same against what a second of the robot's time costs, for methods that ask more often or for several samples.
+
+    Points are marked with the environment steps from one query to the next, eight where a name says nothing.
+
+    Args:
+        results, path: as of `plot_fronts`; of methods that say what an episode costs.
+
+    Raises:
+        ValueError: if there are results without times to success.
+    """
+    return _plot(results, path, _SPENT)
+
+
+def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -> Path:
     tasks = _by_task(results)
     figure, grid = make_figure(1.5 + 2.9 * len(tasks), 7.2, rows=2, columns=len(tasks), sharex=True)
     handles: dict[str, Line2D] = {}
     for (title, found), upper, lower in zip(tasks.items(), *grid, strict=True):
         methods = _of_first(found)
-        for family in _FAMILIES:
+        for family in axis.families:
             for axes, point in ((upper, _lost), (lower, _time)):
-                if (line := _draw(axes, family, methods, point)) is not None:
+                if (line := _draw(axes, family, methods, axis, point)) is not None:
                     handles[family.label] = line
         _margins(upper, 0, -100 * found[0].dense.judged.margin)
         _margins(lower, 1, 1 + found[0].dense.time_vs_dense.margin)
         upper.set_title(title, loc="left")
-        lower.set_xlabel("times as fast as dense")
+        lower.set_xlabel(axis.label)
     _share_scales(*grid)
     grid[0][0].set_ylabel("success or score,\npoints over dense's")
     grid[1][0].set_ylabel("time to success over dense's,\nlog scale, less is further up")
@@ -95,8 +142,6 @@ def _by_task(results: Sequence[AnyResults]) -> dict[str, list[Results]]:
         if not isinstance(one, Results) or one.dense.time_vs_dense is None:
             raise ValueError(f"fronts: expected results with times to success, got {one.task} without them")
         tasks.setdefault(f"{one.task}, score" if one.by_degrees else one.task, []).append(one)
-    if len(tasks) < 2:
-        raise ValueError(f"fronts: expected results of two tasks at least, got {[*tasks]}")
     return tasks
 
 
@@ -136,22 +181,25 @@ def _draw(
     axes: Axes,
     family: _Family,
     methods: Mapping[str, MethodEntry],
+    axis: _Axis,
     point: Callable[[MethodEntry], Estimate | None],
 ) -> Line2D | None:
     """Draw the methods of a family, and return what stands for them in the legend, None where there is none."""
-    known = {name: point(methods[name]) for name in family.members(methods)}
-    names = [name for name, value in known.items() if value is not None]
+    known = {
+        name: (axis.of(methods[name]), point(methods[name])) for name in family.members(methods, axis.number)
+    }
+    names = [name for name, where in known.items() if None not in where]
     if not names:
         return None
-    at, values = [methods[name].speedup_vs_dense for name in names], [known[name] for name in names]
+    at, values = zip(*(known[name] for name in names), strict=True)
     for x, (_, interval) in zip(at, values, strict=True):
         axes.vlines(x, *interval, color=family.color, linewidth=1.6, alpha=0.5)
     heights = [value for value, _ in values]
     (line,) = axes.plot(at, heights, f"{family.marker}-", color=family.color, markersize=6, linewidth=1)
     for name, x, y in zip(names, at, heights, strict=True):
-        if steps := _steps(name):
+        if number := axis.number(name):
             axes.annotate(
-                f"{steps}", (x, y), xytext=(5, 3), textcoords="offset points", fontsize=8, color=family.color
+                f"{number}", (x, y), xytext=(5, 3), textcoords="offset points", fontsize=8, color=family.color
             )
     return line
 
@@ -166,7 +214,26 @@ def _steps(name: str) -> int:
     return int(found[1]) if found else 0
 
 
+def _interval(name: str) -> int:
+    """Return the environment steps from one query of a few-step chain to the next, 0 for other methods.
+
+    >>> _interval("ddpm3_logsnr_every2_of8"), _interval("ddpm5_logsnr"), _interval("dense_noise")
+    (2, 8, 0)
+    """
+    found = re.search(r"_every(\d+)", name)
+    return (int(found[1]) if found else _USUAL_INTERVAL) if _steps(name) else 0
+
+
+def _second(method: MethodEntry) -> float | None:
+    return None if method.per_episode is None else method.per_episode.flops_per_step_to_dense
+
+
 def _margins(axes: Axes, dense: float, margin: float) -> None:
     axes.set_xscale("log")
     axes.axhline(dense, color="#333333", linewidth=1)
     axes.axhline(margin, color="#333333", linewidth=1, linestyle=(0, (4, 3)), alpha=0.6)
+
+
+_USUAL_INTERVAL = 8  # of all policies here
+_SPEED = _Axis("times as fast as dense", _FAMILIES, _steps, lambda method: method.speedup_vs_dense)
+_SPENT = _Axis("computation a second over dense's", _SPENDERS, _interval, _second)
