@@ -57,10 +57,18 @@ def cases() -> Iterator[Case]:
     """All of what is shipped, and copies under other rules of reuse."""
     for folder in sorted(path.parent for path in ASSETS.glob("*/model.safetensors")):
         for method in shipped_methods(folder):
-            for engine in ("",) if folder.name == "vla" else ENGINES:
+            for engine in ("",) if folder.name == "vla" else engines_of(folder, method):
                 yield Case(folder.name, method, engine)
     for method, rule, engine in product(_COPIED, _RULES, ENGINES):
         yield Case("lift", method, engine, rule)
+
+
+def engines_of(folder: Path, method: str) -> tuple[str, ...]:
+    """The engines that a method runs in: all but the reference, or that alone where it recalls earlier queries."""
+    planner = folder / f"{method}.json"
+    planner = planner if planner.exists() else folder / method / "config.json"
+    format = json.loads(planner.read_text(encoding="utf-8"))["format"] if planner.exists() else method
+    return ("reference",) if re.match(r"(torchrl_sparse\.)?(recall|tts)", format) else ENGINES
 
 
 def shipped_methods(folder: Path) -> list[str]:
