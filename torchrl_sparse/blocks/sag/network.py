@@ -83,9 +83,10 @@ class PrunerNetwork(nn.Module):
             "n_layer": n_layer,
             "n_head": n_head,
             "rate_input": self.rate_input,
-            "recalls": self.recalls,
         }
-        _check(**self.config)
+        _check(**self.config, recalls=recalls)
+        if recalls:  # SAG's files do not name what SAG has not
+            self.config["recalls"] = True
         self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
         self.token = nn.Linear(2 * width, width)
         layer = nn.TransformerEncoderLayer(
@@ -111,7 +112,8 @@ class PrunerNetwork(nn.Module):
             cond: encoded observations f32 [B, To, D].
             rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
         """
-        return self.mlp(self._fused(cond, rate)).view(len(cond), len(self.timesteps), self.num_blocks, -1)
+        logits = self.mlp(self._fused(cond, rate))
+        return logits.view(len(cond), len(self.timesteps), self.num_blocks, logits.shape[-1])
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Return f32 [B, K, 3L], by how much pruning is preferred to keeping, at less cost than both logits.
