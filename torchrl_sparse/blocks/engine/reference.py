@@ -19,7 +19,14 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise", "denoise_recalling"]
+__all__ = [
+    "ComputedRows",
+    "FeatureRecorder",
+    "ReferenceEngine",
+    "denoise",
+    "denoise_recalling",
+    "first_memory",
+]
 
 
 class FeatureRecorder:
@@ -148,6 +155,13 @@ def denoise_recalling(
     """
     kept = Memory(mask, recalled, memory)
     return denoise(network, sampler, noise, cond, mask, reuse=reuse, replace=kept), kept.outputs
+
+
+def first_memory(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Tensor:
+    """Return what a query that computes everything leaves to the next, the ``memory`` of :func:`denoise_recalling`."""
+    recorder = FeatureRecorder()
+    denoise(network, sampler, noise, cond, record=recorder)
+    return recorder.features().permute(2, 1, 0, 3, 4)
 
 
 def _block_output(

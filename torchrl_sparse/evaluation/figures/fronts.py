@@ -69,6 +69,7 @@ _FAMILIES = (
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
 )
 
+_USUAL_INTERVAL = 8  # environment steps between queries, of all policies here
 _FEW_STEPS = {2: "#56B4E9", 3: "#0072B2", 5: "#009E73", 10: "#E69F00"}
 _SPENDERS = (
     _Family("dense, other noise", "dense_noise", "#8A8A8F", "s"),
@@ -234,6 +235,5 @@ def _margins(axes: Axes, dense: float, margin: float) -> None:
     axes.axhline(margin, color="#333333", linewidth=1, linestyle=(0, (4, 3)), alpha=0.6)
 
 
-_USUAL_INTERVAL = 8  # of all policies here
 _SPEED = _Axis("times as fast as dense", _FAMILIES, _steps, lambda method: method.speedup_vs_dense)
 _SPENT = _Axis("computation a second over dense's", _SPENDERS, _interval, _second)

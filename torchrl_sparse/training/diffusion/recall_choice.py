@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.engine.reference import denoise_recalling
+from torchrl_sparse.blocks.engine.reference import denoise_recalling, first_memory
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import dense_answers
@@ -78,9 +78,9 @@ class RecallJudge:
             seeds = torch.randint(2**62, (len(cond), 1), generator=generator).to(cond.device)
             asked = TensorDict({keys.COND: cond, keys.SEED: seeds}, [len(cond)])
             self._turns.append((cond, seeds.flatten(), dense_answers(dense, asked)))
-        nothing = torch.zeros(policy.num_inference_steps, policy.num_blocks, dtype=torch.bool)
-        cells = len(self._turns[0][0]), *nothing.shape, policy.network.horizon, policy.network.n_emb
-        self._first = self._answer(0, Choice(nothing, nothing), torch.zeros(cells, device=policy.device))[1]
+        cond, seeds, _ = self._turns[0]
+        with torch.no_grad():
+            self._first = first_memory(policy.network, policy.sampler, policy.sample_noise(seeds), cond)
 
     def errors(self, choice: Choice) -> list[Tensor]:
         """Return, for each turn but the first, f32 [B] of the episodes that come to it: mean absolute difference to the dense

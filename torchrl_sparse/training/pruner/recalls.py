@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.engine.reference import denoise_recalling
+from torchrl_sparse.blocks.engine.reference import denoise_recalling, first_memory
 from torchrl_sparse.blocks.sag.relaxed import Recalled, straight_through_gate
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH
@@ -105,12 +105,11 @@ class RecallTrainer(PrunerTrainer):
         keep, prune, recall = self.gates(query[keys.COND]).unbind(-1)
         return prune - keep, recall
 
+    @torch.no_grad()
     def _first_memory(self, query: TensorDict) -> Tensor:
         """Return what the first queries of episodes leave to the next, f32 [B, K, 3L, H, d]."""
-        network, cells = self.policy.network, (self.policy.num_inference_steps, self.policy.num_blocks)
-        nothing = torch.zeros(len(query), *cells, dtype=torch.bool, device=self.policy.device)
-        empty = torch.zeros(*nothing.shape, network.horizon, network.n_emb, device=self.policy.device)
-        return self._answer(query, nothing, nothing, empty)[1]
+        noise = self.policy.sample_noise(query[keys.SEED].squeeze(-1))
+        return first_memory(self.policy.network, self.policy.sampler, noise, query[keys.COND])
 
     @torch.no_grad()
     def _answer(
