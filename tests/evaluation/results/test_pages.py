@@ -1,5 +1,6 @@
 """A page names its tables, and gets them from the files that it names."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -61,6 +62,15 @@ def test_several_files_are_one_table_or_stand_side_by_side():
         table(cells, ASSETS)
     compared = f'{files} methods="dense | sag" cells="vs dense, points | speed-up"'
     assert table(compared, ASSETS)[1][1] == "1.00×"  # dense is not compared with itself
+
+
+def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
+    files = "lift_two_ways/results.json pusht/results.json"
+    cells = f'{files} methods="dense | bac" cells="success or score | time vs dense"'
+    _, dense, bac = table(cells, ASSETS)
+    results = json.loads((ASSETS / "pusht/results.json").read_text())["methods"]
+    assert dense[1].startswith("295/300") and dense[2].startswith(f"{results['dense']['score']['mean']:.3f}")
+    assert bac[1].count("[") == 2 and bac[2].count("[") == 1  # a score has an interval, and no time beside it
 
 
 def test_published_figures_stand_before_ours():

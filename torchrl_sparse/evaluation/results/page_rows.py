@@ -24,7 +24,7 @@ from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows,
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.results.stopping import load_stopping, stopping_rows
-from torchrl_sparse.evaluation.results.text import percent_text
+from torchrl_sparse.evaluation.results.text import count_text, mean_text, percent_text
 from torchrl_sparse.evaluation.results.vla_report import (
     load_vla_results,
     vla_method_rows,
@@ -108,15 +108,19 @@ def _results(path: Path) -> dict[str, Table]:
 def _more(results: AnyResults, name: str) -> Row:
     """Return the columns that only a page asks for."""
     method = results.methods[name]
-    chunks = 1 / method.latency_s.p50
+    chunks, score = 1 / method.latency_s.p50, method.score
     more = {
         "success, %": percent_text(method.success),
+        "success or score": mean_text(score.mean, score.ci95) if score else count_text(method.success),
         "action chunks per second": f"{chunks:.1f}",
         "actions per second": f"{results.policy.n_action_steps * chunks:.0f}",
     }
-    # Beside rows of version 2, one of version 1 has no times.
-    times = dict.fromkeys(("time vs dense", "time verdict"), "")
-    return more | (_more_of_times(results, method) if isinstance(method, MethodEntry) else times)
+    if isinstance(method, MethodEntry):
+        more |= _more_of_times(results, method)
+        if not score:
+            return more
+    # Beside rows of version 2 that success and time decide, one of version 1 or one that its score decides has no times.
+    return more | dict.fromkeys(("time vs dense", "time verdict"), "")
 
 
 def _more_of_times(results: Results, method: MethodEntry) -> Row:
