@@ -68,7 +68,9 @@ def main(config: DictConfig) -> None:
 def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
     """Measure the action error at each number, on the same recorded queries."""
     if config.demos is not None:
-        recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps)
+        task = find_robosuite_task(config.task)
+        poses = task.pose_slices(task.proprioception_keys)
+        recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps, poses)
     else:
         recorded = recorded_queries(
             policy, executor(policy, config), environment(policy, config), seeds(config)

@@ -116,7 +116,7 @@ def test_holding_leaves_the_arm_where_it_is():
     env = RobosuiteEnv("Lift", seeds=[3])
     td = env.reset()
     start = env.raw_observation()["robot0_eef_pos"]
-    td[keys.ACTION] = HoldPose(find_robosuite_task("lift").pose_slices)(td.clone())[keys.HOLD]
+    td[keys.ACTION] = HoldPose(find_robosuite_task("lift").pose_slices())(td.clone())[keys.HOLD]
     for _ in range(20):
         td = env.step(td)["next"].set(keys.ACTION, td[keys.ACTION])
     moved = env.raw_observation()["robot0_eef_pos"] - start
@@ -132,7 +132,7 @@ def policy():
 
 
 def test_without_latency_robosuite_sees_the_ordinary_evaluation(policy):
-    hold, make = HoldPose(find_robosuite_task("lift").pose_slices), partial(make_env, "Lift", horizon=40)
+    hold, make = HoldPose(find_robosuite_task("lift").pose_slices()), partial(make_env, "Lift", horizon=40)
 
     def outcomes(actor):
         episodes = rollout_episodes(actor, make, [100_000], num_envs=1)
@@ -151,7 +151,7 @@ def test_without_latency_every_action_is_the_ordinary_one(policy):
     late = td.clone()
     executors = (
         ChunkExecutor(policy),
-        RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices), latency=0.0),
+        RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices()), latency=0.0),
     )
     for step in range(10):
         for each in (td, late):
@@ -162,7 +162,7 @@ def test_without_latency_every_action_is_the_ordinary_one(policy):
 
 
 def test_its_keys_pass_through_a_collector(policy):
-    actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices), latency=0.1)
+    actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices()), latency=0.1)
     collector = Collector(
         make_env("Lift"),
         actor,

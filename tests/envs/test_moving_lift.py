@@ -19,7 +19,7 @@ def env():
 
 def watch(env, td, steps):
     """f64 [steps, 3] of the cube while the arm stands still."""
-    action = HoldPose(env.task.pose_slices)(td.clone())[keys.HOLD]
+    action = HoldPose(env.task.pose_slices())(td.clone())[keys.HOLD]
     positions = []
     for _ in range(steps):
         td = env.step(td.set(keys.ACTION, action))["next"]

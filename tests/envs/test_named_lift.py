@@ -47,7 +47,7 @@ def succeeds_with(env, state, colour):
     pose = sim.data.get_joint_qpos(joint).copy()
     sim.data.set_joint_qpos(joint, [*pose[:2], 1.2, *pose[3:]])
     sim.forward()
-    td = env.step(td.set(keys.ACTION, HoldPose(env.task.pose_slices)(td.clone())[keys.HOLD]))["next"]
+    td = env.step(td.set(keys.ACTION, HoldPose(env.task.pose_slices())(td.clone())[keys.HOLD]))["next"]
     return bool(td[keys.SUCCESS])
 
 

@@ -94,7 +94,9 @@ def test_every_entry_offers_what_a_task_has(task):
 
 def test_arms_lie_one_after_the_other_in_the_state():
     transport = find_robosuite_task("transport")
-    assert [(p.start, q.start, q.stop) for p, q in transport.pose_slices] == [(41, 44, 48), (50, 53, 57)]
+    assert [(p.start, q.start, q.stop) for p, q in transport.pose_slices()] == [(41, 44, 48), (50, 53, 57)]
+    seen = transport.proprioception_keys  # of cameras
+    assert [(p.start, q.start, q.stop) for p, q in transport.pose_slices(seen)] == [(0, 3, 7), (9, 12, 16)]
     assert transport.state_dim == 59
 
 

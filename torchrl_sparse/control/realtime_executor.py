@@ -51,7 +51,7 @@ class RealtimeExecutor(ChunkExecutor):
         >>> env = make_env("Lift", seeds=[7])
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> policy.sampler = Sampler("ddim", 10)
-        >>> actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices), latency=0.1)
+        >>> actor = RealtimeExecutor(policy, HoldPose(find_robosuite_task("lift").pose_slices()), latency=0.1)
         >>> env.rollout(3, actor)["control", "delay"].flatten().tolist()
         [2, 2, 2]
     """

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -112,17 +113,16 @@ class RobosuiteTask(_Named):
     def demonstrator(self) -> type:
         return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
 
-    @property
-    def pose_slices(self) -> list[tuple[slice, slice]]:
-        """For each arm, where its position and its quaternion (xyzw) lie in the state."""
-        place = self.state_slice
+    def pose_slices(self, state_keys: Sequence[str] | None = None) -> list[tuple[slice, slice]]:
+        """For each arm, where its position and its quaternion (xyzw) lie in a state; see `state_slice`."""
+        place = partial(self.state_slice, state_keys=state_keys)
         return [(place(f"robot{i}_eef_pos"), place(f"robot{i}_eef_quat_site")) for i in range(self.arms)]
 
-    def state_slice(self, key: str) -> slice:
-        """Locate one of `state_keys` in the state."""
-        sizes = [self.object_dim, *self.arms * tuple(_PROPRIOCEPTION.values())]
-        index = self.state_keys.index(key)
-        return slice(sum(sizes[:index]), sum(sizes[: index + 1]))
+    def state_slice(self, key: str, state_keys: Sequence[str] | None = None) -> slice:
+        """Locate an observation in a state of `state_keys`; None: those of the task."""
+        names = state_keys or self.state_keys
+        end = self.state_size(names[: names.index(key) + 1])
+        return slice(end - self.state_size([key]), end)
 
     def state_size(self, state_keys: Sequence[str]) -> int:
         """Return how many numbers the observations have together.

@@ -71,27 +71,35 @@ class EndEffectorVelocity(Transform):
         super().__init__(in_keys=[key], out_keys=[keys.EEF_VEL])
         self.control_freq = control_freq
         self._key = key
-        self._poses = task.pose_slices
+        self._poses = task.pose_slices()
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         state = tensordict_reset.get(self._key)
         return tensordict_reset.set(keys.EEF_VEL, state.new_zeros(*state.shape[:-1], 6 * len(self._poses)))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before, after = tensordict.get(self._key), next_tensordict.get(self._key)
-        twists = [
-            torch.cat(
-                [after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat])],
-                -1,
-            )
-            for pos, quat in self._poses
-        ]
-        return next_tensordict.set(keys.EEF_VEL, torch.cat(twists, -1) * self.control_freq)
+        moved = twists(tensordict.get(self._key), next_tensordict.get(self._key), self._poses)
+        return next_tensordict.set(keys.EEF_VEL, moved * self.control_freq)
 
     def transform_observation_spec(self, observation_spec):
         shape = (*observation_spec.shape, 6 * len(self._poses))
         observation_spec[keys.EEF_VEL] = Unbounded(shape, device=observation_spec.device)
         return observation_spec
+
+
+def twists(before: Tensor, after: Tensor, poses: Sequence[tuple[slice, slice]]) -> Tensor:
+    """Return by how far each arm moved and turned from one state to another, f32 [..., 6 * arms] in m and rad.
+
+    Args:
+        before, after: states [..., Ds].
+        poses: for each arm, where its position and its quaternion (xyzw) lie in them.
+    """
+    moved = [
+        part
+        for pos, quat in poses
+        for part in (after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat]))
+    ]
+    return torch.cat(moved, -1)
 
 
 def rotation_between(before: Tensor, after: Tensor) -> Tensor:

@@ -74,14 +74,20 @@ def test_queries_of_demonstrations_begin_with_each_episode():
         camera: torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(7, 3, 56, 56)
         for camera in CONFIG.cameras
     }
-    data |= {keys.STATE: torch.zeros(7, 8), keys.ACTION: torch.zeros(7, 7)}
+    state = torch.zeros(7, 8)
+    state[:, 0], state[:, 6] = torch.tensor([0.0, 1, 3, 7, 7, 8, 8]), 1.0  # x, and a quaternion that does not turn
+    data |= {keys.STATE: state, keys.ACTION: torch.zeros(7, 7)}
     episodes = Demonstrations(TensorDict(data, [7]), torch.tensor([0, 3, 7]))
-    found = [
-        *demonstrated_queries(make_policy(), InstructedDemonstrations(episodes, ["up", "down"]), every=2)
-    ]
+    demos, poses = InstructedDemonstrations(episodes, ["up", "down"]), [(slice(0, 3), slice(3, 7))]
+    found = [*demonstrated_queries(make_policy(), demos, 2, poses, control_freq=10.0)]
     assert [[int(td[keys.IMAGE][0, 0, 0]) for td in queries] for queries in found] == [[0, 2], [3, 5]]
     assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False]] * 2
     assert [queries[1][keys.INSTRUCTION] for queries in found] == ["up", "down"]
+    # Of the last step alone, whatever lies between two queries, and at rest where an episode begins.
+    assert [[td[keys.EEF_VEL][0].item() for td in queries] for queries in found] == [[0, 20], [0, 10]]
+    assert all(td[keys.EEF_VEL].count_nonzero() <= 1 for queries in found for td in queries)
+    back = SpecPrune(alpha=0.2, budget=PER_CAMERA, dynamic=False, look_back=2)
+    assert measure_errors(make_policy(), found, {0.2: back}, 1)[0].kept < CONFIG.num_visual
     assert measure_errors(make_policy(), found, {0.2: pruner(0.2)}, 1)[0].kept < CONFIG.num_visual
 
 

@@ -54,7 +54,7 @@ def evaluate_late(
         name,
         policy,
         settings["n_action_steps"],
-        hold=HoldPose(find_robosuite_task(settings["task"]).pose_slices),
+        hold=HoldPose(find_robosuite_task(settings["task"]).pose_slices()),
         latency=delay_steps / control_freq,
         control_freq=control_freq,
         model=model,

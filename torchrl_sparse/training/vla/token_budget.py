@@ -15,6 +15,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.transforms import twists
 from torchrl_sparse.methods.token_budget import BudgetPoint
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
@@ -51,12 +52,30 @@ def recorded_queries(
 
 
 def demonstrated_queries(
-    policy: VLAPolicy, demos: InstructedDemonstrations, every: int
+    policy: VLAPolicy,
+    demos: InstructedDemonstrations,
+    every: int,
+    poses: Sequence[tuple[slice, slice]],
+    control_freq: float = 20.0,
 ) -> Iterator[list[TensorDictBase]]:
-    """Take the same from demonstrations with images, one query each ``every`` steps; no simulator is needed."""
+    """Take the same from demonstrations with images, one query each ``every`` steps; no simulator is needed.
+
+    The hand's velocity, which demonstrations do not keep, is that of the step before each query, as `EndEffectorVelocity`'s.
+
+    Args:
+        policy: whose inputs are taken.
+        demos: whose states are the policy's.
+        every: steps from one query to the next.
+        poses: for each arm, where its position and its quaternion (xyzw) lie in the state.
+        control_freq: steps a second.
+    """
     observed = [*policy.network.config.cameras, keys.STATE]
     for index, instruction in enumerate(demos.instructions):
-        steps = demos.episodes.episode(index)[::every].select(*observed).clone()
+        steps = demos.episodes.episode(index).select(*observed).clone()
+        state = steps[keys.STATE]
+        before = torch.cat([state[:1], state[:-1]])  # an episode begins at rest
+        steps[keys.EEF_VEL] = twists(before, state, poses) * control_freq
+        steps = steps[::every]
         steps[keys.IS_INIT] = torch.arange(len(steps))[:, None] == 0
         yield [step.set(keys.INSTRUCTION, instruction) for step in steps.unbind(0)]
 
