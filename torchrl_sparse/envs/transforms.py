@@ -97,7 +97,10 @@ def twists(before: Tensor, after: Tensor, poses: Sequence[tuple[slice, slice]]) 
     moved = [
         part
         for pos, quat in poses
-        for part in (after[..., pos] - before[..., pos], rotation_between(before[..., quat], after[..., quat]))
+        for part in (
+            after[..., pos] - before[..., pos],
+            rotation_between(before[..., quat], after[..., quat]),
+        )
     ]
     return torch.cat(moved, -1)
 

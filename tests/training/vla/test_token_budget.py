@@ -75,7 +75,10 @@ def test_queries_of_demonstrations_begin_with_each_episode():
         for camera in CONFIG.cameras
     }
     state = torch.zeros(7, 8)
-    state[:, 0], state[:, 6] = torch.tensor([0.0, 1, 3, 7, 7, 8, 8]), 1.0  # x, and a quaternion that does not turn
+    state[:, 0], state[:, 6] = (
+        torch.tensor([0.0, 1, 3, 7, 7, 8, 8]),
+        1.0,
+    )  # x, and a quaternion that does not turn
     data |= {keys.STATE: state, keys.ACTION: torch.zeros(7, 7)}
     episodes = Demonstrations(TensorDict(data, [7]), torch.tensor([0, 3, 7]))
     demos, poses = InstructedDemonstrations(episodes, ["up", "down"]), [(slice(0, 3), slice(3, 7))]
