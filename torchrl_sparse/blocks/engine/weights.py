@@ -72,7 +72,6 @@ class WeightWatch:
             ValueError: naming a weight that has no values, on the meta device, or that is no floating-point number.
         """
         members = self._members
-        self.approach(members)
         if members.identities() != members.known:
             members = self._members = Members.of(self.network)
         # By `map`, which does not come back to the interpreter: all of this has left the caches since it was asked last.
@@ -85,9 +84,6 @@ class WeightWatch:
             places = self.locate([_first_values(p.detach()) for p in members.parameters])
             self._places = addresses, places
         return members.known, addresses, versions, self.read(places), self._refreshed
-
-    def approach(self, members: Members) -> None:
-        """Do what makes it faster to look at ``members``."""
 
     def locate(self, samples: list[Tensor]) -> Any:
         """Return what :meth:`read` needs to read ``samples``, views of each parameter's first values."""

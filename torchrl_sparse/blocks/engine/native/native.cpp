@@ -47,6 +47,33 @@ void run(int32_t threads, Task& task) {
     Team::run(threads, [](const Member& who, void* data) { (*static_cast<Task*>(data))(who); }, &task);
 }
 
+// Where CPython keeps a tensor behind its Python object and counts the changes of a dictionary, and PyTorch keeps what it knows
+// of a tensor: guesses, which kept.py tries before it trusts them.
+typedef uint64_t Word;
+constexpr int TENSOR = 2, CHANGES = 3, STORAGE = 2, VERSION = 5, LAYOUT_END = 20, DATA = 2, COUNT = 2;
+constexpr int PARAMETER_WORDS = 1 + LAYOUT_END - STORAGE + 2;
+
+const Word* follow(Word word) { return reinterpret_cast<const Word*>(static_cast<uintptr_t>(word)); }
+
+// Calls `meet` with each word until it returns false: the tensor, its layout, its version (none in inference mode), its data.
+template <class Meet>
+void meet_parameter(const Word* object, const Meet& meet) {
+    if (!meet(object[TENSOR])) return;
+    const Word* const tensor = follow(object[TENSOR]);
+    for (int i = STORAGE; i < LAYOUT_END; i++)
+        if (!meet(tensor[i])) return;
+    meet(tensor[VERSION] ? follow(tensor[VERSION])[COUNT] : 0) && meet(follow(tensor[STORAGE])[DATA]);
+}
+
+void prefetch_parameter(const Word* object, const Word* kept) {
+    const Word* const layout = kept + 1 - STORAGE;
+    __builtin_prefetch(object + TENSOR);
+    for (int i = 0; i < LAYOUT_END; i += 8) __builtin_prefetch(follow(kept[0]) + i);
+    __builtin_prefetch(follow(kept[0]) + LAYOUT_END - 1);
+    __builtin_prefetch(follow(layout[VERSION]) + COUNT);
+    __builtin_prefetch(follow(layout[STORAGE]) + DATA);
+}
+
 }  // namespace
 
 extern "C" {
@@ -95,15 +122,25 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
     run(threads, task);
 }
 
-// Asks the caches for what lies at n places, if anything does.
-void sparse_fetch(int32_t n, const void* const* places) {
-    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);
-}
-
-// What lies at n places.
-void sparse_gather(int32_t n, const float* const* places, float* values) {
-    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);  // none is in a cache, and they are nowhere near each other
-    for (int32_t i = 0; i < n; i++) values[i] = *places[i];
+// Of n parameters, of dictionaries and of samples among the values: the words that change when they do, as kept.py says. Writes
+// them to `kept` where `record`, else returns whether they are there. What was recorded is fetched into the caches beforehand, all
+// at once, since none of it is in one; a pointer is followed only where it is what it was.
+int32_t sparse_kept(int32_t record, int32_t n, const Word* const* objects, int32_t dictionaries, const Word* const* holders,
+                    int32_t samples, const uint32_t* const* values, Word* kept) {
+    if (!record) {
+        for (int32_t i = 0; i < n; i++) prefetch_parameter(objects[i], kept + i * PARAMETER_WORDS);
+        for (int32_t i = 0; i < dictionaries; i++) __builtin_prefetch(holders[i]);
+        for (int32_t i = 0; i < samples; i++) __builtin_prefetch(values[i]);
+    }
+    bool same = true;
+    auto meet = [&](Word word) {
+        if (record) *kept = word;
+        return same = same && *kept++ == word;
+    };
+    for (int32_t i = 0; i < n && same; i++) meet_parameter(objects[i], meet);
+    for (int32_t i = 0; i < dictionaries && same; i++) meet(holders[i][CHANGES]);
+    for (int32_t i = 0; i < samples && same; i++) meet(*values[i]);
+    return same;
 }
 
 // observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.

@@ -3,40 +3,41 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_float, c_uint64, c_void_p
+from ctypes import c_float
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.native.library import library
+from torchrl_sparse.blocks.engine.native.kept import Kept, addresses, layout_is_known
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
-from torchrl_sparse.blocks.engine.weights import Members, WeightWatch
+from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["NativeWatch", "SharedWeights"]
 
-_LINE = 64  # bytes that a cache reads together
-_WORD = ctypes.sizeof(c_void_p)
+_FLOAT = ctypes.sizeof(c_float)
 
 
 class NativeWatch(WeightWatch):
-    """Reads the values in compiled code: after a query the caches have lost them, and PyTorch is slow to ask for them.
-
-    They have lost what Python and PyTorch know of the weights as well, some 2,000 places that lead to one another. All of
-    them are asked for at once, before Python goes from one to the next.
-    """
+    """Looks at what is kept of the weights in one call of compiled code; asks them one by one only where that has changed."""
 
     def __init__(self, network: torch.nn.Module) -> None:
-        self._lines: tuple[Members | None, ctypes.Array | None] = (None, None)
         super().__init__(network)
+        self._seen: tuple[Kept, tuple] | None = None
 
-    def approach(self, members: Members) -> None:
-        known, lines = self._lines  # read and replaced in one go: other threads may do the same
-        if known is not members:
-            lines = _addresses(_cache_lines(members))
-            self._lines = members, lines
-        library().sparse_fetch(len(lines), lines)
+    def state(self) -> tuple:
+        seen = self._seen  # read and replaced in one go: other threads may do the same
+        if seen is not None and seen[1][-1] == self._refreshed and seen[0].is_same():
+            return seen[1]
+        # Recorded before the weights are asked: what changes meanwhile is a change.
+        values, kept = self._places[1], None
+        if values is not None and layout_is_known():
+            kept = Kept(self._members, values)
+        state = super().state()
+        if kept is not None and kept.members is self._members and kept.values is self._places[1]:
+            self._seen = kept, state
+        return state
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
         for sample in samples:
@@ -45,37 +46,10 @@ class NativeWatch(WeightWatch):
                     f"native engine: it reads float32 weights on the CPU, the network was changed to {sample.dtype} on "
                     f"{sample.device}"
                 )
-        return _addresses([value.data_ptr() for sample in samples for value in sample])
+        return addresses(value.data_ptr() for sample in samples for value in sample)
 
     def read(self, places: ctypes.Array) -> bytes:
-        values = (c_float * len(places))()
-        library().sparse_gather(len(places), places, values)
-        return bytes(values)
-
-
-def _addresses(places: list[int]) -> ctypes.Array:
-    return (c_void_p * len(places))(*places)
-
-
-def _cache_lines(members: Members) -> list[int]:
-    """Return where CPython and PyTorch keep what they know of ``members``, as far as they can be guessed from outside.
-
-    The addresses are only ever fetched into a cache, which does no harm whatever lies there, and be it nothing any more.
-    """
-    spans = []
-    for parameter in members.parameters:
-        tensor = parameter._cdata
-        storage, *others = _words(tensor, 2, 6)  # autograd's part, rare members, the version
-        spans += [(id(parameter), 2), (tensor, 4), (storage, 2), *((place, 1) for place in others)]
-    for holder in members.holders:
-        (entries,) = _words(id(holder), 4, 5)
-        spans += [(id(holder), 1), (entries, 3)]
-    return sorted({start // _LINE * _LINE + _LINE * i for start, count in spans for i in range(count)})
-
-
-def _words(place: int, first: int, last: int) -> list[int]:
-    """Return words of an object that is alive and not smaller than that."""
-    return [c_uint64.from_address(place + _WORD * i).value for i in range(first, last)]
+        return b"".join(ctypes.string_at(place, _FLOAT) for place in places)
 
 
 class SharedWeights:
