@@ -95,6 +95,7 @@ def test_what_cannot_mean_anything_is_refused(recipe, override, message):
         ("train_vla", "+network.llm.layers=6"),
         ("benchmark_vla", "+specprune.keep_share=0.95"),
         ("benchmark", "margin=0.1"),
+        ("realtime", "latencies=[]"),
     ],
 )
 def test_what_pages_show_is_taken(recipe, override):
