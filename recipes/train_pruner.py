@@ -33,7 +33,7 @@ from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner, exported
 from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
-from torchrl_sparse.training.pruner.recalls import pruner_trainer
+from torchrl_sparse.training.pruner.recalls import check_turns, pruner_trainer
 from torchrl_sparse.training.pruner.rollouts import closed_loop_queries
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
@@ -65,6 +65,7 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
     sizes = {**config.network, "rate_input": options.rate_range is not None}
     gates = make_gates(config.method, policy, seed=options.seed, **sizes)
+    check_turns(gates, config.targets.turns)  # which take minutes to make
     return pruner_trainer(gates, policy, calibration_set(policy, config), options)
 
 
@@ -89,8 +90,9 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     with suppress(FileNotFoundError, *stale):
         return load_targets(path, made_for).to(policy.device)
     task = find_task(config.task)
-    seen, poses = observed_keys(task.name, policy), task.acts_in_poses
-    demos = read_demos(config.demos, seen, poses=poses, task=task.name)
+    demos = read_demos(
+        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
+    )
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:

@@ -15,7 +15,7 @@ from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner
 from torchrl_sparse.training.pruner.fit import spread_logits
-from torchrl_sparse.training.pruner.recalls import RecallTrainer, pruner_trainer
+from torchrl_sparse.training.pruner.recalls import RecallTrainer, check_turns, pruner_trainer
 
 SMALL = PrunerConfig(rate=0.6, batch_size=8, lr=1e-3, max_updates=100, epochs=100, checkpointed=False)
 
@@ -131,6 +131,10 @@ def test_what_does_not_fit_is_refused(policy, turns, targets):
         ValueError, match=r"turns: expected 1 for such gates, got targets of shape \[\d+, 3\]"
     ):
         pruner_trainer(sag_gates(policy), policy, turns, SMALL)
+    for recalls, count in ((True, 1), (False, 3)):  # what the recipe asks before it makes any
+        with pytest.raises(ValueError, match=rf"targets\.turns: expected .* for such gates, got {count}"):
+            check_turns(sag_gates(policy, recalls=recalls), count)
+        check_turns(sag_gates(policy, recalls=not recalls), count)
     for name, value in (("gradient", "step"), ("objective", "noise"), ("rate_range", (0.3, 0.7))):
         config = dataclasses.replace(SMALL, **{name: value})
         with pytest.raises(ValueError, match=rf"{name}: expected .* for gates that recall, got"):

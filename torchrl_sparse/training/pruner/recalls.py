@@ -21,7 +21,7 @@ from torchrl_sparse.training.pruner.gates import Gates
 from torchrl_sparse.training.pruner.loss import rate_metrics, varying_share
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
-__all__ = ["RecallTrainer", "pruner_trainer"]
+__all__ = ["RecallTrainer", "check_turns", "pruner_trainer"]
 
 
 class RecallTrainer(PrunerTrainer):
@@ -125,3 +125,10 @@ def pruner_trainer(
     """Return the trainer of such gates; arguments and errors are those of `PrunerTrainer` and `RecallTrainer`."""
     kind = RecallTrainer if gates.recalls else PrunerTrainer
     return kind(gates, policy, targets, config)
+
+
+def check_turns(gates: Gates, turns: int) -> None:
+    """Raise ValueError unless gates can be taught by ``turns`` queries in a row: several if they recall, else one."""
+    if gates.recalls != (turns > 1):
+        expected = "2 or more" if gates.recalls else "1"
+        raise ValueError(f"targets.turns: expected {expected} for such gates, got {turns}")
