@@ -89,10 +89,8 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     stale = () if path.with_name(CHECKPOINT).exists() else (ValueError,)
     with suppress(FileNotFoundError, *stale):
         return load_targets(path, made_for).to(policy.device)
-    task = find_task(config.task)
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    task, seen = find_task(config.task), observed_keys(config.task, policy)
+    demos = read_demos(config.demos, seen, poses=task.acts_in_poses, task=task.name)
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
