@@ -21,6 +21,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
+from torchrl_sparse.blocks.engine.native.packing import units
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch
 from torchrl_sparse.evaluation.latency.measure import measure_latency, next_arguments
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -89,12 +90,13 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
             f"plan: expected one that does not look at the observation, got {type(policy.plan).__name__}"
         )
     noise, state, seed = policy.sample_noise(torch.tensor([1])), query["history", "state"], torch.tensor([1])
-    mask, watch, normalizer = policy.plan.static_mask, NativeWatch(policy.network), policy.normalizer
+    mask, watch = policy.plan.static_mask, NativeWatch(policy.network)
     chunk = policy(query.copy())[keys.CHUNK]
 
     def answer() -> None:
-        cond = engine.condition(state, normalizer)
-        engine.answer(engine.ready(noise, cond), noise, cond, normalizer, mask, chunk, policy.plan.reuse)
+        scales = units(policy.normalizer)
+        cond = engine.condition(state, scales)
+        engine.answer(engine.ready(noise, cond), noise, cond, scales, mask, chunk, policy.plan.reuse)
 
     latency = measure_latency(
         {

@@ -39,7 +39,10 @@ def query_seed(episode_seed: Tensor, episode_step: Tensor, stream: int = 0) -> T
     begin = stream * NOISE_STREAM
     pairs = zip(episode_seed.flatten().tolist(), episode_step.flatten().tolist(), strict=True)
     seeds = [_mix((seed + begin) * 1_000_003 + step) for seed, step in pairs]
-    return torch.tensor(seeds, dtype=torch.int64, device=episode_seed.device).view(episode_seed.shape)
+    shape, kind = episode_seed.shape, {"dtype": torch.int64, "device": episode_seed.device}
+    if len(seeds) == 1:  # a number is written faster than a list of one
+        return torch.full(shape, seeds[0], **kind)
+    return torch.tensor(seeds, **kind).view(shape)
 
 
 def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
+from torchrl_sparse.blocks.engine.native.packing import units
 from torchrl_sparse.blocks.mask import REUSE_RULES
 from torchrl_sparse.blocks.planner import Planner, StaticPlanner
 from torchrl_sparse.networks.normalize import Normalizer
@@ -44,7 +45,8 @@ def answer_directly(
     batch = tensordict.batch_size
     if state.shape != (*batch, *encode.state_shape):
         return False
-    cond = engine.condition(state.reshape(-1, *encode.state_shape), normalizer)
+    scales = units(normalizer)
+    cond = engine.condition(state.reshape(-1, *encode.state_shape), scales)
     if cond is None:  # the encoder says what is wrong with the state
         return False
     mask, seed = plan.static_mask, encode.seed(tensordict)
@@ -60,7 +62,7 @@ def answer_directly(
     tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), denoise.static_flops(mask)))
     tensordict.set(keys.CHUNK, chunk)
-    engine.answer(packed, noise, cond, normalizer, mask, chunk, plan.reuse)
+    engine.answer(packed, noise, cond, scales, mask, chunk, plan.reuse)
     return True
 
 

@@ -7,6 +7,7 @@ the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import byref
@@ -24,14 +25,13 @@ from torchrl_sparse.blocks.engine.native.library import (
     library,
     native_available,
 )
-from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, units, weight_type
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
@@ -167,9 +167,9 @@ class NativeEngine:
         actions = noise.new_empty(len(cond), *noise.shape[2:])
         if not len(cond):
             return actions
-        mask, noise, cond = mask.contiguous(), noise.detach().contiguous(), cond.detach().contiguous()
+        mask, noise, cond = mask.contiguous(), noise.contiguous(), cond.contiguous()
         threads = self._num_threads(len(cond))
-        drawn = [] if guide is None else [part.detach().contiguous() for part in guide]
+        drawn = [] if guide is None else [part.contiguous() for part in guide]
         guided = [part.data_ptr() for part in drawn] or [None, None]
         query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guided, actions.data_ptr()
         with self._scratch(packed, threads) as scratch:
@@ -177,12 +177,12 @@ class NativeEngine:
             library().sparse_guided(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
-    def condition(self, state: Tensor, normalizer: Normalizer) -> Tensor | None:
+    def condition(self, state: Tensor, scales: ctypes.Array) -> Tensor | None:
         """Return condition f32 [B, To, D] of states in the units of the environment, as PyTorch rounds it.
 
         Args:
             state: f32 [B, To, D].
-            normalizer: with f32 buffers on the CPU.
+            scales: `units` of a normaliser with f32 buffers on the CPU.
 
         Returns:
             None if a state is not finite.
@@ -190,7 +190,7 @@ class NativeEngine:
         state = state.contiguous()
         cond, (rows, steps, dim) = torch.empty_like(state), state.shape
         where = state.data_ptr(), cond.data_ptr()
-        finite = library().sparse_normalise(units(normalizer), rows * steps, dim, *where)
+        finite = library().sparse_normalise(scales, rows * steps, dim, *where)
         return cond if finite else None
 
     def ready(self, noise: Tensor, cond: Tensor) -> PackedNetwork:
@@ -208,7 +208,7 @@ class NativeEngine:
         packed: PackedNetwork,
         noise: Tensor,
         cond: Tensor,
-        normalizer: Normalizer,
+        scales: ctypes.Array,
         mask: Tensor,
         chunks: Tensor,
         reuse: Reuse = "block",
@@ -219,7 +219,7 @@ class NativeEngine:
             packed: see :meth:`ready`.
             noise: f32 [B, K, H, A].
             cond: f32 [B, To, D], see :meth:`condition`.
-            normalizer: with f32 buffers on the CPU.
+            scales: see :meth:`condition`.
             mask: bool [K, 3L], valid, of every row.
             chunks: f32 [B, H - To + 1, A], contiguous, to be written.
             reuse: see :meth:`denoise`.
@@ -231,7 +231,7 @@ class NativeEngine:
         tensors = (tensor.data_ptr() for tensor in (cond, actions, chunks))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            query = rows, mask.data_ptr(), slots, noise.data_ptr(), units(normalizer), *tensors
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), scales, *tensors
             library().sparse_answer(*where, *query, scratch.data_ptr())
 
     def _num_threads(self, rows: int) -> int:
@@ -265,24 +265,23 @@ class NativeEngine:
             scratch = self._stock.pop()
         except IndexError:
             scratch = None
-        if scratch is None or scratch.numel() < threads * self._piece(packed):
+        if scratch is None or scratch.numel() < threads * packed.scratch:
             scratch = self._new_scratch(packed, threads)
         yield scratch
         self._stock.append(scratch)
 
     def _new_scratch(self, packed: PackedNetwork, threads: int) -> Tensor:
         """Allocate on a cache line, as PyTorch always does."""
-        return torch.empty(threads * self._piece(packed), dtype=torch.float32, device="cpu")
-
-    def _piece(self, packed: PackedNetwork) -> int:
-        """Return the floats that a thread needs, with a slot for each block: enough for every reuse rule."""
-        return library().sparse_scratch(byref(packed.model), self._dense.shape[1])
+        return torch.empty(threads * packed.scratch, dtype=torch.float32, device="cpu")
 
     def _current(self) -> PackedNetwork:
         """Return what the network and the sampler are packed into, anew if the network has changed."""
         weights, packed = self._shared.current(), self._packed
         if packed is None or packed.weights is not weights:
-            packed = self._packed = PackedNetwork(self._network, self._sampler, weights)
+            packed = PackedNetwork(self._network, self._sampler, weights)
+            # With a slot for each block: enough for every reuse rule.
+            packed.scratch = library().sparse_scratch(byref(packed.model), self._dense.shape[1])
+            self._packed = packed
         return packed
 
     def _check(self, mask: Tensor | None) -> None:

@@ -158,7 +158,10 @@ class PackedNetwork:
     Attributes:
         model: the structure that denoise.h reads.
         weights: as given.
+        scratch: floats that a thread needs for a query; the engine, which knows compiled code, says so.
     """
+
+    scratch: int
 
     def __init__(self, network: TransformerForDiffusion, sampler: Sampler, weights: PackedWeights) -> None:
         self.weights, self._arena = weights, Arena()
