@@ -40,7 +40,8 @@ class Kept:
         self.members, self.values = members, values
         objects, holders = (addresses(map(id, part)) for part in (members.parameters, members.holders))
         words = (c_uint64 * (_WORDS * len(objects) + len(holders) + len(values)))()
-        self._query = len(objects), objects, len(holders), holders, len(values), values, words
+        counts = len(objects), objects, len(holders), holders, len(values), values
+        self._query = _place_of_tensor(), *counts, words
         _compare()(True, *self._query)
 
     def is_same(self) -> bool:
@@ -86,11 +87,18 @@ def _sees(change: Callable[[nn.Module], None]) -> bool:
 def _points_as_expected(parameter: nn.Parameter) -> bool:
     """Return whether words that will be followed are pointers; a version is shared with a view and nothing else."""
     view, other = parameter.detach(), torch.zeros(1)
-    (tensor,) = _words(id(parameter), 2, 3)
     storage, *_, version = _words(parameter._cdata, 2, 6)
     of_view, of_other = (_words(tensor._cdata, 5, 6)[0] for tensor in (view, other))
-    found = tensor == parameter._cdata and storage == parameter.untyped_storage()._cdata
-    return found and version == of_view != of_other
+    follows = _place_of_tensor() is not None and storage == parameter.untyped_storage()._cdata
+    return follows and version == of_view != of_other
+
+
+@lru_cache(maxsize=1)
+def _place_of_tensor() -> int | None:
+    """Return which word of a tensor's Python object points to the tensor: its first own one, or the second in older PyTorch."""
+    tensor = torch.zeros(1)
+    words = _words(id(tensor), 2, 4)
+    return 2 + words.index(tensor._cdata) if tensor._cdata in words else None
 
 
 def _words(place: int, first: int, last: int) -> list[int]:

@@ -50,16 +50,17 @@ void run(int32_t threads, Task& task) {
 // Where CPython keeps a tensor behind its Python object and counts the changes of a dictionary, and PyTorch keeps what it knows
 // of a tensor: guesses, which kept.py tries before it trusts them.
 typedef uint64_t Word;
-constexpr int TENSOR = 2, CHANGES = 3, STORAGE = 2, VERSION = 5, LAYOUT_END = 20, DATA = 2, COUNT = 2;
+constexpr int CHANGES = 3, STORAGE = 2, VERSION = 5, LAYOUT_END = 20, DATA = 2, COUNT = 2;
 constexpr int PARAMETER_WORDS = 1 + LAYOUT_END - STORAGE + 2;
 
 const Word* follow(Word word) { return reinterpret_cast<const Word*>(static_cast<uintptr_t>(word)); }
 
-// Calls `meet` with each word until it returns false: the tensor, its layout, its version (none in inference mode), its data.
+// Calls `meet` with each word until it returns false: the tensor, to which word `at` of the object points, its layout, its version
+// (none in inference mode), its data.
 template <class Meet>
-void meet_parameter(const Word* object, const Meet& meet) {
-    if (!meet(object[TENSOR])) return;
-    const Word* const tensor = follow(object[TENSOR]);
+void meet_parameter(const Word* object, int at, const Meet& meet) {
+    if (!meet(object[at])) return;
+    const Word* const tensor = follow(object[at]);
     for (int i = STORAGE; i < LAYOUT_END; i++)
         if (!meet(tensor[i])) return;
     meet(tensor[VERSION] ? follow(tensor[VERSION])[COUNT] : 0) && meet(follow(tensor[STORAGE])[DATA]);
@@ -67,7 +68,7 @@ void meet_parameter(const Word* object, const Meet& meet) {
 
 void prefetch_parameter(const Word* object, const Word* kept) {
     const Word* const layout = kept + 1 - STORAGE;
-    __builtin_prefetch(object + TENSOR);
+    __builtin_prefetch(object + 2);
     for (int i = 0; i < LAYOUT_END; i += 8) __builtin_prefetch(follow(kept[0]) + i);
     __builtin_prefetch(follow(kept[0]) + LAYOUT_END - 1);
     __builtin_prefetch(follow(layout[VERSION]) + COUNT);
@@ -125,8 +126,8 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
 // Of n parameters, of dictionaries and of samples among the values: the words that change when they do, as kept.py says. Writes
 // them to `kept` where `record`, else returns whether they are there. What was recorded is fetched into the caches beforehand, all
 // at once, since none of it is in one; a pointer is followed only where it is what it was.
-int32_t sparse_kept(int32_t record, int32_t n, const Word* const* objects, int32_t dictionaries, const Word* const* holders,
-                    int32_t samples, const uint32_t* const* values, Word* kept) {
+int32_t sparse_kept(int32_t record, int32_t at, int32_t n, const Word* const* objects, int32_t dictionaries,
+                    const Word* const* holders, int32_t samples, const uint32_t* const* values, Word* kept) {
     if (!record) {
         for (int32_t i = 0; i < n; i++) prefetch_parameter(objects[i], kept + i * PARAMETER_WORDS);
         for (int32_t i = 0; i < dictionaries; i++) __builtin_prefetch(holders[i]);
@@ -137,7 +138,7 @@ int32_t sparse_kept(int32_t record, int32_t n, const Word* const* objects, int32
         if (record) *kept = word;
         return same = same && *kept++ == word;
     };
-    for (int32_t i = 0; i < n && same; i++) meet_parameter(objects[i], meet);
+    for (int32_t i = 0; i < n && same; i++) meet_parameter(objects[i], at, meet);
     for (int32_t i = 0; i < dictionaries && same; i++) meet(holders[i][CHANGES]);
     for (int32_t i = 0; i < samples && same; i++) meet(*values[i]);
     return same;
