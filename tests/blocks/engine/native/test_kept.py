@@ -9,7 +9,7 @@ from torch import nn
 from torchrl_sparse.blocks.engine.native import kept
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch
-from torchrl_sparse.blocks.engine.weights import WeightWatch
+from torchrl_sparse.blocks.engine.weights import Members, WeightWatch
 
 pytestmark = pytest.mark.skipif(not native_available()[0], reason=native_available()[1])
 
@@ -47,6 +47,21 @@ def test_weights_that_stay_are_asked_one_by_one_twice_and_never_again(watch, mon
     with torch.no_grad():
         watch.held[0](torch.ones(1, 3))
     assert watch.state() is second
+
+
+def test_values_that_lie_elsewhere_by_now_are_not_read(watch):
+    members, bias = Members.of(watch.held), watch.held[0].bias
+    begins = [parameter.data_ptr() for parameter in members.parameters]
+    assert kept.Kept(members, begins, kept.addresses(begins)).is_same()
+    bias.data = bias.data.clone()
+    assert not kept.Kept(members, begins, kept.addresses([8])).is_same()  # an address that nobody may read
+
+
+def test_a_weight_without_storage_is_seen(watch):
+    watch.state(), watch.state()
+    watch.held[2].bias = nn.Parameter(watch.held[2].bias.detach().to_sparse(), requires_grad=False)
+    with pytest.raises((ValueError, RuntimeError, NotImplementedError)):
+        watch.state()
 
 
 @pytest.mark.parametrize("inference", [False, True])

@@ -12,7 +12,7 @@ be relied on. Pointers are followed only from objects that are held, and only as
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from ctypes import c_uint64, c_void_p
 from functools import lru_cache
 
@@ -33,20 +33,21 @@ class Kept:
 
     Args:
         members: of a network; they are held.
-        values: addresses of some of their values, f32, which are compared too.
+        begins: where the values of each parameter are thought to begin.
+        values: addresses of some of them, f32, which are compared too.
     """
 
-    def __init__(self, members: Members, values: ctypes.Array) -> None:
+    def __init__(self, members: Members, begins: Sequence[int], values: ctypes.Array) -> None:
         self.members, self.values = members, values
         objects, holders = (addresses(map(id, part)) for part in (members.parameters, members.holders))
         words = (c_uint64 * (_WORDS * len(objects) + len(holders) + len(values)))()
         counts = len(objects), objects, len(holders), holders, len(values), values
         self._query = _place_of_tensor(), *counts, words
-        _compare()(True, *self._query)
+        self._recorded = bool(_compare()(addresses(begins), *self._query))
 
     def is_same(self) -> bool:
-        """Tell whether nothing has changed since."""
-        return bool(_compare()(False, *self._query))
+        """Tell whether nothing has changed since, nor had before: values that begin elsewhere may lie nowhere any more."""
+        return self._recorded and bool(_compare()(None, *self._query))
 
 
 def addresses(places: Iterable[int]) -> ctypes.Array:
@@ -73,10 +74,11 @@ def layout_is_known() -> bool:
 
 def _sees(change: Callable[[nn.Module], None]) -> bool:
     module = nn.Module()
-    module.weight = nn.Parameter(torch.arange(9.0).view(3, 3))
+    module.weight = nn.Parameter(torch.arange(12.0)[3:].view(3, 3))
     if not _points_as_expected(module.weight):
         return False
-    before = Kept(Members.of(module), addresses([module.weight.data_ptr()]))
+    begins = [module.weight.data_ptr()]
+    before = Kept(Members.of(module), begins, addresses(begins))
     module.weight.sum()
     undisturbed = before.is_same()
     with torch.no_grad():
@@ -112,7 +114,7 @@ def _other() -> Tensor:
 
 def _shift(module: nn.Module) -> None:
     """Move a parameter within its storage."""
-    module.weight.data = torch.empty(0).set_(module.weight.untyped_storage(), 3, (2, 3))
+    module.weight.data = torch.empty(0).set_(module.weight.untyped_storage(), 2, (3, 3))
 
 
 _CHANGES: list[Callable[[nn.Module], None]] = [

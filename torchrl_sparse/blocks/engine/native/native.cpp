@@ -50,20 +50,29 @@ void run(int32_t threads, Task& task) {
 // Where CPython keeps a tensor behind its Python object and counts the changes of a dictionary, and PyTorch keeps what it knows
 // of a tensor: guesses, which kept.py tries before it trusts them.
 typedef uint64_t Word;
-constexpr int CHANGES = 3, STORAGE = 2, VERSION = 5, LAYOUT_END = 20, DATA = 2, COUNT = 2;
+constexpr int CHANGES = 3, STORAGE = 2, VERSION = 5, OFFSET = 18, LAYOUT_END = 20, DATA = 2, COUNT = 2;
 constexpr int PARAMETER_WORDS = 1 + LAYOUT_END - STORAGE + 2;
 
 const Word* follow(Word word) { return reinterpret_cast<const Word*>(static_cast<uintptr_t>(word)); }
 
+// A word of what `pointer` points to, 0 if that is nothing: sparse tensors have no storage, those of inference mode no version.
+Word behind(Word pointer, int at) { return pointer ? follow(pointer)[at] : 0; }
+
 // Calls `meet` with each word until it returns false: the tensor, to which word `at` of the object points, its layout, its version
-// (none in inference mode), its data.
+// and its data.
 template <class Meet>
 void meet_parameter(const Word* object, int at, const Meet& meet) {
     if (!meet(object[at])) return;
     const Word* const tensor = follow(object[at]);
     for (int i = STORAGE; i < LAYOUT_END; i++)
         if (!meet(tensor[i])) return;
-    meet(tensor[VERSION] ? follow(tensor[VERSION])[COUNT] : 0) && meet(follow(tensor[STORAGE])[DATA]);
+    meet(behind(tensor[VERSION], COUNT)) && meet(behind(tensor[STORAGE], DATA));
+}
+
+// Where its values begin.
+Word first_value(const Word* object, int at) {
+    const Word* const tensor = follow(object[at]);
+    return behind(tensor[STORAGE], DATA) + tensor[OFFSET] * sizeof(float);
 }
 
 void prefetch_parameter(const Word* object, const Word* kept) {
@@ -123,11 +132,13 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
     run(threads, task);
 }
 
-// Of n parameters, of dictionaries and of samples among the values: the words that change when they do, as kept.py says. Writes
-// them to `kept` where `record`, else returns whether they are there. What was recorded is fetched into the caches beforehand, all
-// at once, since none of it is in one; a pointer is followed only where it is what it was.
-int32_t sparse_kept(int32_t record, int32_t at, int32_t n, const Word* const* objects, int32_t dictionaries,
+// Of n parameters, of dictionaries and of samples among the values: the words that change when they do, as kept.py says. Returns
+// whether they are those in `kept`. Those are fetched into the caches beforehand, all at once, since none of it is in one; a
+// pointer is followed only where it is what it was. Given `first`, where each parameter's values begin, it writes the words to
+// `kept` instead and returns whether that is where they begin: else no sample is read, which may lie nowhere any more.
+int32_t sparse_kept(const Word* first, int32_t at, int32_t n, const Word* const* objects, int32_t dictionaries,
                     const Word* const* holders, int32_t samples, const uint32_t* const* values, Word* kept) {
+    const bool record = first != nullptr;
     if (!record) {
         for (int32_t i = 0; i < n; i++) prefetch_parameter(objects[i], kept + i * PARAMETER_WORDS);
         for (int32_t i = 0; i < dictionaries; i++) __builtin_prefetch(holders[i]);
@@ -138,7 +149,10 @@ int32_t sparse_kept(int32_t record, int32_t at, int32_t n, const Word* const* ob
         if (record) *kept = word;
         return same = same && *kept++ == word;
     };
-    for (int32_t i = 0; i < n && same; i++) meet_parameter(objects[i], at, meet);
+    for (int32_t i = 0; i < n && same; i++) {
+        meet_parameter(objects[i], at, meet);
+        if (record) same = first_value(objects[i], at) == first[i];
+    }
     for (int32_t i = 0; i < dictionaries && same; i++) meet(holders[i][CHANGES]);
     for (int32_t i = 0; i < samples && same; i++) meet(*values[i]);
     return same;

@@ -31,11 +31,11 @@ class NativeWatch(WeightWatch):
         if seen is not None and seen[1][-1] == self._refreshed and seen[0].is_same():
             return seen[1]
         # Recorded before the weights are asked: what changes meanwhile is a change.
-        values, kept = self._places[1], None
+        members, (places, values), kept = self._members, self._places, None
         if values is not None and layout_is_known():
-            kept = Kept(self._members, values)
+            kept = Kept(members, places[: len(members.parameters)], values)
         state = super().state()
-        if kept is not None and kept.members is self._members and kept.values is self._places[1]:
+        if kept is not None and members is self._members and values is self._places[1]:
             self._seen = kept, state
         return state
 
