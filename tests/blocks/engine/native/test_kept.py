@@ -26,6 +26,16 @@ def test_the_layout_of_this_python_and_pytorch_is_known(watch):
     assert kept.layout_is_known()
 
 
+def test_it_is_known_whatever_the_mode_of_whoever_asks_first(watch):
+    with torch.inference_mode(), torch.device("meta"):
+        assert kept.layout_is_known.__wrapped__()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert kept.layout_is_known.__wrapped__()
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_a_layout_in_which_a_change_is_not_seen_is_not_trusted(watch, monkeypatch):
     monkeypatch.setattr(kept, "_CHANGES", [*kept._CHANGES, lambda module: None])
     assert not kept.layout_is_known.__wrapped__()

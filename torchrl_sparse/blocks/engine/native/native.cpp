@@ -158,6 +158,12 @@ int32_t sparse_kept(const Word* first, int32_t at, int32_t n, const Word* const*
     return same;
 }
 
+// What lies at n places.
+void sparse_gather(int32_t n, const float* const* places, float* values) {
+    for (int32_t i = 0; i < n; i++) __builtin_prefetch(places[i]);  // none is in a cache, and they are nowhere near each other
+    for (int32_t i = 0; i < n; i++) values[i] = *places[i];
+}
+
 // observations [n][obs.rows] -> logits [n][count], or which of them are positive, none of the first step; the other is null.
 void sparse_prune(int32_t level, int32_t threads, const Pruner* pruner, int32_t n, const float* observations, float* logits,
                   uint8_t* masks) {

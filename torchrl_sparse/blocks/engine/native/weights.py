@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.native.kept import Kept, addresses, layout_is_known
+from torchrl_sparse.blocks.engine.native.library import library
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["NativeWatch", "SharedWeights"]
-
-_FLOAT = ctypes.sizeof(c_float)
 
 
 class NativeWatch(WeightWatch):
@@ -49,7 +48,9 @@ class NativeWatch(WeightWatch):
         return addresses(value.data_ptr() for sample in samples for value in sample)
 
     def read(self, places: ctypes.Array) -> bytes:
-        return b"".join(ctypes.string_at(place, _FLOAT) for place in places)
+        values = (c_float * len(places))()
+        library().sparse_gather(len(places), places, values)
+        return bytes(values)
 
 
 class SharedWeights:
