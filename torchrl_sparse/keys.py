@@ -54,6 +54,7 @@ constant                          shape, dtype           meaning
 ``CHOSEN``                        i64 [*B, 1]            which of them
 ``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the query before, for policies that read it
 ``ELAPSED``                       i64 [*B, 1]            steps since that query; 0 at the beginning of an episode
+``ENSEMBLED``                     i64 [*B, n]            predictions that were averaged into each action of ``CHUNK``
 ``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait; a
                                                          policy that is asked reads what is expected of its own
 ``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
@@ -116,6 +117,7 @@ CANDIDATES = ("control", "candidates")
 CHOSEN = ("control", "chosen")
 LAST_CHUNK = ("control", "last_chunk")
 ELAPSED = ("control", "elapsed")
+ENSEMBLED = ("control", "ensembled")
 DELAY = ("control", "delay")
 MEANWHILE = ("control", "meanwhile")
 HOLD = ("control", "hold")

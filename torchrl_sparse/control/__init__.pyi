@@ -16,3 +16,4 @@ from .roll_forward import (
     StateModel as StateModel,
 )
 from .selectors import CoherentChunk as CoherentChunk
+from .temporal_ensemble import TemporalEnsemble as TemporalEnsemble

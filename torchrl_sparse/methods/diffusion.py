@@ -3,9 +3,9 @@
 A method is written ``NAME``, ``NAME@RATE`` (every query is asked for that prune rate) or ``NAME@COARSE-FINE`` (a
 controller asks for the first rate in coarse motion and for the second in fine motion). ``NAME:bf16`` and ``NAME:int8``, of
 any of them (``sag:int8@0.9``), run it in the native engine with rounded weights and activations. ``NAME_every2`` queries
-every two steps, ``NAME_of8`` samples eight chunks and plays one, ``NAME_every2_of8`` does both; ``NAME_ahead`` is for a world
-that does not wait (:mod:`torchrl_sparse.methods.executor`). NAME is a key of :data:`METHODS`, matches the pattern of one, or
-names a planner saved in the folder at hand, as ``NAME.json`` or ``NAME/``, which brings the sampler that it was made for.
+every two steps, ``NAME_of8`` samples eight chunks and plays one, ``NAME_every2_ensembled`` averages chunks over queries;
+``NAME_ahead`` is for a world that does not wait (:mod:`torchrl_sparse.methods.executor`). NAME is a key of :data:`METHODS`,
+matches the pattern of one, or names a saved planner, ``NAME.json`` or ``NAME/``, which brings the sampler it was made for.
 
 ==================== ===========================================================================================
 ``ddpm_82_14``       a sampler with its steps, as :mod:`torchrl_sparse.networks.diffusion.naming` says, nothing pruned

@@ -10,6 +10,7 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import RealtimeExecutor
 from torchrl_sparse.control.roll_forward import RollForward, StateModel
 from torchrl_sparse.control.selectors import CoherentChunk
+from torchrl_sparse.control.temporal_ensemble import TemporalEnsemble
 from torchrl_sparse.methods.diffusion import make_controller
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -56,7 +57,7 @@ def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> Ch
     if MethodName.parse(text).ahead:
         raise ValueError(f"methods: {text}: expected no _ahead where the world waits for an answer")
     steps = executed_every(text, policy, n_action_steps)
-    return ChunkExecutor(policy, steps, make_controller(text), **execution_options(text))
+    return ChunkExecutor(_averaged(text, policy), steps, make_controller(text), **execution_options(text))
 
 
 def make_realtime_executor(
@@ -88,4 +89,9 @@ def make_realtime_executor(
         asked = RollForward(policy, model.to(policy.device))
     every = executed_every(text, policy, n_action_steps)
     timing = {"latency": latency, "control_freq": control_freq}
-    return RealtimeExecutor(asked, hold, every, **timing, **execution_options(text))
+    return RealtimeExecutor(_averaged(text, asked), hold, every, **timing, **execution_options(text))
+
+
+def _averaged(text: str, policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """Return the policy, its chunks averaged over queries where the method says so."""
+    return TemporalEnsemble(policy) if MethodName.parse(text).ensembled else policy

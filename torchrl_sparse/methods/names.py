@@ -10,7 +10,7 @@ __all__ = ["WEIGHTS", "MethodName"]
 WEIGHTS = ("bf16", "int8")
 
 _PATTERN = re.compile(
-    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?(_ahead)?"  # the policy, and how its chunks are executed
+    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?(_ensembled)?(_ahead)?"  # execution
     rf"(?::({'|'.join(WEIGHTS)}))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
 )
 
@@ -18,7 +18,7 @@ _PATTERN = re.compile(
 @dataclass(frozen=True)
 class MethodName:
     """A method as it is written: ``NAME``, ``NAME_everyN``, ``NAME_ofS`` or ``NAME_everyN_ofS``, behind that perhaps
-    ``_ahead``, then ``:WEIGHTS``, and then ``@RATE`` or ``@COARSE-FINE``.
+    ``_ensembled`` and ``_ahead``, then ``:WEIGHTS``, and then ``@RATE`` or ``@COARSE-FINE``.
 
     Attributes:
         name: see `torchrl_sparse.methods.diffusion`.
@@ -26,6 +26,7 @@ class MethodName:
         weights: ``"bf16"``, ``"int8"``, or None, which rounds nothing.
         every: environment steps from one query to the next; None leaves them to the benchmark.
         samples: chunks that a query samples, of which the one that agrees best with the last chunk is played.
+        ensembled: the chunks are averaged over queries, see `TemporalEnsemble`.
         ahead: in a world that does not wait, the policy is shown the state in which its answer will begin.
     """
 
@@ -34,12 +35,13 @@ class MethodName:
     weights: str | None = None
     every: int | None = None
     samples: int = 1
+    ensembled: bool = False
     ahead: bool = False
 
     @property
     def asked_as_usual(self) -> bool:
         """True where episodes follow from the method's answers, not from how often or for how many it is asked."""
-        return self.every is None and self.samples == 1 and not self.ahead
+        return self.every is None and self.samples == 1 and not self.ensembled and not self.ahead
 
     @classmethod
     def parse(cls, text: str) -> MethodName:
@@ -50,20 +52,21 @@ class MethodName:
         >>> MethodName.parse("dense:int8").weights
         'int8'
         >>> MethodName.parse("ddpm3_logsnr_every2_of8")
-        MethodName(name='ddpm3_logsnr', rates=(), weights=None, every=2, samples=8, ahead=False)
+        MethodName(name='ddpm3_logsnr', rates=(), weights=None, every=2, samples=8, ensembled=False, ahead=False)
         """
         match = _PATTERN.fullmatch(text)
         if match is None:
             raise ValueError(
-                "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME_ahead, "
-                f"NAME:bf16 or NAME:int8, got {text!r}"
+                "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME_ensembled, "
+                f"NAME_ahead, NAME:bf16 or NAME:int8, got {text!r}"
             )
-        name, every, samples, ahead, weights, *rates = match.groups()
+        name, every, samples, ensembled, ahead, weights, *rates = match.groups()
         return cls(
             name,
             tuple(float(rate) for rate in rates if rate is not None),
             weights,
             None if every is None else int(every),
             int(samples or 1),
+            ensembled is not None,
             ahead is not None,
         )
