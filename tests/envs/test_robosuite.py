@@ -230,3 +230,24 @@ def test_a_ready_made_environment_is_made_anew_where_it_is_sent():
     copy = pickle.loads(pickle.dumps(env))
     assert copy.base_env.sim_env is not env.base_env.sim_env
     assert (copy.reset() == first).all()
+
+
+@pytest.mark.parametrize("task", ["Lift", "TwoArmTransport"])
+def test_observing_only_when_asked_changes_no_bit_of_an_episode(task):
+    spared, usual = (RobosuiteEnv(task, action_mode="delta", seeds=[7]) for _ in range(2))
+    del usual.sim_env._update_observables  # the class's own, in every substep
+    torch.manual_seed(0)
+    actions = [spared.action_spec.rand() for _ in range(12)]
+    for one, other in zip(*(steps_of(env, actions) for env in (spared, usual)), strict=True):
+        assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True))
+    spared.close()
+    usual.close()
+
+
+def steps_of(env, actions):
+    """What the environment returns for its reset and for each of the actions."""
+    td = env.reset()
+    yield td
+    for action in actions:
+        td = env.step(td.clone().set(keys.ACTION, action))["next"]
+        yield td

@@ -24,7 +24,13 @@ from robosuite.utils.placement_samplers import UniformRandomSampler  # noqa: E40
 COLOURS = ("red", "green", "blue")
 X_RANGE, Y_RANGE = (-0.08, 0.08), (-0.13, 0.13)  # m, of the cubes' centres about the table's
 SPACING = 0.10  # m between centres: open fingers fit around a cube without touching another
-_RGBA = {"green": (0.0, 1.0, 0.0, 1.0), "blue": (0.0, 0.0, 1.0, 1.0)}
+_RGBA = {
+    "green": (0.0, 1.0, 0.0, 1.0),
+    "blue": (0.0, 0.0, 1.0, 1.0),
+    "yellow": (1.0, 0.9, 0.0, 1.0),
+    "purple": (0.5, 0.0, 0.8, 1.0),
+}
+_WOODEN = ("green", "blue")  # those of which robosuite has a texture
 
 
 class LiftNamed(Lift):
@@ -34,27 +40,30 @@ class LiftNamed(Lift):
     is drawn last at a reset, so the same seed gives the same scene whatever is asked for there.
     """
 
+    colours: tuple[str, ...] = COLOURS
+    x_range, y_range = X_RANGE, Y_RANGE
+
     def _load_model(self) -> None:
         if self.placement_initializer is None:
             self.placement_initializer = SpacedSampler(
                 name="ObjectSampler",
-                x_range=X_RANGE,
-                y_range=Y_RANGE,
+                x_range=self.x_range,
+                y_range=self.y_range,
                 ensure_object_boundary_in_range=False,
                 reference_pos=self.table_offset,
                 z_offset=0.01,
                 rng=self.rng,
             )
         super()._load_model()  # with the red cube
-        others = [_cube(colour, self.rng) for colour in COLOURS[1:]]
-        self.cubes: Mapping[str, BoxObject] = dict(zip(COLOURS, [self.cube, *others], strict=True))
+        others = [_cube(colour, self.rng) for colour in self.colours[1:]]
+        self.cubes: Mapping[str, BoxObject] = dict(zip(self.colours, [self.cube, *others], strict=True))
         self.model.mujoco_objects = [*self.cubes.values()]
         self.model.merge_objects(others)
         self.placement_initializer.add_objects(others)
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
-        choices = find_robosuite_task("LiftNamed").instructions
+        choices = find_robosuite_task(type(self).__name__).instructions
         self.instruction = choices[self.rng.integers(len(choices))]
 
     @property
@@ -82,12 +91,16 @@ class SpacedSampler(UniformRandomSampler):
 
 def _cube(colour: str, rng: np.random.Generator) -> BoxObject:
     """Make a cube like Lift's red one, of another colour."""
-    material = CustomMaterial(
+    material = _wood(colour) if colour in _WOODEN else None
+    size = {"size_min": [0.020] * 3, "size_max": [0.022] * 3}
+    return BoxObject(name=f"{colour}_cube", **size, rgba=_RGBA[colour], material=material, rng=rng)
+
+
+def _wood(colour: str) -> CustomMaterial:
+    return CustomMaterial(
         texture=f"Wood{colour.capitalize()}",
         tex_name=f"{colour}wood",
         mat_name=f"{colour}wood_mat",
         tex_attrib={"type": "cube"},
         mat_attrib={"texrepeat": "1 1", "specular": "0.4", "shininess": "0.1"},
     )
-    size = {"size_min": [0.020] * 3, "size_max": [0.022] * 3}
-    return BoxObject(name=f"{colour}_cube", **size, rgba=_RGBA[colour], material=material, rng=rng)

@@ -211,6 +211,7 @@ def _expert(place: str) -> str:
 
 
 _LIFT = _expert("lift:LiftExpert")
+_CUBES = tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue", "yellow", "purple"))
 # early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; two ways 49,
 # 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22 and
 # of the two ways on the 23rd, before any table that uses it.
@@ -221,11 +222,10 @@ _ROBOSUITE = (
         module=f"{_ENVS}.moving_lift",
         expert=_expert("lift:LiftMovingExpert"),
     ),
+    RobosuiteTask("LiftNamed", "lift_named", 1, 10, 200, _CUBES[:3], f"{_ENVS}.named_lift", _LIFT),
     RobosuiteTask(
-        *("LiftNamed", "lift_named", 1, 10, 200),
-        instructions=tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue")),
-        module=f"{_ENVS}.named_lift",
-        expert=_LIFT,
+        *("LiftCrowded", "lift_crowded", 1, 10, 200, _CUBES),
+        *(f"{_ENVS}.crowded_lift", _LIFT),
     ),
     *(
         RobosuiteTask(

@@ -36,7 +36,7 @@ def running_collector(
 ) -> Iterator[BaseCollector]:
     """Run a collector without end while the block lasts, and deal the seeds among its environments; see `rollout_episodes`.
 
-    Its batches are [environments, steps]: of this process, else of the worker that was ready first.
+    Its batches are [environments, steps], of one environment [steps]: of this process, else of the worker that was ready first.
 
     Raises:
         WorkerDied: if a worker dies, while it starts or in the block, or has not started after ten minutes.
@@ -118,8 +118,11 @@ class _RayWorker(Collector):
 def _batched(
     make_env: Callable[..., EnvBase], shares: Sequence[Sequence[int]], max_steps: int | None
 ) -> EnvBase:
-    """Make one environment per share of the seeds, stepped as one batch."""
-    # One function with differing arguments, rather than differing functions, lets SerialEnv take its
-    # specs from a single throw-away environment instead of one per worker.
-    env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
+    """Make one environment per share of the seeds, stepped as one batch; a single one as it is, which saves copies."""
+    if len(shares) == 1:
+        env = make_env(seeds=shares[0])
+    else:
+        # One function with differing arguments, rather than differing functions, lets SerialEnv take its
+        # specs from a single throw-away environment instead of one per worker.
+        env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
     return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps))

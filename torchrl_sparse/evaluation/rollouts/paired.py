@@ -37,6 +37,15 @@ _REQUIRED = (
     ("next", "reward"),
     ("next", "done"),
 )
+_OPTIONAL = (
+    keys.LATENCY,
+    keys.KEPT,
+    keys.FINE,
+    keys.PRUNE_MASK,
+    keys.TOKEN_DEPTH,
+    ("next", keys.EPISODE_COMPLETED),
+    ("next", keys.EPISODE_WAY),
+)
 
 
 def rollout_episodes(
@@ -53,11 +62,12 @@ def rollout_episodes(
     on_episode: Callable[[EpisodeResult, int, int], None] | None = None,
     policy_device: torch.device | str | None = None,
 ) -> list[EpisodeResult]:
-    """Run one episode per seed in a TorchRL ``Collector`` over a ``SerialEnv``, or several of them in processes.
+    """Run one episode per seed in a TorchRL ``Collector``, or several of them in processes.
 
-    Seeds are dealt to the environments in turn. An environment that has done its own keeps stepping until the last
-    one is finished (its surplus episodes are dropped). With ``workers`` > 1 a ``MultiAsyncCollector`` runs as many
-    processes, and with ``backend="ray"`` a ``RayCollector`` as many Ray actors of one CPU, each with a copy of the actor.
+    Several environments of one collector are a ``SerialEnv``. Seeds are dealt to the environments in turn. An environment that
+    has done its own keeps stepping until the last one is finished (its surplus episodes are dropped). With ``workers`` > 1 a
+    ``MultiAsyncCollector`` runs as many processes, and with ``backend="ray"`` a ``RayCollector`` as many Ray actors of one CPU,
+    each with a copy of the actor.
     A worker that dies, be it while it starts, is reported as a warning, and the episodes that were under way run again: they
     come out the same, since nothing but its seed fixes an episode. Nothing but rounding, that is: PyTorch sums in another
     order on several threads. The native engine does not, so with it one process equals many whatever its number of threads.
@@ -158,8 +168,8 @@ def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeRe
     """Yield each pending seed's episode as it ends. The seed of a row says which episode it belongs to."""
     running: dict[int, _OpenEpisode] = {}
     for batch in collector:
-        for step in batch.unbind(-1):
-            _check_keys(step)
+        _check_keys(batch)
+        for step in batch.select(*_REQUIRED, *_OPTIONAL, strict=False).unbind(-1):
             for row in step.reshape(-1).unbind(0):
                 seed = int(row[keys.EPISODE_SEED])
                 if seed not in pending:
@@ -172,8 +182,8 @@ def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeRe
             return
 
 
-def _check_keys(step: TensorDictBase) -> None:
-    missing = [key for key in _REQUIRED if step.get(key, None) is None]
+def _check_keys(batch: TensorDictBase) -> None:
+    missing = [key for key in _REQUIRED if batch.get(key, None) is None]
     if missing:
         raise KeyError(f"a rollout needs the keys {list(_REQUIRED)}, got none of {missing}")
 
