@@ -52,7 +52,7 @@ def weighted_mean(step, row, first, every, coeff):
     return sum(w * v for w, v in zip(weights, values, strict=True)) / sum(weights)
 
 
-@pytest.mark.parametrize("coeff", [0.0, 0.01, 0.7, -0.7])
+@pytest.mark.parametrize("coeff", [0.0, 0.01, 0.7, -0.7, -100.0])
 @pytest.mark.parametrize("every", [1, 2, 3, 5])
 def test_every_action_is_the_weighted_mean_of_the_formula(every, coeff):
     executor = ChunkExecutor(TemporalEnsemble(Predicting(), coeff), every)

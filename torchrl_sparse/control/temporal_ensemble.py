@@ -66,14 +66,13 @@ class TemporalEnsemble(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         elapsed = keys.recall(tensordict, keys.ELAPSED, (1,), 0)
-        last = tensordict.get(keys.LAST_CHUNK, None)
-        count = tensordict.get(keys.ENSEMBLED, None)
         answer = self.policy(tensordict)
         chunk = answer.get(keys.CHUNK)
         earlier = torch.zeros(chunk.shape[:-1], dtype=torch.int64, device=chunk.device)
         if elapsed.any():
-            earlier = _still_to_come(count, elapsed)
-            chunk = self._mean(shift_chunk(last, elapsed, chunk.shape[-2]), chunk, earlier)
+            earlier = _still_to_come(keys.read(tensordict, keys.ENSEMBLED), elapsed)
+            before = shift_chunk(keys.read(tensordict, keys.LAST_CHUNK), elapsed, chunk.shape[-2])
+            chunk = self._mean(before, chunk, earlier)
         answer.set(keys.CHUNK, chunk)
         return answer.set(keys.ENSEMBLED, earlier + 1)
 
@@ -83,7 +82,8 @@ class TemporalEnsemble(TensorDictModuleBase):
             -self.coeff * torch.arange(int(earlier.max()) + 1, device=chunk.device, dtype=chunk.dtype)
         )
         total = weight.cumsum(dim=0)
-        share = (weight / total)[earlier][..., None]  # of the newest prediction, 1 where it is the only one
+        # Of the newest prediction: 1 where it is the only one, or where its weight is past all numbers.
+        share = (weight / total).nan_to_num(nan=1.0)[earlier][..., None]
         return torch.where(share < 1, before + share * (chunk - before), chunk)
 
 

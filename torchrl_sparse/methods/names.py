@@ -10,7 +10,8 @@ __all__ = ["WEIGHTS", "MethodName"]
 WEIGHTS = ("bf16", "int8")
 
 _PATTERN = re.compile(
-    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?(_ensembled)?(_ahead)?"  # execution
+    # The policy, and how its chunks are executed.
+    r"(\w+?(?:\.\d+)?)(?:_every([1-9]\d*))?(?:_of([2-9]|[1-9]\d+))?(_ensembled)?(_ahead)?"
     rf"(?::({'|'.join(WEIGHTS)}))?(?:@(0?\.\d+)(?:-(0?\.\d+))?)?"
 )
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.envs import check_env_specs
+from torchrl.envs import RewardSum, TransformedEnv, check_env_specs
 
 from tests.evaluation.rollouts.fakes import (
     CHUNK_LENGTH,
@@ -78,6 +78,16 @@ def test_max_steps_truncates():
     episodes = rollout_episodes(FakeActor(), FakeEnv, [5, 1, 2, 3], num_envs=2, max_steps=5)
     assert [episode.length for episode in episodes] == [5, 4, 5, 5]
     assert [episode.success for episode in episodes] == [False, True, True, False]
+
+
+@pytest.mark.filterwarnings("error:Nested TransformedEnvs")
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_max_steps_truncates_environments_that_have_transforms(num_envs):
+    def make_env(seeds):
+        return TransformedEnv(FakeEnv(seeds), RewardSum())
+
+    episodes = rollout_episodes(FakeActor(), make_env, [5, 1], num_envs=num_envs, max_steps=5)
+    assert [episode.length for episode in episodes] == [5, 4]
 
 
 def test_progress_and_file(tmp_path):

@@ -125,4 +125,4 @@ def _batched(
         # One function with differing arguments, rather than differing functions, lets SerialEnv take its
         # specs from a single throw-away environment instead of one per worker.
         env = SerialEnv(len(shares), make_env, create_env_kwargs=[{"seeds": share} for share in shares])
-    return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps))
+    return env if max_steps is None else TransformedEnv(env, StepCounter(max_steps), auto_unwrap=True)
