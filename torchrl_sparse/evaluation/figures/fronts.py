@@ -67,6 +67,10 @@ _FAMILIES = (
     _Family("fixed interval", "uniform7", "#4D4D4D", "X"),
     _Family("BAC on ten stochastic steps", "bac_ddpm10", "#F2A19B", "P"),
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
+    _Family("the last two of five, from the last chunk", "ddpm5_logsnr_warm2", "#7F3C8D", "<"),
+    _Family("searched mask and timesteps", "searched", "#D55E00", "*"),
+    _Family("TTS, in the reference engine", "tts", "#8C564B", "p"),
+    _Family("its mean, there too", "tts_fixed", "#C49C94", "p"),
 )
 
 _USUAL_INTERVAL = 8  # environment steps between queries, of all policies here
@@ -206,12 +210,12 @@ def _draw(
 
 
 def _steps(name: str) -> int:
-    """Return the steps of a few-step chain, 0 of other methods.
+    """Return the steps of a few-step chain that begins with noise, 0 of other methods.
 
-    >>> _steps("ddpm5_logsnr:int8"), _steps("uniform2_ddpm10")
-    (5, 0)
+    >>> _steps("ddpm5_logsnr:int8"), _steps("ddpm5_logsnr_warm2"), _steps("uniform2_ddpm10")
+    (5, 0, 0)
     """
-    found = re.match(r"dd[pi]m(\d+)", name)
+    found = re.match(r"dd[pi]m(\d+)(?!.*_warm)", name)
     return int(found[1]) if found else 0
 
 
