@@ -64,11 +64,11 @@ def cases() -> Iterator[Case]:
 
 
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
-    """The engines that a method runs in: all but the reference, or that alone where it recalls earlier queries."""
+    """The engines that a method runs in beside the reference: not PyTorch's where it recalls earlier queries."""
     planner = folder / f"{method}.json"
     planner = planner if planner.exists() else folder / method / "config.json"
     format = json.loads(planner.read_text(encoding="utf-8"))["format"] if planner.exists() else method
-    return ("reference",) if re.match(r"(torchrl_sparse\.)?(recall|tts)", format) else ENGINES
+    return ("native",) if re.match(r"(torchrl_sparse\.)?(recall|tts)", format) else ENGINES
 
 
 def shipped_methods(folder: Path) -> list[str]:

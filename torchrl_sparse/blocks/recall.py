@@ -4,8 +4,8 @@ TTS learns, cell by cell, whether to compute, to reuse within the query or to re
 had there (:mod:`torchrl_sparse.blocks.engine.recall`). `Recall` asks what recalling alone is worth, at the cost of
 `uniform<interval>`: every query computes its first step and each `interval`-th other one, another each time, and recalls the
 rest. `RecallSchedule` has a choice for each cell, the same in every query, which
-:mod:`torchrl_sparse.training.diffusion.recall_choice` searches. The first query of an episode computes everything. Only the
-reference engine recalls: counts of FLOPs say what it is worth, times do not. A schedule is a JSON file that people can read::
+:mod:`torchrl_sparse.training.diffusion.recall_choice` searches. The first query of an episode computes everything. All
+engines but PyTorch's recall. A schedule is a JSON file that people can read::
 
     {
       "format": "torchrl_sparse.recall/1",

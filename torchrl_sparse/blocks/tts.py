@@ -30,7 +30,7 @@ FORMAT = "torchrl_sparse.tts/1"
 
 
 class TTSPruner(Recalling, SAGPruner):
-    """Predicts from its observation what a query computes, reuses and recalls; runs in the reference engine alone.
+    """Predicts from its observation what a query computes, reuses and recalls.
 
     Args:
         network: the trained network, with ``recalls``.

@@ -12,7 +12,7 @@ matches the pattern of one, or names a saved planner, ``NAME.json`` or ``NAME/``
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
-``recall2``          every second step of the queries after an episode's first, others as in the one before; reference engine
+``recall2``          every second step of the queries after an episode's first, others as in the one before
 ``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ``ddpm5_logsnr_rtc`` a sampler, whose queries are drawn to what is left of the last chunk
 ==================== ===========================================================================================

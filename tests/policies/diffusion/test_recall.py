@@ -5,6 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_sparse import ChunkExecutor, keys
+from torchrl_sparse.blocks.engine.factory import ENGINES
+from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.recall import Memory
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import MaskError
@@ -31,9 +33,10 @@ def slow_query(policy, query, recalled, memory):
 
 
 @torch.no_grad()
-def test_queries_recall_what_was_computed_before_them_in_each_sample_of_its_own(policy):
+@pytest.mark.parametrize("engine", ["auto", "reference"])
+def test_queries_recall_what_was_computed_before_them_in_each_sample_of_its_own(policy, engine):
     """Two samples, four queries; the second sample begins a new episode at the third."""
-    policy.plan = Recall(2)
+    policy.plan, policy.engine = Recall(2), engine
     executor = ChunkExecutor(policy, n_action_steps=3)
     assert keys.ELAPSED not in executor.in_keys
     generator, td, at = torch.Generator().manual_seed(0), TensorDict(batch_size=[2]), 0
@@ -88,20 +91,55 @@ def test_nothing_recalled_is_the_rule_alone(policy):
         Memory(torch.zeros_like(mask), torch.ones_like(mask), memory.outputs)
 
 
+def test_auto_takes_an_engine_that_recalls_and_says_which_it_passed_over(policy, monkeypatch):
+    policy.plan = Recall(2)
+    if native_available()[0]:
+        assert policy.engine_info().startswith("native: ")
+    missing = ENGINES["native"]._replace(applies=lambda network: (False, "it was not built"))
+    monkeypatch.setitem(ENGINES, "native", missing)
+    policy.engine = "auto"  # anew
+    info = (
+        "reference: eager and differentiable (not native: it was not built) (not torch: it does not recall)"
+    )
+    assert policy.engine_info() == info
+    assert policy.with_plan(None).engine_info().startswith("torch: ")
+
+
+def test_what_a_query_leaves_is_a_tensor_of_its_own(policy):
+    policy.plan = Recall(2)
+    query = TensorDict({keys.HISTORY_STATE: torch.zeros(1, 2, 5), keys.ELAPSED: torch.tensor([[0]])}, [1])
+    first = policy(query.clone())
+    before = first[keys.FEATURES].clone()
+    later = first.clone(recurse=False).set(keys.ELAPSED, torch.tensor([[3]]))
+    later.set(keys.HISTORY_STATE, torch.ones(1, 2, 5))
+    second = policy(later)
+    assert torch.equal(before, first[keys.FEATURES])
+    computed = ~second[keys.PRUNE_MASK]
+    same = (second[keys.FEATURES] == before).flatten(3).all(dim=-1)
+    assert torch.equal(same, ~computed)
+
+
+@pytest.mark.parametrize("engine", ["auto", "reference"])
+def test_gradients_flow_through_a_query_that_recalls(policy, engine):
+    policy.plan, policy.engine = Recall(2), engine
+    state = torch.zeros(1, 2, 5, requires_grad=True)
+    query = {keys.HISTORY_STATE: state, keys.ELAPSED: torch.tensor([[3]]), keys.QUERY: torch.tensor([[0]])}
+    policy(TensorDict(query, [1]))[keys.CHUNK].sum().backward()
+    assert state.grad.abs().sum() > 0
+
+
 def test_what_does_not_go_together_is_refused(policy):
     policy.plan = Recall(2)
     with pytest.raises(ValueError, match="start: expected None with a planner that recalls, got warm2"):
         policy.start = WarmStart(2)
-    assert policy.engine_info().startswith("reference: ")
-    with pytest.raises(
-        ValueError, match="engine: expected 'auto' or 'reference' with a planner that recalls, got 'torch'"
-    ):
+    message = r"engine: expected one of \['auto', 'native', 'reference', .*\] with a planner that recalls, got 'torch'"
+    with pytest.raises(ValueError, match=message):
         policy.engine = "torch"
     assert keys.FEATURES in policy.out_keys
     policy.plan = None
     assert keys.FEATURES not in policy.out_keys
     policy.engine = "torch"
-    with pytest.raises(ValueError, match="engine: expected 'auto' or 'reference'"):
+    with pytest.raises(ValueError, match=message):
         policy.plan = Recall(2)
     assert keys.FEATURES not in policy.out_keys
     with pytest.raises(ValueError, match="interval: expected at least 2, got 1"):

@@ -12,7 +12,7 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Engine", "check_query"]
+__all__ = ["Engine", "RecallingEngine", "check_input", "check_query"]
 
 
 class Engine(Protocol):
@@ -66,6 +66,31 @@ class Engine(Protocol):
         ...
 
 
+class RecallingEngine(Engine, Protocol):
+    """An engine whose queries may reuse what earlier ones computed, see :mod:`torchrl_sparse.blocks.engine.recall`."""
+
+    def denoise_recalling(
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor,
+        recalled: Tensor,
+        memory: Tensor,
+        reuse: Reuse = "block",
+    ) -> tuple[Tensor, Tensor]:
+        """Return normalised actions f32 [B, H, A] and the memory f32 [B, K, 3L, H, d] that the query leaves to the next.
+
+        Args:
+            noise, cond, mask, reuse: see :meth:`denoise`.
+            recalled: bool [B, K, 3L], the pruned cells that recall.
+            memory: what was computed last in each cell, f32 [B, K, 3L, H, d]; it is not written to.
+
+        Raises:
+            ValueError: as ``denoise`` does, if a cell is recalled that is not pruned, or if the memory has another shape.
+        """
+        ...
+
+
 def check_query(
     network: TransformerForDiffusion,
     sampler: Sampler,
@@ -92,7 +117,7 @@ def check_query(
         expected |= {"guide.actions": (batch, *chunk), "guide.pull": (batch, network.horizon, 1)}
         given |= {"guide.actions": guide.actions, "guide.pull": guide.pull}
     for name, shape in expected.items():
-        _check_input(name, given[name], shape, network.pos_emb)
+        check_input(name, given[name], shape, network.pos_emb)
     if guide is not None and not ((guide.pull >= 0) & (guide.pull <= 1)).all():
         raise ValueError(f"guide.pull: expected numbers in [0, 1], got {guide.pull.flatten().tolist()}")
     if mask is not None:
@@ -100,7 +125,8 @@ def check_query(
     check_reuse(reuse)
 
 
-def _check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+def check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+    """Raise ValueError unless ``tensor`` is dense, of this shape, and of the type and device of ``like``."""
     if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested:
         came = f"layout {tensor.layout}" if isinstance(tensor, Tensor) else type(tensor).__name__
         raise ValueError(f"{name}: expected a dense tensor, got {came}")

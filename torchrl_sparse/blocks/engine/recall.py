@@ -16,20 +16,27 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchrl_sparse.blocks.engine.base import check_input
 from torchrl_sparse.blocks.mask import MaskError, check_form
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Memory", "check_recall"]
+__all__ = ["Memory", "check_memory", "check_recall"]
 
 
-def check_recall(recall: Tensor, mask: Tensor) -> None:
+def check_recall(recalled: Tensor, mask: Tensor) -> None:
     """Refuse anything but cells bool [B, K, 3L] that ``mask`` of the same shape prunes.
 
     Raises:
         MaskError: a ValueError.
     """
-    check_form(recall, mask.shape[-2], mask.shape[-1] // 3, batch=mask.shape[:-2])
-    if (recall & ~mask).any():
-        raise MaskError(f"recall: expected pruned cells alone, got {int((recall & ~mask).sum())} others")
+    check_form(recalled, mask.shape[-2], mask.shape[-1] // 3, batch=mask.shape[:-2])
+    if (recalled & ~mask).any():
+        raise MaskError(f"recall: expected pruned cells alone, got {int((recalled & ~mask).sum())} others")
+
+
+def check_memory(memory: Tensor, mask: Tensor, network: TransformerForDiffusion) -> None:
+    """Raise ValueError unless ``memory`` is [B, K, 3L, H, d] for a ``mask`` [B, K, 3L], of the network's type and device."""
+    check_input("memory", memory, (*mask.shape, network.horizon, network.n_emb), network.pos_emb)
 
 
 class Memory:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import check_query
-from torchrl_sparse.blocks.engine.recall import Memory
+from torchrl_sparse.blocks.engine.recall import Memory, check_memory
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
@@ -151,8 +151,9 @@ def denoise_recalling(
         normalised actions [B, H, A], and the memory that this query leaves to the next.
 
     Raises:
-        ValueError: as ``denoise`` does, or if a cell is recalled that is not pruned.
+        ValueError: as ``denoise`` does, if a cell is recalled that is not pruned, or if the memory has another shape.
     """
+    check_memory(memory, mask, network)
     kept = Memory(mask, recalled, memory)
     return denoise(network, sampler, noise, cond, mask, reuse=reuse, replace=kept), kept.outputs
 
@@ -226,6 +227,20 @@ class ReferenceEngine:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.denoise`; gradients flow."""
         check_weights(self._network)
         return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse, guide=guide)
+
+    def denoise_recalling(
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor,
+        recalled: Tensor,
+        memory: Tensor,
+        reuse: Reuse = "block",
+    ) -> tuple[Tensor, Tensor]:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.RecallingEngine.denoise_recalling`; gradients flow."""
+        check_weights(self._network)
+        query = noise, cond, mask, recalled, memory
+        return denoise_recalling(self._network, self._sampler, *query, reuse=reuse)
 
     def refresh(self) -> None:
         """Do nothing: no weights are kept between queries."""

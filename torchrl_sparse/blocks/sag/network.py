@@ -128,7 +128,12 @@ class PrunerNetwork(nn.Module):
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
 
     def recall_logits(self, cond: Tensor) -> Tensor:
-        """Return f32 [B, K, 3L], positive where a cell recalls if it is pruned; for networks with ``recalls``."""
+        """Return f32 [B, K, 3L], positive where a cell recalls if it is pruned; for networks with ``recalls``.
+
+        Compiled code computes it where it computes `prune_logits`.
+        """
+        if (native := self._compiled(cond, recall=True)) is not None:
+            return native.logits(cond.flatten(1))
         return self(cond)[..., 2]
 
     def prune_masks(self, cond: Tensor) -> Tensor:
@@ -139,22 +144,23 @@ class PrunerNetwork(nn.Module):
         masks[:, 0] = False
         return masks
 
-    def _compiled(self, cond: Tensor) -> NativePruner | None:
-        """Return the compiled MLP, or None where PyTorch has to compute."""
+    def _compiled(self, cond: Tensor, recall: bool = False) -> NativePruner | None:
+        """Return the compiled MLP of a decision, to prune or to recall, or None where PyTorch has to compute."""
         if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):
             return None
-        if self._native is None and self._can_be_native():
-            self._native = NativePruner(self.mlp_weights())
-        return self._native
+        if recall not in self._native and self._can_be_native():
+            self._native[recall] = NativePruner(self.mlp_weights(recall))
+        return self._native.get(recall)
 
-    def mlp_weights(self) -> PrunerWeights:
-        """Return the weights of all that depends on the observation, for compiled code."""
+    def mlp_weights(self, recall: bool = False) -> PrunerWeights:
+        """Return the weights of all that depends on the observation, for compiled code; it decides to prune or to recall."""
         _, middle, _, last = self.mlp
         obs, fuse, middle, last = (
             (layer.weight, layer.bias) for layer in (self.obs, self.fuse_obs, middle, last)
         )
         cells = self.cells().view(len(self.timesteps), self.num_blocks, -1)
-        return PrunerWeights(obs, fuse, cells, middle, tuple(some[:2] for some in last))
+        sides = [torch.stack([torch.zeros_like(some[2]), some[2]]) if recall else some[:2] for some in last]
+        return PrunerWeights(obs, fuse, cells, middle, tuple(sides))
 
     def _can_be_native(self) -> bool:
         small = self.fuse_obs.out_features <= MAX_HIDDEN
@@ -183,7 +189,7 @@ class PrunerNetwork(nn.Module):
 
     def _forget(self) -> None:
         self._cells: Tensor | None = None
-        self._native: NativePruner | None = None
+        self._native: dict[bool, NativePruner] = {}
 
     def train(self, mode: bool = True) -> PrunerNetwork:
         self._forget()
@@ -198,7 +204,7 @@ class PrunerNetwork(nn.Module):
         super()._load_from_state_dict(*args)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cells": None, "_native": None}
+        return {**self.__dict__, "_cells": None, "_native": {}}
 
     @property
     def macs_per_query(self) -> int:

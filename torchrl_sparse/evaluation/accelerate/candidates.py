@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
-from torchrl_sparse.blocks.engine.native.engine import native_supports
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.evaluation.accelerate.stages import Search, read_or_make

@@ -69,8 +69,8 @@ _FAMILIES = (
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
     _Family("the last two of five, from the last chunk", "ddpm5_logsnr_warm2", "#7F3C8D", "<"),
     _Family("searched mask and timesteps", "searched", "#D55E00", "*"),
-    _Family("TTS, in the reference engine", "tts", "#8C564B", "p"),
-    _Family("its mean, there too", "tts_fixed", "#C49C94", "p"),
+    _Family("TTS", "tts", "#8C564B", "p"),
+    _Family("its mean choice", "tts_fixed", "#C49C94", "p"),
 )
 
 _USUAL_INTERVAL = 8  # environment steps between queries, of all policies here

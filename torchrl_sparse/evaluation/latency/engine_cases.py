@@ -18,8 +18,8 @@ from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
 from torchrl_sparse.blocks.engine import Engine, NativeEngine, ReferenceEngine, TorchEngine
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
-from torchrl_sparse.blocks.engine.native.engine import native_supports
 from torchrl_sparse.blocks.engine.native.library import native_available
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.training.diffusion.published import published_network

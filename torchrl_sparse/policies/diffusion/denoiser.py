@@ -8,8 +8,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot
-from torchrl_sparse.blocks.engine.reference import ReferenceEngine, denoise, denoise_recalling
+from torchrl_sparse.blocks.engine.base import Engine
+from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot, check_engine
+from torchrl_sparse.blocks.engine.reference import denoise, denoise_recalling
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
@@ -33,17 +34,10 @@ def check_noise(name: str) -> str:
 
 
 def check_recalling(engine: EngineName, start: str) -> None:
-    """Raise ValueError unless a planner that recalls can run: in the reference engine, with queries that begin from noise.
-
-    The other engines run programs in which a run of pruned blocks is one sum of outputs of this query; what a row recalls is
-    in no such sum. ``"auto"`` is taken as the reference.
-    """
+    """Raise ValueError unless a planner that recalls can run: in an engine that does, with queries that begin from noise."""
     if start:
         raise ValueError(f"start: expected None with a planner that recalls, got {start}")
-    if engine not in ("auto", "reference"):
-        raise ValueError(
-            f"engine: expected 'auto' or 'reference' with a planner that recalls, got {engine!r}"
-        )
+    check_engine(engine, recalls=True)
 
 
 class ActionDenoiser(TensorDictModuleBase):
@@ -52,8 +46,7 @@ class ActionDenoiser(TensorDictModuleBase):
     Attributes:
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
         guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
-        recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`; only
-            the reference engine does that.
+        recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`.
     """
 
     def __init__(
@@ -90,16 +83,17 @@ class ActionDenoiser(TensorDictModuleBase):
         return [keys.CHUNK, keys.FLOPS, *([keys.FEATURES] if self.recalls else ())]
 
     def choose(self, engine: EngineName) -> None:
-        """Take another engine from the next query on; ValueError as `check_recalling`, or for an unknown name."""
-        if self.recalls:
-            check_recalling(engine, start="")
+        """Take another engine from the next query on; ValueError as `check_engine`."""
+        check_engine(engine, self.recalls)
         self.engine = EngineSlot(engine)
 
     def describe(self) -> str:
         """Say which engine runs and on what, and why not a faster one."""
-        if self.recalls:
-            return f"reference: {ReferenceEngine.detail} (not native, torch: the planner recalls)"
-        return self.engine.describe(self.network, self.sampler)
+        return self.engine.describe(self.network, self.sampler, recalls=self.recalls)
+
+    def current_engine(self) -> Engine:
+        """Return the engine that queries run in now."""
+        return self.engine.get(self.network, self.sampler, recalls=self.recalls)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
@@ -129,8 +123,11 @@ class ActionDenoiser(TensorDictModuleBase):
         before = _flat(keys.recall(tensordict, keys.FEATURES, shape, 0.0, cond.dtype), batch)
         recalled = _flat(keys.read(tensordict, keys.RECALL), batch)
         (code,) = set(rules.tolist()) or {0}
-        query = network, self.sampler, noise, cond, mask, recalled, before
-        actions, memory = denoise_recalling(*query, reuse=REUSE_RULES[code])
+        query = noise, cond, mask, recalled, before
+        if network.training or cond.requires_grad:
+            actions, memory = denoise_recalling(network, self.sampler, *query, reuse=REUSE_RULES[code])
+        else:
+            actions, memory = self.current_engine().denoise_recalling(*query, REUSE_RULES[code])
         tensordict.set(keys.FEATURES, memory.reshape(*batch, *shape))
         return actions, mask_flops(NetworkSizes.of(network), mask)
 
@@ -218,7 +215,7 @@ class ActionDenoiser(TensorDictModuleBase):
             sampler, slot = self._tail(number)
         if self.network.training or cond.requires_grad:
             return denoise(self.network, sampler, noise, cond, mask, reuse=reuse, guide=guide)
-        return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse, guide)
+        return slot.get(self.network, sampler, recalls=self.recalls).denoise(noise, cond, mask, reuse, guide)
 
     def refresh(self) -> None:
         """Read all weights anew in the next query."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from torchrl_sparse.blocks.engine.native.engine import native_supports
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, PackedWeights, weight_type
 from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.tsp import ExportedPlan, write_tsp
 from torchrl_sparse.blocks.mask import num_buffers
 from torchrl_sparse.blocks.planner import Planner

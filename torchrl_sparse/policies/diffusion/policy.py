@@ -206,7 +206,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     def block_costs(self) -> dict[str, BlockCost]:
         """Return seconds, measured now, and FLOPs of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in the engine, batch 1."""
-        return engine_block_costs(self.module["denoise"].engine.get(self.network, self.sampler))
+        return engine_block_costs(self.module["denoise"].current_engine())
 
     def refresh(self) -> None:
         """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""

@@ -38,7 +38,7 @@ def answer_directly(
     if type(tensordict) is not TensorDict or not _known(encode, start, plan, denoise):
         return False
     network, sampler, normalizer = denoise.network, denoise.sampler, denoise.normalizer
-    engine = denoise.engine.get(network, sampler)
+    engine = denoise.current_engine()
     state = tensordict.get(keys.HISTORY_STATE, None)
     if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
         return False

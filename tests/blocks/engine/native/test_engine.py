@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchrl_sparse.blocks.engine import denoise
-from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.library import native_available
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 

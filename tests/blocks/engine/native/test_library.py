@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from torchrl_sparse.blocks.engine.native import library
-from torchrl_sparse.blocks.engine.native.engine import native_supports
 from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, native_available
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 
 from .test_engine import SETS, make_network
 

@@ -7,8 +7,9 @@ from functools import partial
 import pytest
 import torch
 
-from torchrl_sparse.blocks.engine.native.engine import NativeEngine, native_supports
+from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch, SharedWeights
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion

@@ -8,7 +8,7 @@ the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from ctypes import byref
 from functools import partial
@@ -19,14 +19,11 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.costs import folded_block_macs
 from torchrl_sparse.blocks.engine.native.arena import PANEL
-from torchrl_sparse.blocks.engine.native.library import (
-    INSTRUCTION_SETS,
-    instruction_level,
-    library,
-    native_available,
-)
+from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instruction_level, library
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
+from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
+from torchrl_sparse.blocks.engine.recall import check_memory, check_recall
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
@@ -34,34 +31,9 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["MAX_THREADS", "NativeEngine", "native_supports"]
+__all__ = ["MAX_THREADS", "NativeEngine"]
 
 MAX_THREADS = 64  # of a team, see team.h
-
-_MAX_OBS_STEPS = 63
-
-
-def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
-    """Return whether the native engine can run ``network`` on this machine, and if not, why.
-
-    It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0,
-    as all published models have), a noise vector as large as an action, and at most 63 observation steps.
-    """
-    available, reason = native_available()
-    if not available:
-        return False, reason
-    parameters = list(network.parameters())
-    if any(parameter.device.type != "cpu" for parameter in parameters):
-        return False, f"it runs on the CPU, the network is on {parameters[0].device}"
-    if any(parameter.dtype != torch.float32 for parameter in parameters):
-        return False, "it reads float32 weights"
-    if network.n_cond_layers > 0:
-        return False, f"it needs n_cond_layers = 0, the network has {network.n_cond_layers}"
-    if network.output_dim != network.input_dim:
-        return False, f"it needs output_dim = input_dim, got {network.output_dim} and {network.input_dim}"
-    if network.n_obs_steps > _MAX_OBS_STEPS:
-        return False, f"it needs n_obs_steps <= {_MAX_OBS_STEPS}, the network has {network.n_obs_steps}"
-    return True, ""
 
 
 class NativeEngine:
@@ -77,7 +49,7 @@ class NativeEngine:
     caller's. Between queries the threads sleep.
 
     Args:
-        network: the denoiser, in eval mode; see :func:`native_supports`.
+        network: the denoiser, in eval mode; see `native_supports`.
         sampler: the sampler.
         weights: ``"float32"``; ``"float16"`` for half the memory; ``"bfloat16"`` for half the memory and, on a CPU
             with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well; ``"int8"`` for a
@@ -101,7 +73,7 @@ class NativeEngine:
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
-        >>> if native_available()[0]:
+        >>> if native_supports(network)[0]:
         ...     engine = NativeEngine(network, Sampler("ddim", 10))
         ...     actions = engine.denoise(torch.randn(3, 10, 4, 7), torch.randn(3, 2, 5))
         ...     assert actions.shape == (3, 4, 7)
@@ -159,6 +131,36 @@ class NativeEngine:
             ValueError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
         """
         check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
+        drawn = [] if guide is None else [part.contiguous() for part in guide]
+        return self._denoise(noise, cond, mask, reuse, [part.data_ptr() for part in drawn] or [None, None])
+
+    def denoise_recalling(
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor,
+        recalled: Tensor,
+        memory: Tensor,
+        reuse: Reuse = "block",
+    ) -> tuple[Tensor, Tensor]:
+        """See :meth:`torchrl_sparse.blocks.engine.base.RecallingEngine.denoise_recalling`; ValueError as :meth:`denoise`."""
+        check_query(self._network, self._sampler, noise, cond, mask, reuse)
+        check_recall(recalled, mask)
+        check_memory(memory, mask, self._network)
+        recalled, memory = recalled.contiguous(), memory.clone(memory_format=torch.contiguous_format)
+        past = [recalled.data_ptr(), memory.data_ptr()]
+        return self._denoise(noise, cond, mask, reuse, past=past), memory
+
+    def _denoise(
+        self,
+        noise: Tensor,
+        cond: Tensor,
+        mask: Tensor | None,
+        reuse: Reuse,
+        guide: Sequence[int | None] = (None, None),
+        past: Sequence[int | None] = (None, None),
+    ) -> Tensor:
+        """Run a query that was checked, with the addresses of what it is drawn to and of what it recalls."""
         self._check(mask)
         packed, slots = self._current(), num_buffers(reuse, self._dense.shape[1])
         if mask is None:
@@ -169,12 +171,10 @@ class NativeEngine:
             return actions
         mask, noise, cond = mask.contiguous(), noise.contiguous(), cond.contiguous()
         threads = self._num_threads(len(cond))
-        drawn = [] if guide is None else [part.contiguous() for part in guide]
-        guided = [part.data_ptr() for part in drawn] or [None, None]
-        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guided, actions.data_ptr()
+        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guide, *past, actions.data_ptr()
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            library().sparse_guided(*where, len(cond), *query, scratch.data_ptr())
+            library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
     def condition(self, state: Tensor, scales: ctypes.Array) -> Tensor | None:

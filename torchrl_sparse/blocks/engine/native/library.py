@@ -25,7 +25,7 @@ _SIGNATURES = {
     "sparse_levels": (c_int32, []),
     "sparse_model_size": (c_int64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
-    "sparse_guided": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
+    "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 8]),
     "sparse_normalise": (c_int32, [c_void_p, c_int32, c_int32, *[c_void_p] * 2]),
     "sparse_answer": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_blocks": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p]),

@@ -44,7 +44,7 @@ class PrunerWeights:
         obs, fuse: of the observation's F features, one after the other.
         cells: [K, 3L, hidden], what a block of a step adds to the first hidden layer.
         middle: of the second hidden layer.
-        last: of the two logits, keep and prune.
+        last: of two logits, such as keep and prune, of which the second is weighed against the first.
     """
 
     obs: tuple[Tensor, Tensor]
@@ -55,7 +55,7 @@ class PrunerWeights:
 
 
 class NativePruner:
-    """Computes by how much pruning is preferred to keeping, for every block. Not differentiable.
+    """Computes by how much the second logit, as of pruning, is preferred to the first, for every block. Not differentiable.
 
     The two linear layers before the sum over cells are one here, and of the last layer's two logits the difference. A
     row of a batch is computed exactly as it would be alone, on ``torch.get_num_threads()`` threads, whose number changes
