@@ -4,7 +4,7 @@
     python recipes/profile_query.py queries=100000 hz=50 busy=1 library=build/tsp/libtsp.so     # 33 minutes
 
 Writes OUT/query.json, three tables and OUT/query_threads.png. Times are medians, everything interleaved in one process; in
-the tail, every query counts.
+the tail, which comes last, every query counts: Ctrl-C ends it with those that there are.
 """
 
 from __future__ import annotations
@@ -45,18 +45,19 @@ def main(config: DictConfig) -> None:
     counts = sorted({1, *(count for count in config.thread_counts if count <= usable_cores())})
     with num_threads(config.threads):
         parts = query_parts(policy, config.repeats, config.warmup)
-        tails = query_tails(policy, config)
     threads = thread_seconds(
         policy.network, {"dense": dense, config.sampler: chosen}, counts, config.repeats, config.warmup
     )
+    with num_threads(config.threads):
+        samples = query_samples(policy, config)
     found = QueryProfile(
         format="query/2",
         machine=describe_machine(threads=config.threads),
         sampler=config.sampler,
         parts_s=parts,
         threads_s={name: {str(count): at[count] for count in at} for name, at in threads.items()},
-        tails_s=tails,
-        queries=config.queries,
+        tails_s={name: tail(seconds) for name, seconds in samples.items()},
+        queries=len(samples["Python"]),
         busy=config.busy,
         hz=config.hz,
     )
@@ -66,7 +67,7 @@ def main(config: DictConfig) -> None:
     print(f"\n{format_query_profile(found)}\n\nfiles are in {out}")
 
 
-def query_tails(policy: DiffusionPolicy, config: DictConfig) -> dict[str, dict[str, float]]:
+def query_samples(policy: DiffusionPolicy, config: DictConfig) -> dict[str, list[float]]:
     """Time many queries from Python and, with a library, as many in C between them."""
     with ExitStack() as stack:
         calls: dict[str, Callable[..., Any]] = {"Python": policy}
@@ -75,8 +76,7 @@ def query_tails(policy: DiffusionPolicy, config: DictConfig) -> dict[str, dict[s
         stack.enter_context(busy_cores(config.busy))
         show = stack.enter_context(progress("tail", "query", config.queries))
         inputs = {"Python": policy_inputs(policy)}
-        seconds = paced_seconds(calls, config.queries, config.hz, show, inputs=inputs)
-    return {name: tail(samples) for name, samples in seconds.items()}
+        return paced_seconds(calls, config.queries, config.hz, show, inputs=inputs)
 
 
 if __name__ == "__main__":

@@ -115,6 +115,24 @@ def test_callers_take_turns_evenly_in_the_period():
     assert {name: len(seconds) for name, seconds in samples.items()} == {"a": 3, "b": 3}
 
 
+@pytest.mark.parametrize(("interrupted_at", "kept"), [(6, 2), (5, 2), (4, 1), (2, None)])
+def test_an_interrupt_leaves_what_all_callers_were_timed_for(interrupted_at, kept):
+    """The first two calls warm up."""
+    calls = itertools.count(1)
+
+    def caller():
+        if next(calls) == 2 + interrupted_at:
+            raise KeyboardInterrupt
+
+    ask = {"a": caller, "b": caller}
+    if kept is None:
+        with pytest.raises(KeyboardInterrupt):
+            paced_seconds(ask, queries=100, hz=None)
+    else:
+        samples = paced_seconds(ask, queries=100, hz=None)
+        assert {name: len(seconds) for name, seconds in samples.items()} == {"a": kept, "b": kept}
+
+
 @needs_native
 def test_the_recipe_leaves_tables_and_a_figure(tmp_path, policy):
     policy.save_pretrained(tmp_path / "policy")

@@ -174,25 +174,33 @@ def paced_seconds(
     over the period. A query that comes late delays the next; each is timed from its own beginning.
 
     Returns:
-        name of a caller -> seconds of its ``queries``, in order.
+        name of a caller -> seconds of its ``queries``, in order. Ctrl-C ends it with as many of each as there are by then.
+
+    Raises:
+        KeyboardInterrupt: on Ctrl-C before every caller has been timed once.
     """
     inputs = inputs or {}
     for name, call in calls.items():
         call(*next_arguments(inputs, name))
     samples: dict[str, list[float]] = {name: [] for name in calls}
     begin = time.perf_counter()
-    for number in range(queries):
-        for turn, (name, call) in enumerate(calls.items()):
-            given = next_arguments(inputs, name)
-            if hz is not None:
-                due = begin + (number + turn / len(calls)) / hz
-                time.sleep(max(0.0, due - time.perf_counter()))
-            start = time.perf_counter()
-            call(*given)
-            samples[name].append(time.perf_counter() - start)
-        if on_query is not None:
-            on_query(number + 1, queries)
-    return samples
+    try:
+        for number in range(queries):
+            for turn, (name, call) in enumerate(calls.items()):
+                given = next_arguments(inputs, name)
+                if hz is not None:
+                    due = begin + (number + turn / len(calls)) / hz
+                    time.sleep(max(0.0, due - time.perf_counter()))
+                start = time.perf_counter()
+                call(*given)
+                samples[name].append(time.perf_counter() - start)
+            if on_query is not None:
+                on_query(number + 1, queries)
+    except KeyboardInterrupt:
+        if not all(samples.values()):
+            raise
+    whole = min(map(len, samples.values()))
+    return {name: seconds[:whole] for name, seconds in samples.items()}
 
 
 def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
