@@ -14,7 +14,7 @@ from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
-from torchrl_sparse.evaluation.statistics.scores import mean_interval, mean_z
+from torchrl_sparse.evaluation.statistics.scores import difference_interval, difference_z, mean_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 
@@ -22,12 +22,14 @@ def test_intervals_are_those_of_the_t_tests():
     ours, theirs = np.random.default_rng(0).random((2, 12))
     assert mean_interval(ours) == (ours.mean(), pytest.approx([*ttest_1samp(ours, 0).confidence_interval()]))
     paired = ttest_rel(ours, theirs).confidence_interval()
-    assert mean_interval(ours - theirs)[1] == pytest.approx([*paired])
+    assert difference_interval(ours, theirs)[1] == pytest.approx([*paired])
 
 
 def test_one_number_has_no_interval():
     with pytest.raises(ValueError, match=r"values: expected at least two numbers, got shape \(1,\)"):
         mean_interval([0.5])
+    with pytest.raises(ValueError, match="pairs: expected at least two, got 1"):
+        difference_interval([0.5], [0.4])
 
 
 def test_methods_are_compared_on_the_seeds_of_both():
@@ -100,13 +102,14 @@ def test_episodes_of_such_a_task_go_on_until_the_score_is_decided():
     terms = Terms(Design(300, 30), 60, by_degrees=True)
     episodes = play_rounds(["far", "close"], lambda name, count: played[name][:count], terms)
     assert len(episodes["far"]) < 100
-    assert mean_z(np.zeros(1), -0.05) == 0  # one episode says nothing
+    assert difference_z([0.5], [0.5], -0.05) == 0  # one pair says nothing
 
 
 @pytest.mark.parametrize("n", [3, 10, 200])
 def test_a_score_is_decided_where_its_interval_says_so(n):
-    gains = np.random.default_rng(n).normal(0.0, 0.1, n)
-    for confidence in (0.9, 0.95, 0.999):
-        low, high = mean_interval(gains, confidence)[1]
-        assert mean_z(gains, low) == pytest.approx(norm.ppf((1 + confidence) / 2))
-        assert mean_z(gains, high) == pytest.approx(-norm.ppf((1 + confidence) / 2))
+    ours, theirs, more = np.random.default_rng(n).normal(0.0, 0.1, (3, n))
+    for further in ((), more):
+        for confidence in (0.9, 0.95, 0.999):
+            low, high = difference_interval(ours, theirs, further, confidence)[1]
+            assert difference_z(ours, theirs, low, further) == pytest.approx(norm.ppf((1 + confidence) / 2))
+            assert difference_z(ours, theirs, high, further) == pytest.approx(-norm.ppf((1 + confidence) / 2))

@@ -92,11 +92,13 @@ def test_designs_that_are_none_are_refused():
         DESIGN.critical(44)
 
 
-def test_published_simulation_is_what_its_command_makes():
-    published = load_stopping("assets/statistics/stopping.json")
+@pytest.mark.parametrize(("name", "dense_episodes"), [("stopping", None), ("stopping_further", 1300)])
+def test_published_simulations_are_what_their_commands_make(name, dense_episodes):
+    published = load_stopping(f"assets/statistics/{name}.json")
     assert (published.max_episodes, published.looks, published.trials) == (1300, 30, 2000)
+    assert published.dense_episodes == dense_episodes
     assert all(case.rate <= 0.05 for case in published.type_one)
-    few = simulate_stopping(130, 3, 2)
+    few = simulate_stopping(130, 3, 2, dense_episodes=dense_episodes)
     assert [case.task for case in few.savings] == [case.task for case in published.savings]
 
 

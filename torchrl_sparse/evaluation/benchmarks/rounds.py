@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl_sparse.evaluation.results.build import Terms
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
+from torchrl_sparse.evaluation.rollouts.pairs import pair_by_design
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["episode_horizon", "make_design", "play_rounds"]
@@ -20,13 +20,14 @@ _BETWEEN = 10  # episodes from one look to the next, at least: each makes its en
 _UNTIL = ("episodes", "decided")
 
 
-def make_design(until: str, episodes: int, max_episodes: int) -> Design:
+def make_design(until: str, episodes: int, max_episodes: int, dense_episodes: int | None = None) -> Design:
     """Return when a benchmark looks at its episodes.
 
     Args:
         until: "episodes" for a fixed number, "decided" to go on until a method's verdicts are reached.
         episodes: that fixed number.
         max_episodes: cap of the others; part of the design, and so not to be raised once episodes were seen.
+        dense_episodes: see `Design`; likewise.
 
     Raises:
         ValueError: for another ``until``, or a number below 1.
@@ -39,8 +40,8 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
     if until not in _UNTIL:
         raise ValueError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
     if until == "episodes":
-        return Design(episodes)
-    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))
+        return Design(episodes, dense_episodes=dense_episodes)
+    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)), dense_episodes)
 
 
 def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> int:
@@ -57,7 +58,7 @@ def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> i
 def play_rounds(
     names: Iterable[str], play: Callable[[str, int], list[EpisodeResult]], terms: Terms
 ) -> dict[str, list[EpisodeResult]]:
-    """Play every method until its verdict is reached or the cap is, and dense as far as any of them.
+    """Play every method until its verdict is reached or the cap is, and dense as far as any of them or as the design says.
 
     Nothing but the episodes decides, look by look, so a benchmark that was killed stops where it would have stopped.
 
@@ -69,16 +70,17 @@ def play_rounds(
     Returns:
         name -> its episodes, in the order in which methods were played, dense first.
     """
-    episodes: dict[str, list[EpisodeResult]] = {DENSE: []}
+    design, known = terms.design, terms.design.dense_episodes
+    episodes = {DENSE: play(DENSE, known) if known else []}
     for name in names:
         if name == DENSE:
             continue
-        for n in terms.design.ends:
+        for n in design.ends:
             if len(episodes[DENSE]) < n:
                 episodes[DENSE] = play(DENSE, n)
             episodes[name] = play(name, n)
-            if terms.decided(pair_episodes(name, episodes[name], DENSE, episodes[DENSE][:n])):
+            if terms.decided(pair_by_design(name, episodes[name], DENSE, episodes[DENSE], design)):
                 break
     if not episodes[DENSE]:
-        episodes[DENSE] = play(DENSE, terms.design.max_episodes)
+        episodes[DENSE] = play(DENSE, design.max_episodes)
     return episodes

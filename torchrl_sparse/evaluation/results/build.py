@@ -24,7 +24,7 @@ from torchrl_sparse.evaluation.results.parts import (
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, SCHEMA, MethodEntry, Results, Stopping
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals, totals
-from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_episodes
+from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_by_design, pair_episodes
 from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
 from torchrl_sparse.evaluation.statistics.durations import (
     DEFAULT_TIME_MARGIN,
@@ -32,15 +32,9 @@ from torchrl_sparse.evaluation.statistics.durations import (
     allowed_steps,
     correlation,
     success_within,
-    time_ratio,
 )
-from torchrl_sparse.evaluation.statistics.intervals import (
-    DEFAULT_MARGIN,
-    PairedDifference,
-    paired_difference,
-    verdict,
-)
-from torchrl_sparse.evaluation.statistics.scores import mean_interval, mean_z
+from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, verdict
+from torchrl_sparse.evaluation.statistics.scores import mean_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["MethodRun", "Terms", "build_results", "compare_episodes", "compare_pair"]
@@ -93,7 +87,7 @@ class Terms:
 
     def score_statistic(self, pairs: EpisodePairs) -> float:
         """Return by how many standard errors the mean score is better than its margin."""
-        return mean_z(pairs.score_gains, -self.margin)
+        return pairs.score_statistic(self.margin)
 
     def decided(self, pairs: EpisodePairs) -> bool:
         """Tell whether the verdict of a method on these episodes, at a look of the design, is reached."""
@@ -144,6 +138,7 @@ def build_results(
         {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
+        dense_episodes=design.dense_episodes,
         pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
         settings=None if settings is None else dict(settings),
     )
@@ -220,8 +215,7 @@ def compare_pair(
         ValueError: if the seeds differ.
     """
     pairs, horizon = pair_episodes(method, episodes, against, others), terms.episode_horizon
-    solved = paired_difference(*pairs.solved, terms.margin)
-    times = time_ratio(*pairs.times(horizon), horizon, terms.time_margin)
+    solved, times = pairs.success_difference(terms.margin), pairs.time_ratio(horizon, terms.time_margin)
     counts = tuple(map(sum, pairs.solved))
     return PairedEntry(
         method, against, counts, len(pairs.method), Difference.of(solved), TimeDifference.of(times)
@@ -236,16 +230,13 @@ def compare_episodes(
     Args:
         name: of the method.
         episodes: its own.
-        dense: the dense policy's; where the design has several looks, perhaps more of them.
+        dense: the dense policy's, in the order of the benchmark's seeds; perhaps more of them, see `pair_by_design`.
         terms: of the comparison.
 
     Raises:
         ValueError: if the seeds do not fit.
     """
-    if terms.design.looks > 1:
-        seeds = {episode.seed for episode in episodes}
-        dense = [episode for episode in dense if episode.seed in seeds]
-    pairs = pair_episodes(name, episodes, DENSE, dense)
+    pairs = pair_by_design(name, episodes, DENSE, dense, terms.design)
     ours, theirs = pairs.times(terms.episode_horizon)
     steps = allowed_steps(terms.episode_horizon, terms.early_cut)
     shares = success_within(pairs.solved[0], ours, steps)
@@ -263,16 +254,16 @@ def _score(name: str, pairs: EpisodePairs, terms: Terms) -> Score:
     if name == DENSE:
         return Score(mean, ci, Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior"), None)
     n, design = len(pairs.method), terms.design
-    gain, gain_ci = mean_interval(pairs.score_gains, design.confidence(n))
-    beside_dense = Difference(gain, gain_ci, terms.margin, verdict(gain_ci, terms.margin))
-    return Score(mean, ci, beside_dense, design.p_value(abs(terms.score_statistic(pairs)), n))
+    gain, gain_ci = pairs.score_difference(design.confidence(n))
+    gained = Difference(gain, gain_ci, terms.margin, verdict(gain_ci, terms.margin))
+    return Score(mean, ci, gained, design.p_value(abs(terms.score_statistic(pairs)), n))
 
 
 def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     n, design, horizon = len(pairs.method), terms.design, terms.episode_horizon
     confidence = design.confidence(n)
-    solved = paired_difference(*pairs.solved, terms.margin, confidence)
-    times = time_ratio(*pairs.times(horizon), horizon, terms.time_margin, confidence)
+    solved = pairs.success_difference(terms.margin, confidence)
+    times = pairs.time_ratio(horizon, terms.time_margin, confidence)
     p_values = (design.p_value(abs(z), n) for z in terms.statistics(pairs))
     return {
         "paired_vs_dense": Difference.of(solved),

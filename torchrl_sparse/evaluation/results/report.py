@@ -242,12 +242,15 @@ def _episodes_text(results: AnyResults) -> str:
     n = results.dense.success.n
     if not isinstance(results, Results):
         return f"{n} paired episodes a method (seed {results.seed})"
-    seeds = f"{results.split} seeds from {results.first_seed}"
+    seeds, known, more = f"{results.split} seeds from {results.first_seed}", results.dense_episodes, ""
+    if known is not None:
+        more = f"; the first {known} of dense count in every comparison, paired or not"
     if (stopping := results.until_decided) is None:
-        return f"{n} paired episodes a method ({seeds})"
+        paired = min(method.success.n for method in results.methods.values())
+        return f"{paired} paired episodes a method ({seeds}){more}"
     return (
         f"paired episodes ({seeds}) until a method's verdicts are reached, looked at {stopping.looks} times up to "
-        f"{stopping.max_episodes}; intervals of differences are as much wider as that takes"
+        f"{stopping.max_episodes}; intervals of differences are as much wider as that takes{more}"
     )
 
 

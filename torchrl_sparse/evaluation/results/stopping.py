@@ -62,22 +62,25 @@ class StoppingResults:
     seed: int
     type_one: tuple[TypeOne, ...]
     savings: tuple[SavedEpisodes, ...]
+    dense_episodes: int | None = None
 
 
-def simulate_stopping(max_episodes: int, looks: int, trials: int, seed: int = 0) -> StoppingResults:
+def simulate_stopping(
+    max_episodes: int, looks: int, trials: int, seed: int = 0, dense_episodes: int | None = None
+) -> StoppingResults:
     """Simulate every case.
 
     Args:
-        max_episodes, looks: of the `Design`.
+        max_episodes, looks, dense_episodes: of the `Design`.
         trials: benchmarks of each case.
         seed: of all.
 
     Raises:
         ValueError: for a design that is none.
     """
-    design = Design(max_episodes, looks)
-    errors, saved = _type_one(design, trials, seed), _savings(design, trials, seed)
-    return StoppingResults(1, max_episodes, looks, trials, seed, tuple(errors), tuple(saved))
+    design = Design(max_episodes, looks, dense_episodes)
+    cases = tuple(_type_one(design, trials, seed)), tuple(_savings(design, trials, seed))
+    return StoppingResults(1, max_episodes, looks, trials, seed, *cases, dense_episodes)
 
 
 def _type_one(design: Design, trials: int, seed: int) -> Iterator[TypeOne]:

@@ -9,10 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.statistics.durations import restricted_times, time_z
-from torchrl_sparse.evaluation.statistics.intervals import tango_z
+from torchrl_sparse.evaluation.statistics.durations import TimeRatio, restricted_times, time_ratio, time_z
+from torchrl_sparse.evaluation.statistics.intervals import (
+    PairedDifference,
+    discordant_pairs,
+    paired_difference,
+    tango_z,
+)
+from torchrl_sparse.evaluation.statistics.overlap import Further
+from torchrl_sparse.evaluation.statistics.scores import difference_interval, difference_z
+from torchrl_sparse.evaluation.statistics.sequential import Design
 
-__all__ = ["EpisodePairs", "pair_episodes"]
+__all__ = ["EpisodePairs", "pair_by_design", "pair_episodes"]
 
 
 @dataclass(frozen=True)
@@ -22,41 +30,54 @@ class EpisodePairs:
     Attributes:
         method: episodes of the first.
         other: episodes of the second.
+        more: of the second on further seeds, which count too, see `torchrl_sparse.evaluation.statistics.overlap`.
     """
 
     method: Sequence[EpisodeResult]
     other: Sequence[EpisodeResult]
+    more: Sequence[EpisodeResult] = ()
 
     @property
     def solved(self) -> tuple[list[bool], list[bool]]:
         """Successes of both."""
         return [episode.success for episode in self.method], [episode.success for episode in self.other]
 
-    @property
-    def score_gains(self) -> NDArray[np.float64]:
-        """How much higher the first one's scores are, pair by pair."""
-        ours, theirs = (
-            np.array([episode.score for episode in episodes]) for episodes in (self.method, self.other)
-        )
-        return ours - theirs
-
     def times(self, horizon: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the restricted times of both; see `restricted_times`."""
-        lengths = ([episode.length for episode in episodes] for episodes in (self.method, self.other))
-        ours, theirs = (restricted_times(*both, horizon) for both in zip(self.solved, lengths, strict=True))
-        return ours, theirs
+        return _times(self.method, horizon), _times(self.other, horizon)
+
+    def success_difference(self, margin: float, confidence: float = 0.95) -> PairedDifference:
+        """Compare what both solved; see `paired_difference`."""
+        more = [episode.success for episode in self.more]
+        return paired_difference(*self.solved, margin, confidence, more)
+
+    def time_ratio(self, horizon: int, margin: float, confidence: float = 0.95) -> TimeRatio:
+        """Compare how long both took; see `torchrl_sparse.evaluation.statistics.durations.time_ratio`."""
+        return time_ratio(*self.times(horizon), horizon, margin, confidence, _times(self.more, horizon))
+
+    def score_difference(self, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
+        """Compare the scores of both; see `difference_interval`."""
+        ours, theirs, more = map(_scores, (self.method, self.other, self.more))
+        return difference_interval(ours, theirs, more, confidence)
 
     def statistics(self, horizon: int, margin: float, time_margin: float) -> tuple[float, float]:
         """Return by how many standard errors successes and times are better than their margins."""
-        ours, theirs = self.solved
-        won = sum(a and not b for a, b in zip(ours, theirs, strict=True))
-        lost = sum(b and not a for a, b in zip(ours, theirs, strict=True))
-        times = time_z(*self.times(horizon), horizon, 1 + time_margin)
-        return tango_z(won, lost, len(ours), -margin), times
+        further = Further.of(*self.solved, [episode.success for episode in self.more])
+        times = time_z(*self.times(horizon), horizon, 1 + time_margin, _times(self.more, horizon))
+        return tango_z(*discordant_pairs(*self.solved), -margin, further), times
+
+    def score_statistic(self, margin: float) -> float:
+        """Return by how many standard errors the scores are better than their margin."""
+        ours, theirs, more = map(_scores, (self.method, self.other, self.more))
+        return difference_z(ours, theirs, -margin, more)
 
 
 def pair_episodes(
-    name: str, episodes: Sequence[EpisodeResult], other: str, others: Sequence[EpisodeResult]
+    name: str,
+    episodes: Sequence[EpisodeResult],
+    other: str,
+    others: Sequence[EpisodeResult],
+    more: Sequence[EpisodeResult] = (),
 ) -> EpisodePairs:
     """Put the episodes of two methods beside each other.
 
@@ -64,6 +85,7 @@ def pair_episodes(
         name, other: of the methods, for errors.
         episodes: of the first, in any order.
         others: of the second, on the same seeds.
+        more: of the second on further seeds.
 
     Raises:
         ValueError: if they ran on different seeds, or a seed ran twice.
@@ -72,7 +94,47 @@ def pair_episodes(
     if ours.keys() != theirs.keys():
         odd = sorted(ours.keys() ^ theirs.keys())
         raise ValueError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
-    return EpisodePairs([*ours.values()], [theirs[seed] for seed in ours])
+    if repeated := ours.keys() & _by_seed(more).keys():
+        raise ValueError(
+            f"{name}: expected further episodes of {other!r} on other seeds, got {sorted(repeated)[:10]}"
+        )
+    return EpisodePairs([*ours.values()], [theirs[seed] for seed in ours], [*more])
+
+
+def pair_by_design(
+    name: str,
+    episodes: Sequence[EpisodeResult],
+    other: str,
+    others: Sequence[EpisodeResult],
+    design: Design,
+) -> EpisodePairs:
+    """Put a method's episodes beside those of another on the same seeds and those of its further ones that count too.
+
+    Args:
+        name, other: of the methods, for errors.
+        episodes: of the first.
+        others: of the second, in the order of the benchmark's seeds; more of them only where the design has several looks or
+            says how many they are.
+        design: how many of the second's count, whether they are paired or not.
+
+    Raises:
+        ValueError: if the seeds do not fit.
+    """
+    if design.looks == 1 and design.dense_episodes is None:
+        return pair_episodes(name, episodes, other, others)
+    seeds = {episode.seed for episode in episodes}
+    paired = [episode for episode in others if episode.seed in seeds]
+    more = [episode for episode in others[: design.dense_episodes or 0] if episode.seed not in seeds]
+    return pair_episodes(name, episodes, other, paired, more)
+
+
+def _times(episodes: Sequence[EpisodeResult], horizon: int) -> NDArray[np.float64]:
+    solved, lengths = [e.success for e in episodes], [e.length for e in episodes]
+    return restricted_times(solved, lengths, horizon)
+
+
+def _scores(episodes: Sequence[EpisodeResult]) -> NDArray[np.float64]:
+    return np.array([episode.score for episode in episodes], dtype=np.float64)
 
 
 def _by_seed(episodes: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
 from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level
+from torchrl_sparse.evaluation.statistics.overlap import Means, checked_pairs
 
 __all__ = [
     "DEFAULT_TIME_MARGIN",
@@ -88,6 +89,7 @@ def time_ratio(
     horizon: int,
     margin: float = DEFAULT_TIME_MARGIN,
     confidence: float = 0.95,
+    more: ArrayLike = (),
 ) -> TimeRatio:
     """Compare the restricted mean times of two methods on the same seeds.
 
@@ -97,6 +99,7 @@ def time_ratio(
         horizon: the largest that a time can be.
         margin: of the verdict, a share of the other's time.
         confidence: two-sided level, strictly between 0 and 1.
+        more: times of the other on further seeds; see `torchrl_sparse.evaluation.statistics.overlap`.
 
     Raises:
         ValueError: if the lengths differ or are zero, or a number is out of range.
@@ -106,15 +109,12 @@ def time_ratio(
     (1.0, 'non-inferior', [0.91, 1.09])
     """
     check_level(confidence)
-    method, other = _pairs(method, other)
-    n, z2 = len(method), float(norm.ppf((1 + confidence) / 2)) ** 2
-    y, x = method.sum(), other.sum()
-    yy, xx, xy = _spread(method, method), _spread(other, other), _spread(method, other)
-    ci = _fieller(
-        x * x - z2 * xx, x * y - z2 * xy, y * y - z2 * (yy + z2 * _one_seed(method, other, horizon) ** 2)
-    )
+    means, z2 = Means.of(method, other, more), float(norm.ppf((1 + confidence) / 2)) ** 2
+    y, x, shared = means.method, means.other, z2 * means.other_variance
+    own = means.own_variance + z2 * _one_seed(method, other, horizon) ** 2
+    ci = _fieller(x * x - shared, x * y - means.slope * shared, y * y - z2 * own - means.slope**2 * shared)
     low, high = (min(max(limit, 1 / horizon), float(horizon)) for limit in ci)
-    return TimeRatio(float(y / x), (low, high), margin, time_verdict((low, high), margin), n)
+    return TimeRatio(y / x, (low, high), margin, time_verdict((low, high), margin), means.n)
 
 
 def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
@@ -125,13 +125,13 @@ def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
     return (b - root) / a, (b + root) / a
 
 
-def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> float:
+def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float, more: ArrayLike = ()) -> float:
     """Return how many standard errors the method is faster than ``ratio`` times the other; negative where it is slower.
 
     The two-sided interval of `time_ratio` excludes ``ratio`` where this is beyond its normal quantile.
 
     Args:
-        method, other, horizon: see `time_ratio`.
+        method, other, horizon, more: see `time_ratio`.
         ratio: the hypothesis, 1 + margin for non-inferiority.
 
     Raises:
@@ -140,34 +140,20 @@ def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> f
     >>> round(time_z([30.0] * 500, [30.0] * 500, 400, 1.1), 2)
     2.01
     """
-    method, other = _pairs(method, other)
-    gain = float((ratio * other - method).sum())
-    spread = _spread(method - ratio * other, method - ratio * other)
+    means = Means.of(method, other, more)
+    gain, spread = ratio * means.other - means.method, means.variance(ratio)
     floor = _one_seed(method, other, horizon) ** 2
     # The variance holds z² itself: floor * z⁴ + spread * z² = gain².
     z2 = (math.sqrt(spread * spread + 4 * floor * gain * gain) - spread) / (2 * floor)
     return math.copysign(math.sqrt(z2), gain)
 
 
-def _one_seed(method: NDArray, other: NDArray, horizon: int) -> float:
-    """Return the steps that a seed costs which one method solves in the mean time and the other not at all."""
+def _one_seed(method: ArrayLike, other: ArrayLike, horizon: int) -> float:
+    """Return what a seed costs the mean time that one method solves in the mean time and the other not at all, steps."""
+    method, other = checked_pairs(method, other)
     solved = np.concatenate([method[method < horizon], other[other < horizon]])
-    return horizon - float(solved.mean()) if len(solved) else float(horizon)
-
-
-def _spread(a: NDArray, b: NDArray) -> float:
-    """Return n times the covariance, of one pair none."""
-    n = len(a)
-    return float(((a - a.mean()) * (b - b.mean())).sum()) * n / (n - 1) if n > 1 else 0.0
-
-
-def _pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
-    method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
-    if method.shape != other.shape or method.ndim != 1 or not len(method):
-        raise ValueError(
-            f"pairs need as many episodes of both, and at least one, got {method.size} and {other.size}"
-        )
-    return method, other
+    lost = horizon - float(solved.mean()) if len(solved) else float(horizon)
+    return lost / len(method)
 
 
 def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -> Verdict:
@@ -215,7 +201,7 @@ def correlation(method: ArrayLike, other: ArrayLike) -> float | None:
     >>> correlation([1, 2, 3], [2, 4, 6]), correlation([1, 2, 3], [5, 5, 5])
     (1.0, None)
     """
-    method, other = _pairs(method, other)
+    method, other = checked_pairs(method, other)
     if method.std() == 0 or other.std() == 0:
         return None
     return float(np.clip(np.corrcoef(method, other)[0, 1], -1, 1))

@@ -17,11 +17,14 @@ from typing import Literal
 from scipy.optimize import brentq
 from scipy.stats import binomtest, norm
 
+from torchrl_sparse.evaluation.statistics.overlap import Further, checked_pairs
+
 __all__ = [
     "DEFAULT_MARGIN",
     "PairedDifference",
     "Verdict",
     "check_level",
+    "discordant_pairs",
     "episodes_needed",
     "paired_difference",
     "tango_interval",
@@ -32,6 +35,7 @@ __all__ = [
 
 Verdict = Literal["non-inferior", "inferior", "undecided"]
 DEFAULT_MARGIN = 0.05
+_PAIRS_ALONE = Further()
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,8 @@ class PairedDifference:
     """Success of a method minus success of the one that it is compared with, on the same seeds.
 
     Attributes:
-        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse.
+        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse. Of the pairs, or as further
+            episodes correct it.
         ci: two-sided confidence interval of ``diff``.
         margin: the non-inferiority margin of ``verdict``, a positive difference of rates.
         verdict: see :func:`verdict`.
@@ -78,7 +83,9 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
-def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+def tango_interval(
+    won: int, lost: int, n: int, confidence: float = 0.95, further: Further = _PAIRS_ALONE
+) -> tuple[float, float]:
     """Return Tango's score interval of ``(won - lost) / n``, the difference of two paired proportions.
 
     Args:
@@ -86,6 +93,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
         lost: pairs in which only the second member succeeds.
         n: all pairs, concordant ones included, at least 1.
         confidence: two-sided level, strictly between 0 and 1.
+        further: what episodes of the second member alone say beside the pairs.
 
     Raises:
         ValueError: if the counts or the level are out of range.
@@ -101,44 +109,45 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
     z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
     # Where the estimated variance is zero, the equation below also holds at the estimate itself, which is
     # no limit of the interval; its other roots have closed forms there.
-    if won + lost == 0:
-        return -z2 / (n + z2), z2 / (n + z2)
-    if won == n:
-        return (n - z2) / (n + z2), 1.0
-    if lost == n:
-        return -1.0, (z2 - n) / (n + z2)
+    if further == _PAIRS_ALONE:
+        if won + lost == 0:
+            return -z2 / (n + z2), z2 / (n + z2)
+        if won == n:
+            return (n - z2) / (n + z2), 1.0
+        if lost == n:
+            return -1.0, (z2 - n) / (n + z2)
+    diff = min(max((won - lost) / n + further.shift, -1.0), 1.0)
 
     def excess(delta: float) -> float:
         """Return the squared score statistic minus z², times its variance: negative inside the interval."""
-        variance = 2 * _constrained_loss_rate(won, lost, n, delta) + delta * (1 - delta)
-        return (won - lost - n * delta) ** 2 - z2 * n * variance
+        return n * (diff - delta) ** 2 - z2 * further.left(_pair_variance(won, lost, n, delta))
 
-    diff = (won - lost) / n
     return float(brentq(excess, -1.0, diff, xtol=1e-12)), float(brentq(excess, diff, 1.0, xtol=1e-12))
 
 
-def tango_z(won: int, lost: int, n: int, delta: float) -> float:
+def tango_z(won: int, lost: int, n: int, delta: float, further: Further = _PAIRS_ALONE) -> float:
     """Return Tango's score statistic: by how many standard errors the difference lies above ``delta``.
 
     `tango_interval` excludes ``delta`` where this is beyond its normal quantile.
 
     Args:
-        won, lost, n: see `tango_interval`.
+        won, lost, n, further: see `tango_interval`.
         delta: the hypothesis, strictly between -1 and 1 and not 0; minus the margin for non-inferiority.
 
     >>> round(tango_z(1, 7, 21, -0.026), 2), round(tango_z(0, 0, 73, -0.05), 2)
     (-1.96, 1.96)
     """
-    variance = 2 * _constrained_loss_rate(won, lost, n, delta) + delta * (1 - delta)
-    return (won - lost - n * delta) / math.sqrt(n * variance)
+    diff, variance = (won - lost) / n + further.shift, further.left(_pair_variance(won, lost, n, delta))
+    return (diff - delta) / math.sqrt(variance / n)
 
 
-def _constrained_loss_rate(won: int, lost: int, n: int, delta: float) -> float:
-    """Return the maximum-likelihood probability of a lost pair under a true difference ``delta`` (Tango 1998)."""
+def _pair_variance(won: int, lost: int, n: int, delta: float) -> float:
+    """Return the variance of a pair's difference where ``delta`` is the true one, whose likeliest loss rate is Tango's."""
     a = 2 * n
     b = -won - lost + (2 * n - won + lost) * delta
     c = -lost * delta * (1 - delta)
-    return (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
+    loss_rate = (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
+    return 2 * loss_rate + delta * (1 - delta)
 
 
 def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
@@ -163,8 +172,15 @@ def paired_difference(
     other: Sequence[bool],
     margin: float = DEFAULT_MARGIN,
     confidence: float = 0.95,
+    more: Sequence[bool] = (),
 ) -> PairedDifference:
     """Compare two methods on the same seeds; entry *i* of both sequences belongs to the same seed.
+
+    Args:
+        method, other: whether each solved an episode.
+        margin: of the verdict.
+        confidence: two-sided level, strictly between 0 and 1.
+        more: the other's on further seeds; see `torchrl_sparse.evaluation.statistics.overlap`.
 
     Raises:
         ValueError: if the lengths differ or are zero.
@@ -173,14 +189,23 @@ def paired_difference(
     >>> result.diff, result.lost, result.verdict
     (-0.25, 1, 'undecided')
     """
-    if len(method) != len(other) or not len(method):
-        raise ValueError(
-            f"pairs need as many episodes of both, and at least one, got {len(method)} and {len(other)}"
-        )
-    pairs = [(bool(ours), bool(theirs)) for ours, theirs in zip(method, other, strict=True)]
-    won, lost, n = pairs.count((True, False)), pairs.count((False, True)), len(pairs)
-    ci = tango_interval(won, lost, n, confidence)
-    return PairedDifference((won - lost) / n, ci, margin, verdict(ci, margin), won, lost, n)
+    won, lost, n = discordant_pairs(method, other)
+    further = Further.of(method, other, more)
+    ci = tango_interval(won, lost, n, confidence, further)
+    return PairedDifference((won - lost) / n + further.shift, ci, margin, verdict(ci, margin), won, lost, n)
+
+
+def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int, int, int]:
+    """Return the pairs that only the method solved, that only the other solved, and all.
+
+    Raises:
+        ValueError: if the lengths differ or are zero.
+
+    >>> discordant_pairs([True, False, True], [True, True, False])
+    (1, 1, 3)
+    """
+    ours, theirs = checked_pairs(method, other)
+    return int((ours > theirs).sum()), int((theirs > ours).sum()), len(ours)
 
 
 def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) -> int:

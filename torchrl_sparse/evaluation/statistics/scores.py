@@ -1,4 +1,4 @@
-"""Means of scores, and of their paired differences, with Student's intervals: for tasks that succeed by degrees."""
+"""Means of scores, and of their differences, with Student's intervals: for tasks that succeed by degrees."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import norm, t
 
-__all__ = ["mean_interval", "mean_z"]
+from torchrl_sparse.evaluation.statistics.overlap import Means
+
+__all__ = ["difference_interval", "difference_z", "mean_interval"]
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
     """Return the mean of ``values``, at least two, and Student's interval of it.
-
-    Of the differences of paired episodes it is the interval of the paired t-test.
 
     Raises:
         ValueError: if there are fewer than two values, or they are no list of numbers.
@@ -26,23 +26,51 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
     values = np.asarray(values, np.float64)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"values: expected at least two numbers, got shape {values.shape}")
-    half = float(t.ppf((1 + confidence) / 2, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5)
+    half = _half_width(float(values.var(ddof=1)) / len(values), len(values), confidence)
     mean = float(values.mean())
     return mean, (mean - half, mean + half)
 
 
-def mean_z(values: ArrayLike, bound: float) -> float:
-    """Return by how many standard errors the mean of ``values`` lies above ``bound``; 0 of fewer than two, which say nothing.
+def difference_interval(
+    method: ArrayLike, other: ArrayLike, more: ArrayLike = (), confidence: float = 0.95
+) -> tuple[float, tuple[float, float]]:
+    """Return the mean score of a method minus that of another, and its interval: that of the paired t-test without ``more``.
 
-    Student's statistic as the normal one that is as unlikely, so that `mean_interval` excludes ``bound`` where this is beyond
-    the normal quantile.
+    Args:
+        method, other: scores on the same seeds, [n], n at least 2.
+        more: of the other on further seeds, see `torchrl_sparse.evaluation.statistics.overlap`.
+        confidence: two-sided level.
 
-    >>> round(mean_z([0.5, 0.7, 0.9], 0.5), 3), mean_z([0.5, 0.5], 0.6)
+    Raises:
+        ValueError: if they are no pairs, or there are fewer than two.
+
+    >>> difference, (low, high) = difference_interval([0.5, 0.7, 0.9], [0.0, 0.0, 0.0])
+    >>> round(difference, 3), round(low, 3), round(high, 3)
+    (0.7, 0.203, 1.197)
+    """
+    means = Means.of(method, other, more)
+    if means.n < 2:
+        raise ValueError(f"pairs: expected at least two, got {means.n}")
+    half, difference = _half_width(means.variance(1), means.n, confidence), means.method - means.other
+    return difference, (difference - half, difference + half)
+
+
+def _half_width(variance: float, n: int, confidence: float) -> float:
+    return float(t.ppf((1 + confidence) / 2, n - 1)) * math.sqrt(variance)
+
+
+def difference_z(method: ArrayLike, other: ArrayLike, bound: float, more: ArrayLike = ()) -> float:
+    """Return by how many standard errors the difference of scores lies above ``bound``; 0 of a single pair, which says nothing.
+
+    Student's statistic as the normal one that is as unlikely, so that `difference_interval` excludes ``bound`` where this is
+    beyond the normal quantile.
+
+    >>> round(difference_z([0.5, 0.7, 0.9], [0, 0, 0], 0.5), 3), difference_z([0.5, 0.5], [0, 0], 0.6)
     (1.212, -inf)
     """
-    values = np.asarray(values, np.float64)
-    if len(values) < 2:
+    means = Means.of(method, other, more)
+    if means.n < 2:
         return 0.0
-    above, error = float(values.mean()) - bound, float(values.std(ddof=1)) / len(values) ** 0.5
-    tail = t.sf(abs(above) / error, len(values) - 1) if error > 0 else 0.0
+    above, error = means.method - means.other - bound, math.sqrt(means.variance(1))
+    tail = t.sf(abs(above) / error, means.n - 1) if error > 0 else 0.0
     return math.copysign(float(norm.isf(tail)), above)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN, time_z
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, tango_z
+from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, discordant_pairs, tango_z
+from torchrl_sparse.evaluation.statistics.overlap import Further
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["Population", "Savings", "claim_rates", "savings"]
@@ -119,14 +120,15 @@ def _trials(
     """Yield, of each benchmark, the number of episodes and both statistics at each look."""
     generator = np.random.default_rng(seed)
     for _ in range(trials):
-        method, dense = population.draw(design.max_episodes, generator)
-        yield ((n, _statistics(method[:n], dense[:n], population.horizon)) for n in design.ends)
+        method, dense = population.draw(design.num_seeds, generator)
+        known = dense[: design.dense_episodes or 0]
+        yield ((n, _statistics(method[:n], dense[:n], known[n:], population.horizon)) for n in design.ends)
 
 
-def _statistics(method: NDArray, dense: NDArray, horizon: int) -> tuple[float, float]:
+def _statistics(method: NDArray, dense: NDArray, more: NDArray, horizon: int) -> tuple[float, float]:
     ours, theirs = method < horizon, dense < horizon
-    won, lost = int((ours & ~theirs).sum()), int((theirs & ~ours).sum())
+    further = Further.of(ours, theirs, more < horizon)
     return (
-        tango_z(won, lost, len(method), -DEFAULT_MARGIN),
-        time_z(method, dense, horizon, 1 + DEFAULT_TIME_MARGIN),
+        tango_z(*discordant_pairs(ours, theirs), -DEFAULT_MARGIN, further),
+        time_z(method, dense, horizon, 1 + DEFAULT_TIME_MARGIN, more),
     )
