@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 
-__all__ = ["answer", "record_queries"]
+__all__ = ["answer", "in_turn", "record_queries"]
 
 
 def record_queries(
@@ -48,5 +48,33 @@ def _queries(steps: TensorDictBase) -> TensorDictBase:
 
 @torch.no_grad()
 def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictBase:
-    """Ask ``policy`` recorded queries: the same observations and noise, whatever was answered; ``queries`` stay as they are."""
-    return policy(queries.select(*policy.in_keys, strict=False))
+    """Ask ``policy`` recorded queries: the same observations and noise, whatever was answered; ``queries`` stay as they are.
+
+    All [N] at once, or in turn if it has to remember what it was asked before, see `in_turn`; a single one [] as the first.
+    """
+    if not queries.ndim or not _unrecorded(policy, queries):
+        return policy(queries.select(*policy.in_keys, strict=False))
+    return torch.stack([policy(query) for query in in_turn(policy, queries.unbind(0))])
+
+
+def in_turn(policy: TensorDictModuleBase, queries: Iterable[TensorDictBase]) -> Iterator[TensorDictBase]:
+    """Yield what ``policy`` reads of one recorded query after the other, in TensorDicts of their own.
+
+    What it leaves to its own next query, such as features to recall, was not recorded of another policy. It is taken from the
+    TensorDict that was yielded before, which the policy has to have answered in place by then.
+    """
+    before, left = None, []
+    for query in queries:
+        asked = query.select(*policy.in_keys, strict=False)
+        if before is None:
+            left = _unrecorded(policy, query)
+        elif left:
+            asked.update(before.select(*left, strict=False))
+        yield asked
+        before = asked
+
+
+def _unrecorded(policy: TensorDictModuleBase, queries: TensorDictBase) -> list[NestedKey]:
+    """Return the keys that ``policy`` leaves to itself and that the queries do not hold."""
+    held = set(queries.keys(True, True))
+    return [key for key in policy.in_keys if key in policy.out_keys and unravel_key(key) not in held]

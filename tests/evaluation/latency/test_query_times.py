@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, TransformerForDiffusion, keys
 from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 
 QUERIES = TensorDict({"history": {"state": torch.arange(3.0).view(3, 1, 1).expand(3, 2, 5).clone()}}, [3])
@@ -55,3 +56,17 @@ def test_the_planner_is_timed_within_its_queries(policy):
     assert latency.n == 3
     assert latency.p50 >= 0.02
     assert keys.PRUNE_MASK not in QUERIES.keys(include_nested=True)
+
+
+def test_queries_that_recall_are_timed_with_what_they_recall(policy):
+    class Noting(Recall):
+        numbers = []
+
+        def masks(self, cond, query):
+            self.numbers.append(query.item())
+            return super().masks(cond, query)
+
+    policy.plan = Noting(2)
+    queries = QUERIES.clone().set(keys.ELAPSED, torch.tensor([[0], [8], [8]]))
+    time_queries({"recalling": policy}, queries, repeats=3, threads=1)
+    assert policy.plan.numbers == [0, 1, 2, 0, 1, 2]  # three to warm up

@@ -125,7 +125,8 @@ def draw_methods(
     plot_pareto(results, out / "pareto.png")
     plot_success_within(results, out / "success_within.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
-    masks = {name: answer(method, queries[:1])[keys.PRUNE_MASK][0] for name, method in methods.items()}
+    # The first query of an episode has nothing to recall.
+    masks = {name: answer(method, queries[:2])[keys.PRUNE_MASK][-1] for name, method in methods.items()}
     for name, mask in masks.items():
         ratio = results.methods[name].flops.ratio_to_dense
         plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)

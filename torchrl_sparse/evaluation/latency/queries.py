@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from itertools import cycle
 
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_sparse.control.queries import answer
+from torchrl_sparse.control.queries import answer, in_turn
 from torchrl_sparse.evaluation.latency.measure import Latency, measure_latency, summarize_latency
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.clock import synchronised_clock
@@ -28,12 +28,13 @@ def time_queries(
 ) -> dict[str, Latency]:
     """Time recorded queries [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
 
-    Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods in
-    ``samples`` are asked it so many times at once.
+    Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods that
+    recall have what they left themselves in the one before. Those in ``samples`` are asked it so many times at once.
     """
     samples = samples or {}
     inputs = {
-        name: _asked(method, _copied(queries, samples.get(name, 1))) for name, method in methods.items()
+        name: in_turn(method, cycle(_copied(queries, samples.get(name, 1)).unbind(0)))
+        for name, method in methods.items()
     }
     device = next(iter(methods.values())).device
     return measure_latency(
@@ -61,11 +62,6 @@ def time_planning(
 def _copied(queries: TensorDictBase, samples: int) -> TensorDictBase:
     """Return queries [N, samples], or [N] as they are for one."""
     return queries if samples == 1 else queries[:, None].expand(len(queries), samples).contiguous()
-
-
-def _asked(policy: DiffusionPolicy, queries: TensorDictBase) -> Iterator[TensorDictBase]:
-    """Yield what ``policy`` reads of one query after the other, again and again, each in a TensorDict of its own."""
-    return (query.select(*policy.in_keys, strict=False) for query in cycle(queries.unbind(0)))
 
 
 def _planning_seconds(policy: DiffusionPolicy, query: TensorDictBase) -> float:
