@@ -119,7 +119,8 @@ def plot_spending(results: Sequence[AnyResults], path: str | os.PathLike) -> Pat
 
 def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -> Path:
     tasks = _by_task(results)
-    figure, grid = make_figure(1.5 + 2.9 * len(tasks), 7.2, rows=2, columns=len(tasks), sharex=True)
+    width = max(1.5 + 2.9 * len(tasks), 7.3)  # of the legend too
+    figure, grid = make_figure(width, 7.2, rows=2, columns=len(tasks), sharex=True)
     handles: dict[str, Line2D] = {}
     for (title, found), upper, lower in zip(tasks.items(), *grid, strict=True):
         methods = _of_first(found)
@@ -135,7 +136,12 @@ def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -
     grid[0][0].set_ylabel("success or score,\npoints over dense's")
     grid[1][0].set_ylabel("time to success over dense's,\nlog scale, less is further up")
     figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=2 if len(tasks) <= 2 else 4,
+        frameon=False,
+        fontsize=9,
     )
     return save_figure(figure, path)
 
