@@ -189,7 +189,7 @@ def test_pruners(example, tmp_path, options):
 def test_half_precision_and_other_sizes(example, tmp_path, weights, sizes):
     policy = make_policy(**sizes)
     engine = NativeEngine(policy.network, policy.sampler, weights=weights)
-    policy.module["denoise"].engine.get = lambda *_: engine
+    policy.module["denoise"].engine.get = lambda *_, **__: engine
     check_equal(example, policy, tmp_path / "policy.tsp", weights=weights)
 
 
