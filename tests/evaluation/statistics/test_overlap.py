@@ -81,6 +81,13 @@ def test_without_further_episodes_it_is_the_pairs():
     assert Further.of(ours < HORIZON, dense < HORIZON) == Further()
 
 
+def test_pairs_in_which_dense_never_differs_tell_no_slope():
+    ours = np.random.default_rng(0).random(7)
+    means = Means.of(ours, np.full(7, 0.1), np.linspace(0, 1, 50))
+    assert (means.slope, means.method) == (0.0, pytest.approx(ours.mean()))
+    assert means.variance(1) < ours.var(ddof=1) / 7 * 1.3 + 0.1 / 57
+
+
 def test_a_method_that_follows_dense_gains_nothing():
     dense = np.random.default_rng(0).normal(3, 1, 500)
     means = Means.of(dense[:50] - 0.2, dense[:50], dense[50:])

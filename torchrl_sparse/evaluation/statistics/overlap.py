@@ -60,17 +60,24 @@ class Means:
             ValueError: if the lengths of the pairs differ or are zero.
         """
         method, other = checked_pairs(method, other)
-        everything = np.concatenate([other, np.asarray(more, dtype=np.float64)])
-        explained, mean = _covariance(other, other), float(everything.mean())
-        slope = _covariance(method, other) / explained if explained else 0.0
+        ours, theirs, degrees = float(method.mean()), float(other.mean()), max(len(method) - 1, 1)
+        varies = other.min() < other.max()  # else what is left of it would be rounding
+        method, other = method - ours, other - theirs
+        explained = float(other @ other) / degrees if varies else 0.0
+        slope = float(method @ other) / degrees / explained if explained else 0.0
+        more = np.asarray(more, dtype=np.float64)
+        mean, spread = theirs, explained
+        if len(more):
+            everything = np.concatenate([other + theirs, more])
+            mean, spread = float(everything.mean()), float(everything.var(ddof=1))
         return cls(
-            method=float(method.mean()) + slope * (mean - float(other.mean())),
+            method=ours + slope * (mean - theirs),
             other=mean,
             slope=slope,
-            residual=max(_covariance(method, method) - slope**2 * explained, 0.0),
-            spread=_covariance(everything, everything),
+            residual=max(float(method @ method) / degrees - slope**2 * explained, 0.0),
+            spread=spread,
             n=len(method),
-            total=len(everything),
+            total=len(method) + len(more),
         )
 
     @property
@@ -135,11 +142,6 @@ class Further:
     def left(self, variance: float) -> float:
         """Return what is left of the variance of a pair."""
         return variance - min(self.known, self.share * variance)
-
-
-def _covariance(a: NDArray, b: NDArray) -> float:
-    """Return the covariance of two samples, of one pair none."""
-    return float(((a - a.mean()) * (b - b.mean())).sum()) / (len(a) - 1) if len(a) > 1 else 0.0
 
 
 def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
