@@ -62,19 +62,19 @@ class Means:
         method, other = checked_pairs(method, other)
         ours, theirs, degrees = float(method.mean()), float(other.mean()), max(len(method) - 1, 1)
         varies = other.min() < other.max()  # else what is left of it would be rounding
-        method, other = method - ours, other - theirs
-        explained = float(other @ other) / degrees if varies else 0.0
-        slope = float(method @ other) / degrees / explained if explained else 0.0
+        a, b = method - ours, other - theirs
+        explained = float(b @ b) / degrees if varies else 0.0
+        slope = float(a @ b) / degrees / explained if explained else 0.0
         more = np.asarray(more, dtype=np.float64)
         mean, spread = theirs, explained
         if len(more):
-            everything = np.concatenate([other + theirs, more])
+            everything = np.concatenate([other, more])
             mean, spread = float(everything.mean()), float(everything.var(ddof=1))
         return cls(
             method=ours + slope * (mean - theirs),
             other=mean,
             slope=slope,
-            residual=max(float(method @ method) / degrees - slope**2 * explained, 0.0),
+            residual=max(float(a @ a) / degrees - slope**2 * explained, 0.0),
             spread=spread,
             n=len(method),
             total=len(method) + len(more),
