@@ -197,6 +197,7 @@ def test_episodes_of_dense_beyond_the_pairs_count_where_the_design_says_so(looks
     assert (entry.success.n, results.dense.success.n, results.dense_episodes) == (20, 40, 40)
     assert entry.paired_vs_dense.ci95 == tango_interval(0, 5, 20, design.confidence(20), further)
     assert "the first 40 of dense count in every comparison" in format_table(results)
+    assert "20 episodes cannot show non-inferiority" in format_table(results)  # not the 40 of dense
     assert load_results(save_results(results, tmp_path / "results.json")) == results
 
 

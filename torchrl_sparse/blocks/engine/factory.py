@@ -60,10 +60,14 @@ def check_engine(name: str, recalls: bool = False) -> None:
     The PyTorch engine does not: its programs add a run of pruned blocks as one sum of outputs of this query, and what a row
     recalls is in no such sum.
     """
-    names = ["auto", *(known for known, entry in ENGINES.items() if entry.recalls or not recalls)]
+    names = ["auto", *_able(recalls)]
     if name not in names:
         whose = " with a planner that recalls" if recalls else ""
         raise ValueError(f"engine: expected one of {names}{whose}, got {name!r}")
+
+
+def _able(recalls: bool) -> list[str]:
+    return [name for name, entry in ENGINES.items() if entry.recalls or not recalls]
 
 
 def make_engine(
@@ -89,8 +93,7 @@ def make_engine(
     """
     check_engine(name, recalls)
     if name == "auto":
-        able = ((name, entry) for name, entry in ENGINES.items() if entry.recalls or not recalls)
-        name = next(name for name, entry in able if entry.applies(network)[0])
+        name = next(name for name in _able(recalls) if ENGINES[name].applies(network)[0])
     applies, reason = ENGINES[name].applies(network)
     if not applies:
         raise ValueError(f"{name} engine: {reason}")

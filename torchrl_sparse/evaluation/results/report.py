@@ -201,7 +201,7 @@ def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Diffe
 def results_note(results: AnyResults) -> str:
     """Return the lines that explain the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
-    n, margin = dense.success.n, dense.paired_vs_dense.margin
+    n, margin = _num_pairs(results), dense.paired_vs_dense.margin
     compared, scored = "difference to dense with Tango's", results.by_degrees
     if scored:
         compared = "score, the highest reward of an episode, and its difference to dense with Student's; verdicts are on it"
@@ -238,16 +238,21 @@ def results_note(results: AnyResults) -> str:
     return "\n".join(lines)
 
 
+def _num_pairs(results: AnyResults) -> int:
+    """Return the episodes of the method that has the most; dense may have more."""
+    counts = [method.success.n for name, method in results.methods.items() if name != DENSE]
+    return max(counts, default=results.dense.success.n)
+
+
 def _episodes_text(results: AnyResults) -> str:
-    n = results.dense.success.n
+    n = _num_pairs(results)
     if not isinstance(results, Results):
         return f"{n} paired episodes a method (seed {results.seed})"
     seeds, known, more = f"{results.split} seeds from {results.first_seed}", results.dense_episodes, ""
     if known is not None:
         more = f"; the first {known} of dense count in every comparison, paired or not"
     if (stopping := results.until_decided) is None:
-        paired = min(method.success.n for method in results.methods.values())
-        return f"{paired} paired episodes a method ({seeds}){more}"
+        return f"{n} paired episodes a method ({seeds}){more}"
     return (
         f"paired episodes ({seeds}) until a method's verdicts are reached, looked at {stopping.looks} times up to "
         f"{stopping.max_episodes}; intervals of differences are as much wider as that takes{more}"
