@@ -1,4 +1,4 @@
-"""A diffusion policy as ``config.json``, ``model.safetensors`` and its planner, if any. None can hold anything that executes.
+"""A diffusion policy as ``config.json``, ``model.safetensors`` and what else it has. None can hold anything that executes.
 
 ::
 
@@ -11,7 +11,8 @@
      "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
 
-Network weights are fp16 unless full precision is asked for, normalisation constants fp32.
+Weights of the cameras' encoder are in ``vision.safetensors``, where there are cameras. Weights are fp16 unless full precision
+is asked for, normalisation constants fp32.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ FORMAT = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
 PlanName = Literal["plan.json", "plan"]  # of fixed names alone: a file cannot ask for one elsewhere
 RoundedEngine = Literal["native_bf16", "native_int8"]  # what is no choice of speed alone
-_NETWORK, _NORMALIZER, _VISION = "network.", "normalizer.", "vision."
+_NETWORK, _NORMALIZER = "network.", "normalizer."
 
 
 @dataclass(frozen=True)
@@ -82,18 +83,21 @@ class StoredPolicy:
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
-    """Write both files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
+    """Write the files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
     vision = None if policy.vision is None else policy.vision.config
     network, schedule = policy.network.config, policy.sampler.config
     kept = policy.plan, policy.warm_start, policy.engine
     config = _Config(FORMAT, network, schedule, vision, policy.source or None, *kept)
-    weights = {_NETWORK + name: value for name, value in policy.network.state_dict().items()}
-    if policy.vision is not None:
-        weights |= {_VISION + name: value for name, value in policy.vision.state_dict().items()}
-    tensors = {name: value.half() if half else value for name, value in weights.items()}
+    tensors = {_NETWORK + name: value for name, value in _weights(policy.network, half).items()}
     tensors |= {_NORMALIZER + name: value for name, value in policy.normalizer.state_dict().items()}
     write_tensors(path / "model.safetensors", tensors)
+    if policy.vision is not None:
+        write_tensors(path / "vision.safetensors", _weights(policy.vision, half))
     write_json(path / "config.json", config)
+
+
+def _weights(module: nn.Module, half: bool) -> dict[str, Tensor]:
+    return {name: value.half() if half else value for name, value in module.state_dict().items()}
 
 
 def read_pretrained(path: Path) -> StoredPolicy:
@@ -108,16 +112,22 @@ def read_pretrained(path: Path) -> StoredPolicy:
     sampler = _make(path / "config.json", "schedule", Sampler, config.schedule)
     _check_warm_start(path / "config.json", config.warm_start, sampler)
     with torch.device("meta"):  # the configuration is compared with the weights before memory is taken for it
-        expected = _state(_modules(path / "config.json", config))
+        network, vision = _networks(path / "config.json", config)
+        expected = _state(network, vision)
     tensors = read_tensors(path / "model.safetensors", expected)
-    modules = _modules(path / "config.json", config)
-    for prefix, module in modules.items():
-        module.load_state_dict({name: value.float() for name, value in take(tensors, prefix).items()})
-        module.eval()
+    seen = None if vision is None else read_tensors(path / "vision.safetensors", vision.state_dict())
+    network, vision = _networks(path / "config.json", config)
+    _load(network, take(tensors, _NETWORK))
+    if vision is not None:
+        _load(vision, seen)
     normalizer = _make(path / "model.safetensors", "normalizer", Normalizer, take(tensors, _NORMALIZER))
-    vision, source = modules.get(_VISION), config.source or {}
     kept = config.plan, config.warm_start, config.engine
-    return StoredPolicy(modules[_NETWORK], normalizer, sampler, vision, source, *kept)
+    return StoredPolicy(network, normalizer, sampler, vision, config.source or {}, *kept)
+
+
+def _load(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    module.load_state_dict({name: value.float() for name, value in weights.items()})
+    module.eval()
 
 
 def _check_warm_start(file: Path, steps: int | None, sampler: Sampler) -> None:
@@ -126,17 +136,15 @@ def _check_warm_start(file: Path, steps: int | None, sampler: Sampler) -> None:
         raise ValueError(f"{file}: warm_start: expected 1 to {most} of the schedule's steps, got {steps}")
 
 
-def _modules(file: Path, config: _Config) -> dict[str, nn.Module]:
-    """Make the untrained networks that a configuration describes, by the prefix of their weights."""
-    modules = {_NETWORK: _make(file, "network", TransformerForDiffusion, config.network)}
-    if config.vision is not None:
-        modules[_VISION] = _make(file, "vision", VisionEncoder, config.vision)
-    return modules
+def _networks(file: Path, config: _Config) -> tuple[TransformerForDiffusion, VisionEncoder | None]:
+    """Make the untrained networks that a configuration describes."""
+    network = _make(file, "network", TransformerForDiffusion, config.network)
+    vision = None if config.vision is None else _make(file, "vision", VisionEncoder, config.vision)
+    return network, vision
 
 
-def _state(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
-    """Return all tensors that a file must hold for ``modules``; only their shapes count."""
-    network, vision = modules[_NETWORK], modules.get(_VISION)
+def _state(network: TransformerForDiffusion, vision: VisionEncoder | None) -> dict[str, Tensor]:
+    """Return all tensors that ``model.safetensors`` must hold; only their shapes count."""
     state_dim = network.cond_dim - (0 if vision is None else vision.feature_dim)
     sizes = {"state": max(state_dim, 0), "action": network.input_dim}
     tensors = {
@@ -144,9 +152,7 @@ def _state(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
         for name, size in sizes.items()
         for part in ("scale", "offset")
     }
-    for prefix, module in modules.items():
-        tensors |= {prefix + name: value for name, value in module.state_dict().items()}
-    return tensors
+    return tensors | {_NETWORK + name: value for name, value in network.state_dict().items()}
 
 
 def _make(file: Path, field: str, kind: Callable[..., T], arguments: dict[str, Any]) -> T:

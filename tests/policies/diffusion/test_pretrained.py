@@ -28,6 +28,23 @@ def test_round_trip_at_half_precision(policy, folder):
     assert torch.equal(again(request(2))[keys.CHUNK], loaded(request(2))[keys.CHUNK])
 
 
+def test_weights_of_the_cameras_have_their_own_file(make_image_policy, tmp_path):
+    policy = make_image_policy()
+    policy.save_pretrained(tmp_path)
+    loaded, file = DiffusionPolicy.from_pretrained(tmp_path), tmp_path / "vision.safetensors"
+    for name, value in load_file(file).items():
+        assert torch.equal(value, policy.vision.state_dict()[name].half())
+        assert torch.equal(loaded.vision.state_dict()[name], value.float())
+    assert loaded.fingerprint == policy.fingerprint
+    wrong = {**load_file(file), "encoders.image.linear.bias": torch.zeros(3)}
+    save_file(wrong, file)
+    with pytest.raises(ValueError, match=r"vision.safetensors: encoders.image.linear.bias: expected shape"):
+        DiffusionPolicy.from_pretrained(tmp_path)
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match="vision.safetensors"):
+        DiffusionPolicy.from_pretrained(tmp_path)
+
+
 def change_tensors(folder, change):
     tensors = load_file(folder / "model.safetensors")
     change(tensors)

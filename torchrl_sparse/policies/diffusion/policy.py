@@ -237,7 +237,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return tensordict.set(keys.LATENCY, latency.fill_(synchronised_clock(device) - start))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
-        """Write ``config.json``, ``model.safetensors``, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
+        """Write ``config.json``, weights, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
 
         An engine that rounds is kept, any other is the reader's choice.
 
