@@ -15,8 +15,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
+from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate import (
     Grid,
@@ -29,6 +28,7 @@ from torchrl_sparse.evaluation.accelerate import (
 from torchrl_sparse.evaluation.results.acceleration import acceleration_note, acceleration_rows
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.pruner.config import PrunerConfig
 
@@ -42,9 +42,7 @@ def main(config: DictConfig) -> None:
     request = Request(task.name, **options, n_action_steps=n_action_steps, repeats=config.latency_repeats)
     grid = Grid(**{name: tuple(values) for name, values in config.candidates.items()})
     pruner = PrunerConfig(**OmegaConf.to_container(config.pruner)) if config.train else None
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    demos = policy_demos(config.demos, task.name, policy)
     make_env = diffusion_env(task.name, policy, config.horizon)
     found, methods = accelerate(
         policy,

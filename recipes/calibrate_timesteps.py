@@ -15,11 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import FoundTimesteps, find_timesteps
@@ -31,9 +30,7 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     task = find_task(config.task)
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    demos = policy_demos(config.demos, task.name, policy)
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     options = {name: config[name] for name in ("eta", "spacings", "strides")}

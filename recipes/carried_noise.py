@@ -14,14 +14,13 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.carried_noise import plot_carried_noise
 from torchrl_sparse.evaluation.results.carried_noise import CarriedNoiseResults, save_carried_noise
 from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
@@ -33,9 +32,7 @@ def main(config: DictConfig) -> None:
     policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
     train_steps = policy.sampler.num_train_timesteps
     samplers = {name: Sampler.from_name(name, num_train_timesteps=train_steps) for name in config.samplers}
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    demos = policy_demos(config.demos, task.name, policy)
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     options = {"draws": config.draws, "seed": config.targets.seed, "n_action_steps": n_action_steps}

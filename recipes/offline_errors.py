@@ -19,8 +19,6 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.figures.offline import plot_offline
@@ -39,6 +37,7 @@ from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors, draw_answers, offline_errors
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
@@ -53,9 +52,7 @@ def main(config: DictConfig) -> None:
     policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
     played = read_tables(config, task.name)
     n_action_steps = executed_steps(task.name, policy.source)
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    demos = policy_demos(config.demos, task.name, policy)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)
     methods = make_methods(
         dict.fromkeys(name for table in played.values() for name in table),

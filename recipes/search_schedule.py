@@ -17,8 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import observed_keys
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate.schedules import (
     Judge,
@@ -32,6 +30,7 @@ from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.diffusion.evolution import Evolution
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.pruner.loss import block_weights
@@ -82,9 +81,7 @@ def main(config: DictConfig) -> None:
 def make_judges(policy: DiffusionPolicy, config: DictConfig) -> tuple[Judge, Judge]:
     """Return one of the demonstrations that are searched with, and one of the last ones, which are not."""
     task = find_task(config.task)
-    demos = read_demos(
-        config.demos, observed_keys(task.name, policy), poses=task.acts_in_poses, task=task.name
-    )
+    demos = policy_demos(config.demos, task.name, policy)
     if len(demos) < 2:
         raise ValueError(f"demos: expected at least 2, of which some are held out, got {len(demos)}")
     split = len(demos) - min(ceil(config.held_out * len(demos)), len(demos) - 1)

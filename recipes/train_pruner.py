@@ -20,13 +20,11 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import observed_keys
-from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
+from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -89,8 +87,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     stale = () if path.with_name(CHECKPOINT).exists() else (ValueError,)
     with suppress(FileNotFoundError, *stale):
         return load_targets(path, made_for).to(policy.device)
-    task, seen = find_task(config.task), observed_keys(config.task, policy)
-    demos = read_demos(config.demos, seen, poses=task.acts_in_poses, task=task.name)
+    demos = policy_demos(config.demos, config.task, policy)
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:

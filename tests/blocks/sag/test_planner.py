@@ -19,9 +19,10 @@ SPEC = PlanSpec(NUM_STEPS, NUM_LAYERS, policy="8d1f", sampler="ddim")
 TIMESTEPS = list(range(90, -1, -10))
 
 
-def make_pruner(rate_range=None, **info):
+def make_pruner(rate_range=None, unseen=0, **info):
     torch.manual_seed(0)
-    network = PrunerNetwork(TIMESTEPS, NUM_BLOCKS, (OBS_STEPS, COND_DIM), rate_input=rate_range is not None)
+    options = {"rate_input": rate_range is not None, "unseen": unseen}
+    network = PrunerNetwork(TIMESTEPS, NUM_BLOCKS, (OBS_STEPS, COND_DIM), **options)
     return SAGPruner(network, PrunerInfo("8d1f", "ddim", 0.7, rate_range, **info))
 
 
@@ -154,14 +155,37 @@ def test_another_policy_or_sampler_is_refused(spec, message):
         make_pruner().bind(spec)
 
 
+@pytest.mark.parametrize("rate_range", [None, (0.5, 0.97)])
+def test_columns_that_are_not_to_be_seen_change_nothing(rate_range):
+    pruner = make_pruner(rate_range, unseen=2)
+    assert pruner.unseen == 2
+    network, cond = pruner.network, observations()
+    other = cond + 9 * torch.randn(cond.shape) * (torch.arange(COND_DIM) < 2)
+    rate = None if rate_range is None else torch.rand(len(cond), 1)
+    with torch.no_grad():
+        compiled = network.prune_logits(cond, rate)
+        torch.testing.assert_close(network.prune_logits(other, rate), compiled, rtol=0, atol=1e-5)
+        keep, prune = network(cond, rate).unbind(-1)
+        torch.testing.assert_close(prune - keep, compiled, rtol=1e-5, atol=1e-5)
+        assert torch.equal(network(other, rate), network(cond, rate))
+    assert (network.prune_logits(cond[:1], rate if rate is None else rate[:1]) != compiled[1:]).any()
+
+
+@pytest.mark.parametrize("unseen", [-1, COND_DIM, True, 1.0])
+def test_columns_that_cannot_be_left_out_are_refused(unseen):
+    with pytest.raises(ValueError, match=f"unseen: expected 0 to {COND_DIM - 1} columns, got {unseen}"):
+        PrunerNetwork(TIMESTEPS, NUM_BLOCKS, (OBS_STEPS, COND_DIM), unseen=unseen)
+
+
 def test_an_observation_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"expected \[B, To, D\] = \[B, 2, 5\], got \[1, 2, 6\]"):
         plan(make_pruner(), torch.zeros(1, 2, 6))
 
 
+@pytest.mark.parametrize("unseen", [0, 2])
 @pytest.mark.parametrize("rate_range", [None, (0.5, 0.97)])
-def test_files_bring_back_the_same_pruner(tmp_path, rate_range):
-    pruner = make_pruner(rate_range, reuse="block", settings={"updates": 3})
+def test_files_bring_back_the_same_pruner(tmp_path, rate_range, unseen):
+    pruner = make_pruner(rate_range, unseen=unseen, reuse="block", settings={"updates": 3})
     pruner.save_pretrained(tmp_path / "sag")
     loaded = SAGPruner.from_pretrained(tmp_path / "sag")
     assert loaded.info == pruner.info

@@ -41,7 +41,7 @@ def test_weights_of_the_cameras_have_their_own_file(make_image_policy, tmp_path)
     with pytest.raises(ValueError, match=r"vision.safetensors: encoders.image.linear.bias: expected shape"):
         DiffusionPolicy.from_pretrained(tmp_path)
     file.unlink()
-    with pytest.raises(FileNotFoundError, match="vision.safetensors"):
+    with pytest.raises(FileNotFoundError, match=r"vision\.safetensors"):
         DiffusionPolicy.from_pretrained(tmp_path)
 
 

@@ -44,6 +44,7 @@ class PrunerNetwork(nn.Module):
         n_layer, n_head: of the transformer encoder over the coordinates.
         rate_input: whether the target prune rate is an input.
         recalls: whether there is a third logit, of recalling an earlier query, see :mod:`torchrl_sparse.blocks.tts`.
+        unseen: leading columns of the observations that are not read, as those of the cameras' features.
 
     Raises:
         ValueError: if a size is no positive number or far too large, or ``width`` no multiple of ``n_head``.
@@ -69,10 +70,11 @@ class PrunerNetwork(nn.Module):
         n_head: int = 4,
         rate_input: bool = False,
         recalls: bool = False,
+        unseen: int = 0,
     ) -> None:
         super().__init__()
         self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input, self.recalls = rate_input, recalls
+        self.rate_input, self.recalls, self.unseen = rate_input, recalls, unseen
         self.config: dict[str, Any] = {
             "timesteps": self.timesteps,
             "num_blocks": num_blocks,
@@ -84,16 +86,16 @@ class PrunerNetwork(nn.Module):
             "n_head": n_head,
             "rate_input": self.rate_input,
         }
-        _check(**self.config, recalls=recalls)
-        if recalls:  # SAG's files do not name what SAG has not
-            self.config["recalls"] = True
+        _check(**self.config, recalls=recalls, unseen=unseen)
+        # Files do not name what their pruner has not.
+        self.config |= {name: value for name, value in (("recalls", recalls), ("unseen", unseen)) if value}
         self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
         self.token = nn.Linear(2 * width, width)
         layer = nn.TransformerEncoderLayer(
             width, n_head, 2 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
         )
         self.encoder = nn.TransformerEncoder(layer, n_layer, enable_nested_tensor=False)
-        self.obs = nn.Linear(cond_shape[0] * cond_shape[1] + rate_input, obs_width)
+        self.obs = nn.Linear(cond_shape[0] * (cond_shape[1] - unseen) + rate_input, obs_width)
         # The first layer of the MLP on [obs ; z], as its two halves.
         self.fuse_obs = nn.Linear(obs_width, hidden)
         self.fuse_z = nn.Linear(width, hidden, bias=False)
@@ -155,24 +157,32 @@ class PrunerNetwork(nn.Module):
     def mlp_weights(self, recall: bool = False) -> PrunerWeights:
         """Return the weights of all that depends on the observation, for compiled code; it decides to prune or to recall."""
         _, middle, _, last = self.mlp
-        obs, fuse, middle, last = (
-            (layer.weight, layer.bias) for layer in (self.obs, self.fuse_obs, middle, last)
-        )
+        fuse, middle, last = ((layer.weight, layer.bias) for layer in (self.fuse_obs, middle, last))
+        obs = self._weight_of_all(), self.obs.bias
         cells = self.cells().view(len(self.timesteps), self.num_blocks, -1)
         sides = [torch.stack([torch.zeros_like(some[2]), some[2]]) if recall else some[:2] for some in last]
         return PrunerWeights(obs, fuse, cells, middle, tuple(sides))
+
+    def _weight_of_all(self) -> Tensor:
+        """Return the first weight with zeros for what is not read, so that compiled code takes the observation as it lies."""
+        if not self.unseen:
+            return self.obs.weight
+        steps, size = self.cond_shape
+        seen = self.obs.weight[:, : steps * (size - self.unseen)].unflatten(1, (steps, -1))
+        rate = self.obs.weight[:, seen[0].numel() :]
+        return torch.cat([functional.pad(seen, (self.unseen, 0)).flatten(1), rate], dim=1)
 
     def _can_be_native(self) -> bool:
         small = self.fuse_obs.out_features <= MAX_HIDDEN
         return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
 
     def features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        """Return what the first layer reads, f32 [B, n]."""
+        """Return the numbers of a query, f32 [B, n]."""
         return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
         """Return the first MLP layer's sums, one row per cell of every observation: [B * K * 3L, hidden]."""
-        obs = self.fuse_obs(self.obs(self.features(cond, rate)))
+        obs = self.fuse_obs(self.obs(self.features(cond[..., self.unseen :], rate)))
         return (obs[:, None] + self.cells()).flatten(0, 1)
 
     def cells(self) -> Tensor:
@@ -230,7 +240,13 @@ def _is_f32_on_cpu(tensor: Tensor) -> bool:
 
 
 def _check(
-    timesteps: list, cond_shape: list, num_blocks: int, rate_input: bool, recalls: bool, **sizes: int
+    timesteps: list,
+    cond_shape: list,
+    num_blocks: int,
+    rate_input: bool,
+    recalls: bool,
+    unseen: int,
+    **sizes: int,
 ) -> None:
     if len(cond_shape) != 2:
         raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
@@ -245,5 +261,7 @@ def _check(
     check_size("n_layer", sizes["n_layer"], _MAX_LAYERS)
     for name, size in (*sizes.items(), *(("cond_shape", size) for size in cond_shape)):
         check_size(name, size, _MAX_WIDTH)
+    if type(unseen) is not int or not 0 <= unseen < cond_shape[1]:
+        raise ValueError(f"unseen: expected 0 to {cond_shape[1] - 1} columns, got {reprlib.repr(unseen)}")
     if sizes["width"] % sizes["n_head"]:
         raise ValueError(f"width: expected a multiple of n_head={sizes['n_head']}, got {sizes['width']}")

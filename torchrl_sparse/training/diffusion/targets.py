@@ -21,6 +21,7 @@ from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, parse_json
+from torchrl_sparse.training.diffusion.observed import encode_windows
 
 __all__ = [
     "ANSWER_BATCH",
@@ -50,7 +51,7 @@ def make_targets(
 
     Args:
         policy: the dense policy with the sampler that will be pruned.
-        demos: demonstrations.
+        demos: demonstrations with what the policy observes, see `policy_demos`.
         share: of all windows, in (0, 1]; 5 % as published.
         source: of the actions: ``"teacher"``, the answer of the dense policy on the same noise; ``"data"``, the demonstrated
             ones, as published. A regression to data averages over modes; the teacher's answer does not.
@@ -79,13 +80,13 @@ def make_targets(
     generator = torch.Generator().manual_seed(seed)
     drawn = rows[torch.randperm(len(rows), generator=generator)[:size]]
     drawn = _in_turns(demos, drawn, network.n_obs_steps, n_action_steps, turns)
-    windows = demos.windows(drawn.flatten(0, 1), network.n_obs_steps).to(policy.device)
+    windows = demos.windows(drawn.flatten(0, 1), network.n_obs_steps)
     size = len(windows)
     targets = TensorDict(
         {
-            keys.COND: normalizer.normalize_state(windows[keys.HISTORY_STATE]),
+            keys.COND: encode_windows(policy, windows),
             keys.SEED: torch.randint(2**62, (size, 1), generator=generator),
-            "target": normalizer.normalize_action(windows[keys.ACTION]),
+            "target": normalizer.normalize_action(windows[keys.ACTION].to(policy.device)),
         },
         [size],
     ).to(policy.device)

@@ -33,12 +33,16 @@ class Gates(Protocol):
         ...
 
 
-def _sag(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> PrunerNetwork:
+def _sag(policy: DiffusionPolicy, rate_input: bool, *, reads: str = "all", **sizes: Any) -> PrunerNetwork:
+    if reads not in ("all", "state"):
+        raise ValueError(f"reads: expected 'all' or 'state', got {reads!r}")
+    features = 0 if policy.vision is None else policy.vision.feature_dim
     return PrunerNetwork(
         policy.sampler.timesteps.tolist(),
         policy.num_blocks,
         (policy.n_obs_steps, policy.network.cond_dim),
         rate_input=rate_input,
+        unseen=features if reads == "state" else 0,
         **sizes,
     )
 
@@ -66,10 +70,11 @@ def make_gates(
         policy: the policy, with the sampler that will be pruned.
         rate_input: whether SAG's pruner takes the target prune rate as an input.
         seed: of the weights.
-        sizes: of the pruner, see `PrunerNetwork`.
+        sizes: of the pruner, see `PrunerNetwork`; and ``reads``, ``"all"`` that the denoiser is conditioned on or ``"state"``,
+            nothing of the cameras, so that it decides while their encoder runs.
 
     Raises:
-        ValueError: for another method.
+        ValueError: for another method, or something else to read.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
