@@ -1,7 +1,8 @@
 import pytest
 
 from tests.evaluation.accelerate.small import GRID, ask
-from tests.fixtures.diffusion import demos, make_network  # noqa: F401
+from tests.fixtures.diffusion import demos, make_image_demos, make_network  # noqa: F401
+from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler
 from torchrl_sparse.evaluation.accelerate import run
 

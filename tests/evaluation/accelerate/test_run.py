@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, episodes_of, fixed_times
-from torchrl_sparse import Uniform
+from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, ask, episodes_of, fixed_times
+from torchrl_sparse import Sampler, Uniform
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
@@ -16,6 +16,7 @@ from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.training.pruner.config import PrunerConfig
 
+TIMES = fixed_times({"ddim4": 5.0})
 STAGES = {
     "find_timesteps": (candidates, "planners/searches/ddpm2.json"),
     "bac_schedule": (candidates, "planners/bac2_ddpm4.json"),
@@ -39,6 +40,26 @@ def test_every_candidate_is_measured_and_the_most_promising_taken(go, policy, tm
     assert found.chosen == found.ranking[0]
     assert found.played == {}
     assert load_acceleration(tmp_path / "acceleration.json") == found
+
+
+def test_a_policy_with_cameras_is_accelerated_as_one_without(
+    make_image_policy, make_image_demos, monkeypatch, tmp_path
+):
+    policy = make_image_policy()
+    policy.sampler, demos = Sampler("ddpm", 8), make_image_demos(policy)
+    asked = []
+    monkeypatch.setattr(
+        run,
+        "time_queries",
+        lambda methods, queries, **options: asked.append(queries) or TIMES(methods, queries, **options),
+    )
+    options = {"made_for": {"demos": "pictures.h5"}, "grid": GRID, "make_env": None}
+    found, methods = run.accelerate(policy, demos, tmp_path, ask(), **options)
+    assert set(METHODS) < set(found.candidates)
+    assert found.candidates["dense"].error != found.candidates["ddim4"].error
+    assert methods[found.chosen].vision is policy.vision
+    (queries,) = asked
+    assert policy(queries)["vla_action", "chunk"].shape == (3, 5, 4)
 
 
 @pytest.mark.skipif(not native_available()[0], reason="only the native engine rounds")

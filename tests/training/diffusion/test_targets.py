@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
-from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 
 
@@ -76,18 +75,16 @@ def test_an_empty_calibration_set_is_refused(policy, demos, share):
         make_targets(policy, demos, share=share, n_action_steps=4)
 
 
-def test_targets_of_a_policy_with_cameras_are_of_what_these_show(make_image_policy):
-    policy, generator = make_image_policy(), torch.Generator().manual_seed(0)
-    data = {keys.STATE: torch.randn(30, 3, generator=generator), keys.ACTION: torch.randn(30, 4)}
-    for name in policy.vision.cameras:
-        frames = torch.randint(256, (30, 3, *policy.vision.image_size), generator=generator)
-        data["observation", name] = frames.to(torch.uint8)
-    demos = Demonstrations(TensorDict(data, [30]), torch.tensor([0, 12, 30]))
+def test_targets_of_a_policy_with_cameras_are_of_what_these_show(make_image_policy, make_image_demos):
+    policy = make_image_policy()
+    demos = make_image_demos(policy)
     targets = make_targets(policy, demos, share=1.0, n_action_steps=4, turns=2)
     assert targets[keys.COND].shape == (len(targets), 2, 2, 128 + 3)
+    states = policy.normalizer.normalize_state(demos.data[keys.STATE])
     with torch.no_grad():
         for query in targets[::5].reshape(-1):
-            state = policy.normalizer.normalize_state(data[keys.STATE])
-            rows = [(state == step).all(dim=1).nonzero().item() for step in query[keys.COND][:, 128:]]
-            seen = policy.vision({name: data["observation", name][rows] for name in policy.vision.cameras})
+            rows = [(states == step).all(dim=1).nonzero().item() for step in query[keys.COND][:, 128:]]
+            seen = policy.vision(
+                {name: demos.data["observation", name][rows] for name in policy.vision.cameras}
+            )
             torch.testing.assert_close(query[keys.COND][:, :128], seen, rtol=0, atol=1e-5)

@@ -87,14 +87,14 @@ def accelerate(
         What was found, and the policy under every method.
 
     Raises:
-        ValueError: naming the option or the file, if the policy has cameras or a planner, nothing keeps the budget, or ``out``
+        ValueError: naming the option or the file, if the policy has a planner, nothing keeps the budget, or ``out``
             holds something else.
 
     Examples:
-        >>> from torchrl_sparse.data.robomimic import read_demos
         >>> from torchrl_sparse.envs.for_policy import diffusion_env
-        >>> demos = read_demos("lift.hdf5", find_task("lift").state_keys)  # doctest: +SKIP
+        >>> from torchrl_sparse.training.diffusion.observed import policy_demos
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+        >>> demos = policy_demos("lift.hdf5", "lift", policy)  # doctest: +SKIP
         >>> request = Request("lift", budget_ms=5)
         >>> options = {"make_env": diffusion_env("lift", policy), "made_for": {"demos": "lift.hdf5"}}
         >>> found, _ = accelerate(policy, demos, Path("fast"), request, **options)  # doctest: +SKIP
@@ -147,8 +147,6 @@ def accelerate(
 
 
 def _check_policy(policy: DiffusionPolicy) -> None:
-    if policy.vision is not None:
-        raise ValueError("policy: expected one that observes states, got one with cameras")
     if policy.plan.fingerprint != policy.with_plan(None).plan.fingerprint:
         raise ValueError(
             f"policy: expected one that nothing is pruned of yet, got {type(policy.plan).__name__}"
@@ -173,7 +171,7 @@ def _from_demonstrations(
         seed=request.seed,
     )
     spread = torch.linspace(0, len(rows) - 1, min(request.repeats, len(rows))).long()
-    queries = demos.windows(rows[spread], policy.n_obs_steps).select(keys.HISTORY_STATE)
+    queries = demos.windows(rows[spread], policy.n_obs_steps).exclude(keys.ACTION)
     index = torch.arange(len(spread))[:, None]
     queries.update({keys.EPISODE_SEED: torch.full_like(index, request.seed), keys.EPISODE_STEP: index})
     return targets, queries.to(policy.device)
