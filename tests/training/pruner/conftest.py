@@ -6,6 +6,8 @@ from tensordict import TensorDict
 
 from tests.blocks import conftest as blocks
 from tests.blocks.conftest import ACTION_DIM, COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
+from tests.fixtures.diffusion import make_image_demos  # noqa: F401
+from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.data.robomimic import Demonstrations
