@@ -21,6 +21,7 @@ constant                          shape, dtype           meaning
 ``history(name)``                 [*B, To, ...]          the last To entries of any observation, e.g. of a camera
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
 ``COND``                          f32 [*B, To, D]        encoded observations that condition the denoiser
+``FRAME_FEATURES``                f32 [*B, To, F]        features of the cameras' frames, the first columns of ``COND``
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
@@ -84,6 +85,7 @@ HISTORY_STATE = ("history", "state")
 IS_INIT = "is_init"
 
 COND = ("diffusion", "cond")
+FRAME_FEATURES = ("diffusion", "frame_features")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
 REUSE = ("diffusion", "reuse")

@@ -33,7 +33,9 @@ def record_queries(
     env = make_env(seeds=list(seeds))
     episodes = [env.rollout(env.base_env.horizon, actor, auto_cast_to_device=True) for _ in seeds]
     env.close()
-    wanted = [*actor.policy.in_keys, *actor.policy.out_keys, keys.LAST_CHUNK, keys.ELAPSED]
+    read, written = actor.policy.in_keys, actor.policy.out_keys
+    left = set(read) & set(written)  # for its next query: to be read, it belongs to the one before
+    wanted = [*(key for key in (*read, *written) if key not in left), keys.LAST_CHUNK, keys.ELAPSED]
     queries = torch.cat([_queries(steps).select(*wanted, strict=False) for steps in episodes])
     return queries.to(actor.policy.device)
 

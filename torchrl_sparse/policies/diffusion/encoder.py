@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -26,7 +28,8 @@ class ConditionEncoder(nn.Module):
 
     Attributes:
         in_keys: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
-            u8 [*B, To, 3, h, w] of each camera.
+            u8 [*B, To, 3, h, w] of each camera; with cameras, also what the query before left of them,
+            ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there.
     """
 
     def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
@@ -36,6 +39,7 @@ class ConditionEncoder(nn.Module):
         self.in_keys: list[NestedKey] = [keys.HISTORY_STATE]
         if vision is not None:
             self.in_keys += [keys.history(name) for name in vision.cameras]
+            self.in_keys += [keys.ELAPSED, keys.FRAME_FEATURES]
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """Encode one batch.
@@ -49,7 +53,24 @@ class ConditionEncoder(nn.Module):
             return state
         images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
         encode = self.cameras.get(self.vision, frames=state.shape[-2])
-        return torch.cat([encode(images), state], dim=-1)
+        return torch.cat([self._features(tensordict, images, encode), state], dim=-1)
+
+    def _features(
+        self, tensordict: TensorDictBase, images: dict[str, Tensor], encode: Callable[..., Tensor]
+    ) -> Tensor:
+        """Return the features of the frames, [*B, To, F]; those that the query before has encoded are taken from it."""
+        known, elapsed = tensordict.get(keys.FRAME_FEATURES, None), tensordict.get(keys.ELAPSED, None)
+        if known is None or elapsed is None or self.training:
+            return encode(images)
+        place = (
+            torch.arange(known.shape[-2], device=known.device) + elapsed
+        )  # in the history of the query before
+        fresh = (elapsed == 0) | (place >= known.shape[-2])
+        if fresh.all():
+            return encode(images)
+        features = known.gather(-2, place.clamp(max=known.shape[-2] - 1)[..., None].expand_as(known))
+        features[fresh] = encode({name: frames[fresh] for name, frames in images.items()})
+        return features
 
 
 class ObservationEncoder(TensorDictModuleBase):
@@ -68,14 +89,13 @@ class ObservationEncoder(TensorDictModuleBase):
         ValueError: if features and state together are not what the network expects.
     """
 
-    out_keys = [keys.COND, keys.SEED]
-
     def __init__(
         self, network: TransformerForDiffusion, normalizer: Normalizer, vision: VisionEncoder | None = None
     ) -> None:
         super().__init__()
         self.condition = ConditionEncoder(normalizer, vision)
         self.in_keys = [*self.condition.in_keys, keys.EPISODE_SEED, keys.EPISODE_STEP]
+        self.out_keys = [keys.COND, keys.SEED, *(() if vision is None else (keys.FRAME_FEATURES,))]
         features = 0 if vision is None else vision.feature_dim
         state = len(normalizer.state_scale)
         if features + state != network.cond_dim:
@@ -93,6 +113,8 @@ class ObservationEncoder(TensorDictModuleBase):
         frozen = encoder is not None and not self.training
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             tensordict.set(keys.COND, self.condition(tensordict))
+        if encoder is not None:
+            tensordict.set(keys.FRAME_FEATURES, tensordict.get(keys.COND)[..., : encoder.feature_dim].clone())
         return tensordict.set(keys.SEED, self.seed(tensordict))
 
     def take_over(self, other: ObservationEncoder) -> None:
