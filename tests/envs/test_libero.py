@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+from contextlib import nullcontext
 
 import hydra
 import imageio.v3 as iio
@@ -19,6 +20,7 @@ from tests.recipe_modules import RECIPES, load_recipe
 from tests.storage.published import openvla
 from torchrl_sparse import keys
 from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.envs import libero
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
 from torchrl_sparse.envs.release_images import ReleaseImages, as_released
 from torchrl_sparse.networks.vla.vision import center_crop
@@ -48,6 +50,16 @@ def test_unknown_suites_are_refused():
 @pytest.mark.skipif(importlib.util.find_spec("libero") is not None, reason="LIBERO is there")
 def test_the_missing_extra_is_named():
     with pytest.raises(ImportError, match=r"pip install 'torchrl-sparse\[libero\]'"):
+        make_libero_env("libero_goal", 0)
+
+
+def test_scenes_that_are_not_linked_are_named(monkeypatch):
+    def without_scenes(*args, **options):
+        raise FileNotFoundError(2, "No such file or directory", "assets/scenes/kitchen.xml")
+
+    monkeypatch.setattr(libero, "_MountedLibero", without_scenes)
+    monkeypatch.setattr(libero, "_base_of_floor_robots", nullcontext)
+    with pytest.raises(FileNotFoundError, match=r"libero-download-assets --link .*kitchen\.xml"):
         make_libero_env("libero_goal", 0)
 
 

