@@ -213,6 +213,7 @@ OPTIONS: dict[str, Any] = {
     "width": Count,
     "obs_width": Count,
     "hidden": Count,
+    "reads": Literal["all", "state"],
     "n_layer": Count,
     "n_head": Count,
     **dict.fromkeys(("n_emb", "n_obs_steps"), Count | None),

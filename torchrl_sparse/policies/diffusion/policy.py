@@ -48,7 +48,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
     everything that a table needs: see ``out_keys``.
 
-    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then.
+    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. Frames
+    that the query before has encoded (``("diffusion", "frame_features")``) keep its features.
 
     Args:
         network: the denoiser.

@@ -51,7 +51,9 @@ def _tts(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> PrunerNetwo
     return _sag(policy, rate_input, recalls=True, **sizes)
 
 
-def _l2c(policy: DiffusionPolicy, rate_input: bool) -> StaticGates:
+def _l2c(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> StaticGates:
+    if sizes:
+        raise ValueError(f"network: expected nothing of l2c, which has no network, got {', '.join(sizes)}")
     return StaticGates(policy.num_inference_steps, policy.num_blocks)
 
 
@@ -74,7 +76,7 @@ def make_gates(
             nothing of the cameras, so that it decides while their encoder runs.
 
     Raises:
-        ValueError: for another method, or something else to read.
+        ValueError: for another method, something else to read, or sizes of L2C's gates, which have none.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
