@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_sparse import keys
 from torchrl_sparse.networks.diffusion.packed_vision import can_pack_vision, pack_vision
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.policies.diffusion import cameras
@@ -120,7 +121,11 @@ def test_copies_and_pickles_carry_no_packed_weights():
 @needs_packing
 def test_a_policy_answers_with_packed_cameras_as_without(make_image_policy, monkeypatch):
     packings = []
-    monkeypatch.setattr(cameras, "pack_vision", lambda *args: packings.append(args) or pack_vision(*args))
+    monkeypatch.setattr(
+        cameras,
+        "pack_vision",
+        lambda *args, **options: packings.append(args) or pack_vision(*args, **options),
+    )
     policy = make_image_policy()
     query = TensorDict({"history": {"state": torch.rand(2, 2, 3), **make_frames(2, 2)}}, [2])
     query["episode"] = {name: torch.ones(2, 1, dtype=torch.long) for name in ("seed", "step")}
@@ -130,6 +135,28 @@ def test_a_policy_answers_with_packed_cameras_as_without(make_image_policy, monk
     policy.vision.register_forward_hook(lambda *_: None)
     expected = policy(query.copy())["diffusion", "cond"]
     torch.testing.assert_close(cond, expected, atol=1e-5, rtol=0)
+
+
+@needs_packing
+def test_cameras_round_where_the_engine_does(make_image_policy):
+    policy = make_image_policy()
+    query = TensorDict({"history": {"state": torch.rand(2, 2, 3), **make_frames(2, 2)}}, [2])
+    exact = policy(query.copy())[keys.COND]
+    rounded = policy.with_plan(None)  # shares what is packed
+    rounded.engine = "native_bf16"
+    cond = rounded(query.copy())[keys.COND]
+    assert cond.dtype == torch.float32
+    assert torch.equal(cond[..., 128:], exact[..., 128:])
+    error = (cond - exact)[..., :128].abs().mean() / exact[..., :128].abs().mean()
+    assert 1e-4 < error < 0.03
+    assert torch.equal(policy(query.copy())[keys.COND], exact)
+    assert torch.equal(rounded.with_noise(1)(query.copy())[keys.COND], cond)
+    with torch.no_grad():
+        policy.vision.encoders["image"].linear.weight.mul_(-1)
+    changed = rounded(query.copy())[keys.COND]
+    assert not torch.equal(changed[..., :64], cond[..., :64])
+    rounded.engine = "native"
+    torch.testing.assert_close(rounded(query.copy())[keys.COND], policy(query.copy())[keys.COND])
 
 
 @needs_packing

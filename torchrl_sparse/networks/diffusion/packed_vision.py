@@ -1,7 +1,8 @@
 """The cameras' encoder as a CPU computes it fastest: the same layers on weights that oneDNN has laid out once.
 
 A few frames are little work for 22 million weights, and PyTorch lays each convolution's weights out anew in every call. Here
-that is done when the encoder is packed, and activations stay in the order that those weights are for (channels last).
+that is done when the encoder is packed, and activations stay in the order that those weights are for (channels last). They can
+also be rounded to bfloat16, weights and activations, which changes the features and is faster still.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ def can_pack_vision(vision: VisionEncoder) -> bool:
 
 
 @torch.no_grad()
-def pack_vision(vision: VisionEncoder, frames: int) -> VisionEncoder:
+def pack_vision(vision: VisionEncoder, frames: int, *, bf16: bool = False) -> VisionEncoder:
     """Return a copy of ``vision``, of the weights of the moment, whose features differ from its own by rounding alone.
 
     Args:
         vision: one that `can_pack_vision`.
         frames: of each camera at a time that the weights are laid out for; any other number serves too.
+        bf16: whether the layers before the keypoints round weights and activations to bfloat16.
 
     Examples:
         >>> vision = VisionEncoder(["image"], width=16).eval()
@@ -42,6 +44,9 @@ def pack_vision(vision: VisionEncoder, frames: int) -> VisionEncoder:
         True
     """
     packed = copy.deepcopy(vision).requires_grad_(False)
+    if bf16:
+        for encoder in packed.encoders.values():
+            encoder.trunk.bfloat16()
     for module in list(packed.modules()):
         for name, child in list(module.named_children()):
             if isinstance(child, nn.Conv2d):
@@ -57,12 +62,12 @@ class _PackedConvolution(nn.Module):
     def __init__(self, convolution: nn.Conv2d) -> None:
         super().__init__()
         self._convolution: nn.Conv2d | None = convolution
-        self._bias = convolution.bias
+        self._bias, self._dtype = convolution.bias, convolution.weight.dtype
         sizes = convolution.padding, convolution.stride, convolution.dilation
         self._sizes = (*map(list, sizes), convolution.groups)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x.contiguous(memory_format=torch.channels_last)
+        x = x.to(self._dtype, memory_format=torch.channels_last)
         if self._convolution is not None:
             weight = self._convolution.weight.detach()
             self._weight = torch.ops.mkldnn._reorder_convolution_weight(weight, *self._sizes, list(x.shape))

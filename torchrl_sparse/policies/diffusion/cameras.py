@@ -23,10 +23,12 @@ class CameraSlot:
 
     def __init__(self) -> None:
         self._watch: WeightWatch | None = None
-        self._made: tuple[Any, VisionEncoder | None] = (None, None)
+        self._made: dict[bool, tuple[Any, VisionEncoder]] = {}
 
-    def get(self, vision: VisionEncoder, frames: int) -> Callable[[Mapping[str, Tensor]], Tensor]:
-        """Return what encodes ``frames`` images of each camera as ``vision`` does, up to rounding.
+    def get(
+        self, vision: VisionEncoder, frames: int, *, bf16: bool = False
+    ) -> Callable[[Mapping[str, Tensor]], Tensor]:
+        """Return what encodes ``frames`` images of each camera as ``vision`` does, up to rounding, be it to bfloat16.
 
         That is `pack_vision`'s copy of it, where no gradient can be asked for and nobody looks at its layers.
         """
@@ -39,19 +41,20 @@ class CameraSlot:
         ):
             return vision
         # Read and replaced in one go: other threads may do the same.
-        watch, (known, packed) = self._watch, self._made
+        watch, made = self._watch, self._made
         if watch is None or not watch.watches(vision):
-            watch, packed = WeightWatch(vision), None
-            self._watch = watch
+            watch, made = WeightWatch(vision), {}
+            self._watch, self._made = watch, made
         state = id(vision), watch.state()
+        known, packed = made.get(bf16, (None, None))
         if packed is None or known != state:
-            packed = pack_vision(vision, frames)
-            self._made = state, packed
+            packed = pack_vision(vision, frames, bf16=bf16)
+            made[bf16] = state, packed
         return packed
 
     def refresh(self) -> None:
         """Pack the weights anew in the next query."""
-        self._made = (None, None)
+        self._made = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_watch": None, "_made": (None, None)}
+        return {"_watch": None, "_made": {}}

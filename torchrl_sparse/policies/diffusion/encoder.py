@@ -27,6 +27,7 @@ class ConditionEncoder(nn.Module):
         vision: encoder of the cameras; None reads the state alone.
 
     Attributes:
+        bf16: whether the cameras' encoder rounds to bfloat16 in use; False unless another is assigned.
         in_keys: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
             u8 [*B, To, 3, h, w] of each camera; with cameras, also what the query before left of them,
             ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there.
@@ -35,7 +36,7 @@ class ConditionEncoder(nn.Module):
     def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
         super().__init__()
         self.normalizer, self.vision = normalizer, vision
-        self.cameras = CameraSlot()
+        self.cameras, self.bf16 = CameraSlot(), False
         self.in_keys: list[NestedKey] = [keys.HISTORY_STATE]
         if vision is not None:
             self.in_keys += [keys.history(name) for name in vision.cameras]
@@ -52,7 +53,7 @@ class ConditionEncoder(nn.Module):
         if self.vision is None:
             return state
         images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
-        encode = self.cameras.get(self.vision, frames=state.shape[-2])
+        encode = self.cameras.get(self.vision, frames=state.shape[-2], bf16=self.bf16)
         return torch.cat([self._features(tensordict, images, encode), state], dim=-1)
 
     def _features(

@@ -43,10 +43,9 @@ from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_pol
 class DiffusionPolicy(PolicySizes, TensorDictSequential):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
-    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise
-    of a query follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them
-    (`RobosuiteEnv` does), else from torch's global generator. Writes the chunk, from the present step on, and
-    everything that a table needs: see ``out_keys``.
+    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a query
+    follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does),
+    else from torch's global generator. Writes the chunk, from the present step on, and all that a table needs: see ``out_keys``.
 
     The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. Frames
     that the query before has encoded (``("diffusion", "frame_features")``) keep its features.
@@ -58,13 +57,12 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         sampler: DDPM with all training steps by default.
         plan: the planner; None is dense.
         engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
-            fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the
-            same mask and seed. In training mode, and where the condition requires gradients, the differentiable
-            reference runs whatever is chosen.
+            fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the same mask and
+            seed; ``"native_bf16"`` and ``"native_int8"`` round, the first the cameras' encoder too. In training mode, and where
+            the condition requires gradients, the differentiable reference runs whatever is chosen.
 
     Attributes:
-        plan: the planner. Assign another to change the method, ``policy.plan = planner``, or None for the dense policy,
-            which then reads as the `Dense` planner.
+        plan: the planner. Assign another to change the method, or None for the dense policy, which then reads as `Dense`.
         sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
         start: what queries begin from: noise, the last chunk after ``policy.start = WarmStart(1)``, or noise that is drawn to
             the last chunk after ``policy.start = RealtimeChunking()``.
@@ -96,7 +94,11 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
         super().__init__(stages)
-        self.plan, self.source = plan, {}  # the plan is bound to this network and sampler
+        self.plan, self.engine, self.source = (
+            plan,
+            engine,
+            {},
+        )  # the plan is bound to this network and sampler
         self.eval()
 
     @property
@@ -197,6 +199,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     @engine.setter
     def engine(self, name: EngineName) -> None:
         self.module["denoise"].choose(name)
+        self.module["encode"].condition.bf16 = name == "native_bf16"
 
     def engine_info(self) -> str:
         """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why
