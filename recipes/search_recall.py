@@ -59,7 +59,8 @@ def make_judges(policy: DiffusionPolicy, schedule: CacheSchedule, config: DictCo
     task = find_task(config.task).name
     n_action_steps = executed_steps(task, policy.source)
     seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
-    queries = record_queries(ChunkExecutor(policy, n_action_steps), diffusion_env(task, policy), seeds)
+    make_env = diffusion_env(task, policy, config.horizon)
+    queries = record_queries(ChunkExecutor(policy, n_action_steps), make_env, seeds)
     encoded = planned_queries(policy, queries)
     options = {"draws": config.draws, "n_action_steps": n_action_steps, "reuse": schedule.reuse}
     episodes = [encoded[rows] for rows in episode_rows(encoded)]
@@ -76,7 +77,7 @@ def climb(
     recalls: bool,
 ) -> Choice:
     """Climb from ``start``, or from where the file at ``path`` says that an earlier run came to."""
-    made_for = {name: config[name] for name in ("task", "schedule", "episodes", "draws", "seed")}
+    made_for = {name: config[name] for name in ("task", "schedule", "episodes", "horizon", "draws", "seed")}
     done = 0
     if path.exists():
         written = (RecallSchedule if recalls else CacheSchedule).from_pretrained(path)

@@ -1,8 +1,9 @@
-"""What reading a file costs, in a process of its own: seconds of the CPU, and memory beyond that of the imported library.
+"""What reading a file costs, in another process: seconds of the CPU, and memory beyond that of the imported library.
 
 A small file must not exhaust a machine: whatever it says, it is read or refused within `SECONDS` and `MEGABYTES`.
 """
 
+import ctypes
 import resource
 import sys
 import time
@@ -27,22 +28,44 @@ class Cost:
     megabytes: float
 
 
+class _Reader:
+    """A process that reads one file after the other, and another in its place once it was ended."""
+
+    def __init__(self) -> None:
+        self._process, self._pipe = None, None
+
+    def measure(self, read: Callable, path: Path) -> Cost:
+        if self._process is None:
+            self._start()
+        self._pipe.send((read, path))
+        try:
+            assert self._pipe.poll(40 * SECONDS), "it waits for something"  # other processes may have the CPU
+            return self._pipe.recv()
+        except EOFError:
+            self._process.join()
+            pytest.fail(
+                f"it was ended, exit code {self._process.exitcode} (-24: it took more than {SECONDS} s)"
+            )
+        finally:
+            if sys.exc_info()[0] is not None:
+                self._process.kill()
+                self._process = None
+
+    def _start(self) -> None:
+        self._pipe, theirs = FORKED.Pipe()
+        self._process = FORKED.Process(target=_answer, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+
+
+_READER = _Reader()
+
+
 def measure(read: Callable, path: Path) -> Cost:
     """Call ``read(path)`` in a process that is killed when it exceeds the limits."""
     if sys.platform != "linux":
         pytest.skip("limits are Linux's")
-    ours, theirs = FORKED.Pipe()
-    process = FORKED.Process(target=_call, args=(theirs, read, path))
-    process.start()
-    theirs.close()
-    try:
-        assert ours.poll(40 * SECONDS), "it waits for something"  # other processes may have the CPU
-        return ours.recv()
-    except EOFError:
-        process.join()
-        pytest.fail(f"it was ended, exit code {process.exitcode} (-24: it took more than {SECONDS} s)")
-    finally:
-        process.kill()
+    return _READER.measure(read, path)
 
 
 def check_limits(read: Callable, path: Path) -> str | None:
@@ -59,10 +82,17 @@ def check_limits(read: Callable, path: Path) -> str | None:
     return cost.error
 
 
-def _call(answer, read: Callable, path: Path) -> None:
+def _answer(pipe) -> None:
     import torch
 
     torch.set_num_threads(1)
+    while True:
+        read, path = pipe.recv()
+        pipe.send(_call(read, path))
+
+
+def _call(read: Callable, path: Path) -> Cost:
+    ctypes.CDLL(None).malloc_trim(0)  # what an earlier file left is not to serve this one
     Path("/proc/self/clear_refs").write_text("5")  # forget the highest resident size so far
     before, began = _memory(), time.process_time()
     _limit(resource.RLIMIT_AS, before["VmSize"] + MEGABYTES * 1_000_000)
@@ -73,7 +103,7 @@ def _call(answer, read: Callable, path: Path) -> None:
     except Exception as raised:
         error = f"{type(raised).__name__}: {raised}"
     spent = time.process_time() - began
-    answer.send(Cost(error, spent, (_memory()["VmHWM"] - before["VmRSS"]) / 1e6))
+    return Cost(error, spent, (_memory()["VmHWM"] - before["VmRSS"]) / 1e6)
 
 
 def _limit(what: int, most: int) -> None:

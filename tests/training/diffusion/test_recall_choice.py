@@ -107,7 +107,7 @@ def test_episodes_of_one_query_say_nothing(lift):
 def test_the_recipe_goes_on_from_its_files(work, policy):
     out, few = work / "recall", ("sampler=ddpm4", "methods=[bac_unified]", "num_updates=2")
     run("calibrate_bac", f"policy={policy}", *few, f"out={work}/few")
-    small = ("episodes=2", "draws=3", "checkpoint_every=1")
+    small = ("episodes=2", "horizon=24", "draws=3", "checkpoint_every=1")
     options = (f"policy={policy}", f"schedule={work}/few/bac_unified_ddpm4.json", *small, f"out={out}")
     assert "methods=[dense,swapped,recalling]" in run("search_recall", *options, "attempts=1")
     output = run("search_recall", *options, "attempts=3")

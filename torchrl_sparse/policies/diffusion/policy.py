@@ -45,7 +45,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a query
     follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does),
-    else from torch's global generator. Writes the chunk, from the present step on, and all that a table needs: see ``out_keys``.
+    else from torch's global generator. Writes the chunk, from the present step on, all that a table needs: see ``out_keys``.
 
     The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. Frames
     that the query before has encoded (``("diffusion", "frame_features")``) keep its features.
