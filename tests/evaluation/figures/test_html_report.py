@@ -10,6 +10,7 @@ import pytest
 
 from tests.evaluation import synthetic
 from tests.evaluation.results.test_realtime import DENSE, FAST, build
+from tests.recipe_modules import run
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
 from torchrl_sparse.evaluation.results.page_rows import KINDS, read_tables
@@ -129,6 +130,17 @@ def test_every_file_of_results_that_is_shipped_can_be_shown():
     assert {path.name.startswith("query") for path in shipped} == {True, False}
     for path in shipped:
         assert all(table.rows for table in read_tables(path).values()), path
+
+
+def test_the_recipe_shows_one_of_each_kind(tmp_path):
+    shipped = {path.stem.partition("_")[0]: path for path in find_runs("assets")}
+    (tmp_path / "runs").mkdir()
+    for path in shipped.values():
+        copyfile(path, tmp_path / "runs" / path.name)
+    assert "report.html: " in run("report", f"runs={tmp_path}/runs", f"out={tmp_path}/report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert {"results", "realtime", "engine"} < shipped.keys()
+    assert all(path.name in page for path in shipped.values())
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
