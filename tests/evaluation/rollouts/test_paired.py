@@ -111,7 +111,7 @@ def test_resume_after_a_crash_gives_the_same_and_reruns_nothing(tmp_path, torn):
     path = tmp_path / "dense.jsonl"
     whole = rollout_episodes(FakeActor(), FakeEnv, SEEDS, num_envs=3)
     with pytest.raises(RuntimeError, match="injected crash"):
-        rollout_episodes(FakeActor(crash_at=10), FakeEnv, SEEDS, num_envs=3, results_file=path)
+        rollout_episodes(FakeActor(crash_at=20), FakeEnv, SEEDS, num_envs=3, results_file=path)
     finished = len(path.read_text().splitlines()) - 1
     assert 0 < finished < len(SEEDS)
     if torn:

@@ -19,7 +19,7 @@ from torchrl_sparse.runtime.backends import WorkerDied, ray_death
 
 __all__ = ["running_collector"]
 
-_STEPS_PER_BATCH = 16  # that a worker makes between two reports
+_STEPS_PER_BATCH = 16  # between two reports: each takes time, and what was not reported when a kill came runs again
 
 
 @contextmanager
@@ -56,14 +56,14 @@ def running_collector(
         # The policy's noise is a key, not a distribution; RANDOM keeps any other actor as it was trained.
         "exploration_type": ExplorationType.RANDOM,
     }
+    options["frames_per_batch"] = count * _STEPS_PER_BATCH
     transforms = {"auto_register_policy_transforms": True}
-    frames = count * _STEPS_PER_BATCH
     if backend == "ray":
-        running = _on_ray(make, actor, frames_per_batch=frames, collector_kwargs=transforms, **options)
+        running = _on_ray(make, actor, collector_kwargs=transforms, **options)
     elif workers == 1:
-        running = _here(make[0](), actor, frames_per_batch=count, **transforms, **options)
+        running = _here(make[0](), actor, **transforms, **options)
     else:
-        running = in_processes(make, actor, frames_per_batch=frames, **transforms, **options)
+        running = in_processes(make, actor, **transforms, **options)
     with running as collector:
         yield collector
 
