@@ -8,6 +8,7 @@ from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner
+from torchrl_sparse.training.pruner.fit import spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
@@ -19,6 +20,9 @@ def test_a_pruner_is_trained_on_all_or_on_the_state_alone(
     policy = make_image_policy()
     targets = make_targets(policy, make_image_demos(policy), share=0.5, n_action_steps=4)
     gates = make_gates("sag", policy, reads=reads, width=8)
+    spread_logits(gates, targets, 1.0)
+    with torch.no_grad():
+        assert gates.prune_logits(targets[keys.COND])[:, 1:].std(dim=0).mean() == pytest.approx(1, abs=1e-3)
     config = PrunerConfig(rate=0.3, batch_size=4, max_updates=2, checkpointed=False)
     trainer, before = PrunerTrainer(gates, policy, targets, config), gates.obs.weight.clone()
     trainer.train_step()

@@ -92,11 +92,11 @@ def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, s
     """
     cond = targets[keys.COND][:samples]
     rate = torch.full((len(cond), 1), 0.5, device=cond.device) if gates.rate_input else None
-    observed, weight = cond.flatten(1), gates.obs.weight
-    deviation = observed.std(dim=0)
+    seen, weight = cond[..., gates.unseen :], gates.obs.weight
+    deviation = seen.flatten(1).std(dim=0)
     varies = deviation > _SMALLEST_DEVIATION
     weight[:, : len(varies)] *= torch.where(varies, 1 / deviation, 0.0)  # a rate may follow
-    _standardise(gates.fuse_obs, gates.fuse_obs(gates.obs(gates.features(cond, rate))))
+    _standardise(gates.fuse_obs, gates.fuse_obs(gates.obs(gates.features(seen, rate))))
     _standardise(gates.fuse_z, gates.cells(), gates.fuse_obs.bias)
     last = gates.mlp[-1]
     last.weight *= spread / gates.prune_logits(cond, rate)[:, 1:].std(dim=0).mean()
