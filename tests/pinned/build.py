@@ -83,9 +83,13 @@ def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> Chu
     return ChunkExecutor(policy, n_action_steps=1, controller=make_controller(name))
 
 
-def diffusion_query(state: Any, eef_vel: Any, seed: int, step: int) -> TensorDict:
-    """What the environment shows at a step, [], with what a gate remembers of the steps before."""
+def diffusion_query(
+    state: Any, eef_vel: Any, seed: int, step: int, images: Tensor | None = None
+) -> TensorDict:
+    """What the environment shows at a step, [], with what a gate remembers of those before; images u8 [2, 3, h, w] stand."""
     query = TensorDict({keys.HISTORY_STATE: torch.tensor(state), keys.EEF_VEL: torch.tensor(eef_vel)}, [])
+    for name, image in zip(("image", "wrist_image"), () if images is None else images, strict=False):
+        query.set(keys.history(name), torch.stack([image] * len(state)))
     return _at_step(query, seed, step)
 
 
