@@ -105,7 +105,7 @@ def _diffusion_answers(case: Case) -> dict[str, Tensor]:
 
 
 def _diffusion_queries(folder: Path) -> list:
-    """What was observed in the task; a policy with cameras, which has no observations of its own, gets Lift's arm and patterns."""
+    """What was observed in the task; one with cameras, which has none of its own, gets Lift's arm and patterns."""
     if not has_cameras(folder):
         return [build.diffusion_query(**observation) for observation in _OBSERVATIONS[folder.name]]
     before, after = _images()
