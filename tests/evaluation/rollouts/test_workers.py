@@ -25,6 +25,13 @@ from torchrl_sparse.runtime.backends import WorkerDied
 SEEDS = range(7)
 
 
+@pytest.fixture(autouse=True)
+def nobody_is_left():
+    before = set(multiprocessing.active_children())  # those of other tests
+    yield
+    assert set(multiprocessing.active_children()) <= before
+
+
 class MortalEnv(FakeEnv):
     """Kills its process, once per folder, at the third step of the seed 3."""
 
@@ -113,7 +120,6 @@ def kill_while_starting(monkeypatch, backend, go, delays):
     deaths = [warning for warning in warned if warning.category is RuntimeWarning]
     assert 1 <= len(deaths) <= len(delays)
     assert episodes == run(FakeEnv)
-    assert multiprocessing.active_children() == []
 
 
 def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path, monkeypatch, backend):
@@ -132,7 +138,6 @@ def test_workers_that_do_not_start_in_time_are_given_up(monkeypatch):
     monkeypatch.setattr(paired, "_FAILURES", 1)
     with pytest.raises(RuntimeError, match=r"workers had not started after 0\.5 s, 1 times"):
         run(FakeEnv, workers=2)
-    assert multiprocessing.active_children() == []
 
 
 class UnmakeableEnv(FakeEnv):
@@ -154,7 +159,6 @@ def test_what_a_worker_raises_while_it_starts_is_raised_and_not_tried_again(back
     kind = ArithmeticError if backend == "process" else sys.modules["ray"].exceptions.RayActorError
     with pytest.raises(kind, match="no environment"):
         run(UnmakeableEnv, workers=2, backend=backend)
-    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
