@@ -77,8 +77,6 @@ class Planner(TensorDictModuleBase):
             :mod:`torchrl_sparse.blocks.mask`); written for every observation.
         is_static: True where the mask does not depend on the observation.
         made_for: the only spec that it can be bound to; None serves every policy.
-        unseen: leading columns of the condition that it does not read, such as those of the cameras' features: it can then
-            decide before they are there, see `torchrl_sparse.policies.diffusion.meanwhile`.
         rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
 
     Examples:
@@ -101,7 +99,6 @@ class Planner(TensorDictModuleBase):
     reuse: Reuse = "block"
     is_static = False
     made_for: PlanSpec | None = None
-    unseen: int = 0
     rate: float | None = None
 
     def __init__(self) -> None:

@@ -158,7 +158,6 @@ def test_another_policy_or_sampler_is_refused(spec, message):
 @pytest.mark.parametrize("rate_range", [None, (0.5, 0.97)])
 def test_columns_that_are_not_to_be_seen_change_nothing(rate_range):
     pruner = make_pruner(rate_range, unseen=2)
-    assert pruner.unseen == 2
     network, cond = pruner.network, observations()
     other = cond + 9 * torch.randn(cond.shape) * (torch.arange(COND_DIM) < 2)
     rate = None if rate_range is None else torch.rand(len(cond), 1)

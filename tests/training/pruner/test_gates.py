@@ -30,7 +30,7 @@ def test_a_pruner_is_trained_on_all_or_on_the_state_alone(
     assert gates.obs.in_features == 2 * (128 + 3 - unseen)
 
     planner = load_planner(export_planner(trainer, tmp_path, {}), policy.plan.spec)
-    assert planner.unseen == unseen
+    assert planner.network.unseen == unseen
     gates.eval()
     masks = planner.masks(targets[keys.COND])
     with torch.no_grad():

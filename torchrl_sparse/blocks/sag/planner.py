@@ -143,7 +143,6 @@ class SAGPruner(Planner):
                 f"got {info.rate_range} and rate_input={network.rate_input}"
             )
         self.network, self.info, self.reuse = network.eval(), info, info.reuse
-        self.unseen = network.unseen
         self.made_for = PlanSpec(
             len(network.timesteps), network.num_blocks // len(BLOCK_TYPES), info.policy, info.sampler
         )

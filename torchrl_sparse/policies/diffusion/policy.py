@@ -31,7 +31,6 @@ from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds
-from torchrl_sparse.policies.diffusion.meanwhile import answer_meanwhile
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
@@ -235,8 +234,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         # Made now: after the engine's call nothing is in the caches of what makes tensors.
         latency = torch.zeros(*tensordict.batch_size, 1, device=device)
         try:
-            stages = self.module.values()
-            if not (answer_directly(tensordict, *stages) or answer_meanwhile(tensordict, *stages)):
+            if not answer_directly(tensordict, *self.module.values()):
                 tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error

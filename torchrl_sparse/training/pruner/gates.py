@@ -73,7 +73,7 @@ def make_gates(
         rate_input: whether SAG's pruner takes the target prune rate as an input.
         seed: of the weights.
         sizes: of the pruner, see `PrunerNetwork`; and ``reads``, ``"all"`` that the denoiser is conditioned on or ``"state"``,
-            nothing of the cameras, so that it decides while their encoder runs.
+            nothing of the cameras.
 
     Raises:
         ValueError: for another method, something else to read, or sizes of L2C's gates, which have none.
