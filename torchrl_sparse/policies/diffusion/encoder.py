@@ -63,9 +63,8 @@ class ConditionEncoder(nn.Module):
         known, elapsed = tensordict.get(keys.FRAME_FEATURES, None), tensordict.get(keys.ELAPSED, None)
         if known is None or elapsed is None or self.training:
             return encode(images)
-        place = (
-            torch.arange(known.shape[-2], device=known.device) + elapsed
-        )  # in the history of the query before
+        # Where each frame lay in the history of the query before.
+        place = torch.arange(known.shape[-2], device=known.device) + elapsed
         fresh = (elapsed == 0) | (place >= known.shape[-2])
         if fresh.all():
             return encode(images)

@@ -93,11 +93,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
         super().__init__(stages)
-        self.plan, self.engine, self.source = (
-            plan,
-            engine,
-            {},
-        )  # the plan is bound to this network and sampler
+        self.plan, self.source = plan, {}  # the plan is bound to this network and sampler
+        self.engine = engine  # which decides how the cameras are encoded, too
         self.eval()
 
     @property
