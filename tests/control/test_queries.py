@@ -57,6 +57,17 @@ class Remembering(TensorDictModuleBase):
         return td.set(keys.CHUNK, total[..., None])
 
 
+def test_what_a_policy_leaves_to_itself_is_not_recorded():
+    """Recorded beside a query it would be of that query, where it is to be read of the one before."""
+    policy = Remembering()
+    policy.device = torch.device("cpu")
+    actor = ChunkExecutor(policy, n_action_steps=1)
+    queries = record_queries(actor, lambda seeds: CountingEnv(), [1])
+    assert keys.FEATURES not in queries.keys(True, True)
+    assert torch.equal(answer(policy, queries)[keys.CHUNK], queries[keys.CHUNK])
+    assert queries[keys.CHUNK].flatten().tolist() == [0, 1, 3, 6, 10, 15, 21]
+
+
 def recorded():
     """Two episodes of three queries."""
     elapsed = torch.tensor([[0], [3], [3], [0], [3], [3]])

@@ -22,8 +22,8 @@ def record_queries(
 
     The queries are where the policy is; the environment is where it is made.
 
-    The chunk of the query before and the steps since, 0 in the first, are there whether the policy reads them or not, so that
-    another can be asked that does.
+    What the policy leaves to its own next query is left out: it would have to be the query before's. The chunk of that one and
+    the steps since, 0 in the first, are there whether the policy reads them or not, so that another can be asked that does.
 
     Args:
         actor: whose policy is asked.

@@ -19,9 +19,8 @@ from torchrl_sparse.runtime.backends import WorkerDied, ray_death
 
 __all__ = ["running_collector"]
 
-_STEPS_PER_BATCH = (
-    16  # between two reports: each takes time, and what was not reported when a kill came runs again
-)
+# Between two reports: each takes time, and what was not reported when a kill came runs again.
+_STEPS_PER_BATCH = 16
 
 
 @contextmanager
