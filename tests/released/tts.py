@@ -1,7 +1,7 @@
 """TTS as released (``ky-ji/Test-time-Sparsity``, read and run at commit ab1c72b), around a policy of ours.
 
-The release exchanges the layers of a policy's decoder, and asks its pruner on a CUDA stream while the decoder computes its first
-step. On a CPU it would never ask it: `ask_on_cpu` has it asked at the same place.
+The release exchanges the layers of a policy's decoder, and asks its pruner on a CUDA stream while the decoder computes its
+first step. On a CPU it would never ask it: `ask_on_cpu` has it asked at the same place.
 """
 
 import contextlib
