@@ -8,8 +8,8 @@ recalls what the last query that computed it had there (:mod:`torchrl_sparse.blo
 
 TTS chooses among the computed output, the latest of the type, the block's own latest and the recalled one with one softmax;
 here the rule is fixed for a planner, as SAG's is, and recalling is a choice of its own, so that the pruning can be trained and
-weighed exactly as SAG's. The first query of an episode computes everything.
-:mod:`torchrl_sparse.training.pruner.recalls` trains it.
+weighed exactly as SAG's. The first query of an episode computes everything. For equal choices, what is answered and the
+gradient of a gate are those of the release (``tests/released``). :mod:`torchrl_sparse.training.pruner.recalls` trains it.
 """
 
 from __future__ import annotations
