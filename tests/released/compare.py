@@ -7,8 +7,8 @@ and learning rates are the release's own; there, too, the noise of an answer is 
 folder already is not made again.
 """
 
-import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -23,8 +23,9 @@ from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.evaluation.rollouts.episodes import read_episodes, totals
 from torchrl_sparse.evaluation.rollouts.evaluate import evaluate
-from torchrl_sparse.evaluation.statistics.intervals import tango_interval
+from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.targets import make_targets
@@ -34,7 +35,8 @@ from torchrl_sparse.training.pruner.recalls import RecallTrainer
 
 from . import tts
 
-STEPS, RATE, TURNS, BATCH, ROUNDS, EPISODES = 10, 0.7, 4, 16, 250, 50
+STEPS, RATE, TURNS, BATCH, ROUNDS = 10, 0.7, 4, 16, 250
+EPISODES, MARGIN = 50, 0.05
 # The release's learning rates, whose schedule is planned for more epochs than there are.
 PEAK, LOWEST, EPOCHS, WARM, PLANNED = 1e-4, 1e-6, 20, 4, 45
 
@@ -156,17 +158,11 @@ def play(name, module, policy, task, out):
     options = {"log": log, "identity": {"task": task}, "num_envs": 1, "workers": 1, "policy_device": "cpu"}
     make_env, seeds = diffusion_env(task, policy, None), evaluation_seeds("test", 0, EPISODES)
     episodes = evaluate(name, ChunkExecutor(module, 8), make_env, seeds, backend="process", **options)
-    stored = Path(f"assets/{task}/test_split/episodes/tts.jsonl").read_text().splitlines()[1:]
-    beside = {row["seed"]: row["success"] for row in map(json.loads, stored)}
-    both = [(episode.success, beside[episode.seed]) for episode in episodes if episode.seed in beside]
-    won, lost = sum(this > tts for this, tts in both), sum(tts > this for this, tts in both)
-    return {
-        "episodes": len(both),
-        "solved": sum(this for this, _ in both),
-        "tts": sum(tts for _, tts in both),
-        "difference_ci95": tango_interval(won, lost, len(both)),
-        "prune_rate": sum(episode.prune_rate for episode in episodes) / len(episodes),
-    }
+    stored = read_episodes(f"assets/{task}/test_split/episodes/tts.jsonl")
+    pairs = pair_episodes(name, episodes, "tts", [episode for episode in stored if episode.seed in seeds])
+    solved, by_tts = map(sum, pairs.solved)
+    counts = {"solved": solved, "tts": by_tts, "prune_rate": totals(episodes).prune_rate}
+    return counts | asdict(pairs.success_difference(MARGIN))
 
 
 if __name__ == "__main__":
