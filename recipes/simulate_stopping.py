@@ -28,6 +28,9 @@ def main(config: DictConfig) -> None:
         print(
             f"{case.task}, {100 * case.difference:+.0f} points: {saved:.0f} % saved, {decided:.0f} % decided"
         )
+    for pair in results.pairs:
+        at = f"{pair.task}, both {100 * pair.difference:+.0f} points"
+        print(f"{at}: {pair.success:.1%} of equal methods seem to differ in success, {pair.time:.1%} in time")
 
 
 if __name__ == "__main__":

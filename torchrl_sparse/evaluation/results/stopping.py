@@ -10,10 +10,17 @@ from typing import Literal
 
 from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN
 from torchrl_sparse.evaluation.statistics.sequential import Design
-from torchrl_sparse.evaluation.statistics.stopping import Population, Savings, claim_rates, savings
+from torchrl_sparse.evaluation.statistics.stopping import (
+    Population,
+    Savings,
+    claim_rates,
+    pair_errors,
+    savings,
+)
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
+    "PairError",
     "SavedEpisodes",
     "StoppingResults",
     "TypeOne",
@@ -30,6 +37,7 @@ _TASKS = {
     "Square": Population(0.68, 0.0, 165),
 }
 _DIFFERENCES = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02)
+_PAIR_DIFFERENCES = (-0.2, -0.1, 0.0)  # of both from dense: stopped soon, later, late
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,20 @@ class SavedEpisodes:
 
 
 @dataclass(frozen=True)
+class PairError:
+    """How often the intervals of two equal methods exclude that they are, at a true difference of both from dense.
+
+    Attributes:
+        success, time: of the difference in success, and of the ratio of times.
+    """
+
+    task: str
+    difference: float
+    success: float
+    time: float
+
+
+@dataclass(frozen=True)
 class StoppingResults:
     """The content of a ``stopping.json``."""
 
@@ -63,6 +85,7 @@ class StoppingResults:
     type_one: tuple[TypeOne, ...]
     savings: tuple[SavedEpisodes, ...]
     dense_episodes: int | None = None
+    pairs: tuple[PairError, ...] = ()
 
 
 def simulate_stopping(
@@ -79,8 +102,9 @@ def simulate_stopping(
         ValueError: for a design that is none.
     """
     design = Design(max_episodes, looks, dense_episodes)
-    cases = tuple(_type_one(design, trials, seed)), tuple(_savings(design, trials, seed))
-    return StoppingResults(1, max_episodes, looks, trials, seed, *cases, dense_episodes)
+    simulated = (tuple(simulate(design, trials, seed)) for simulate in (_type_one, _savings, _pairs))
+    type_one, saved, pairs = simulated
+    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, dense_episodes, pairs)
 
 
 def _type_one(design: Design, trials: int, seed: int) -> Iterator[TypeOne]:
@@ -100,6 +124,13 @@ def _savings(design: Design, trials: int, seed: int) -> Iterator[SavedEpisodes]:
                 yield SavedEpisodes(task, difference, method.ratio, savings(method, design, trials, seed))
 
 
+def _pairs(design: Design, trials: int, seed: int) -> Iterator[PairError]:
+    for task, equal in _TASKS.items():
+        for difference in _PAIR_DIFFERENCES:
+            both = replace(equal, difference=difference)
+            yield PairError(task, difference, *pair_errors(both, design, trials, seed))
+
+
 def load_stopping(path: str | os.PathLike) -> StoppingResults:
     """Read a ``stopping.json``.
 
@@ -116,14 +147,15 @@ def save_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
 
 
 def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
-    """Return two tables, of false claims where a method is worse by the margin, and of episodes saved."""
+    """Return three tables: of false claims where a method is worse by the margin, of episodes saved, and of equal methods that
+    seem to differ."""
     claims = [
-        {"task": one.task, "margin": one.margin, "non-inferior all the same": f"{one.rate:.1%}"}
+        {"like": one.task, "margin": one.margin, "non-inferior all the same": f"{one.rate:.1%}"}
         for one in results.type_one
     ]
     saved = [
         {
-            "task": one.task,
+            "like": one.task,
             "true difference, points": f"{100 * one.difference:+.0f}",
             "time vs dense": f"{one.ratio:.2f}",
             "episodes saved": f"{one.savings.saved:.0%}",
@@ -132,4 +164,13 @@ def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
         }
         for one in results.savings
     ]
-    return {"claims": claims, "saved": saved}
+    pairs = [
+        {
+            "like": one.task,
+            "both to dense, points": f"{100 * one.difference:+.0f}",
+            "success seems to differ": f"{one.success:.1%}",
+            "time seems to differ": f"{one.time:.1%}",
+        }
+        for one in results.pairs
+    ]
+    return {"claims": claims, "saved": saved, "pairs": pairs}

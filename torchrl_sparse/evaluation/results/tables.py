@@ -10,7 +10,7 @@ __all__ = ["LEFT", "markdown_table", "select_columns"]
 
 LEFT = frozenset(
     {
-        *("task", "method", "family", "against", "verdict", "time verdict", "budget"),
+        *("task", "like", "method", "family", "against", "verdict", "time verdict", "budget"),
         *("latency", "variant", "part of a dense query", "at 20 times dense's speed"),
     }
 )

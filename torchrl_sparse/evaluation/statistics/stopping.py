@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN, time_z
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, discordant_pairs, tango_z
+from torchrl_sparse.evaluation.statistics.intervals import (
+    DEFAULT_MARGIN,
+    discordant_pairs,
+    tango_interval,
+    tango_z,
+)
 from torchrl_sparse.evaluation.statistics.overlap import Further
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
-__all__ = ["Population", "Savings", "claim_rates", "savings"]
+__all__ = ["Population", "Savings", "claim_rates", "pair_errors", "savings"]
 
 _SHAPE = 12.0  # of the gamma distribution of the steps to success: a spread of 29 %, dense's own on Can
+_Look = tuple[int, tuple[float, float]]  # episodes; standard errors above the margins of success and of time
 
 
 @dataclass(frozen=True)
@@ -108,21 +114,48 @@ def savings(population: Population, design: Design, trials: int, seed: int = 0) 
     fixed, totals = Design(design.max_episodes), np.zeros(4)
     for looks in _trials(population, design, trials, seed):
         looks = list(looks)
-        n, worst = next(((n, min(z)) for n, z in looks if design.decides(n, *z)), (design.max_episodes, 0.0))
+        n, worst = _stop(looks, design)
         at_cap = min(looks[-1][1]) > fixed.critical(design.max_episodes)
         totals += 1 - n / design.max_episodes, worst > 0, worst < 0, at_cap
     return Savings(*(float(total) / trials for total in totals))
 
 
-def _trials(
-    population: Population, design: Design, trials: int, seed: int
-) -> Iterator[Iterator[tuple[int, tuple[float, float]]]]:
-    """Yield, of each benchmark, the number of episodes and both statistics at each look."""
+def pair_errors(population: Population, design: Design, trials: int, seed: int = 0) -> tuple[float, float]:
+    """Return how often two equal methods, each stopped by how it compares with dense, seem to differ: in success, and in time.
+
+    Their ordinary 95 % intervals, of the episodes that both played, know nothing of what stopped either.
+
+    Args:
+        population: of the episodes of both.
+        design, trials, seed: see `claim_rates`.
+    """
+    generator, errors = np.random.default_rng(seed), np.zeros(2)
+    for _ in range(trials):
+        first, dense = population.draw(design.num_seeds, generator)
+        second, _ = population.draw(design.num_seeds, generator)
+        n = min(_stop(_looks(method, dense, design, population), design)[0] for method in (first, second))
+        first, second, horizon = first[:n], second[:n], population.horizon
+        low, high = tango_interval(*discordant_pairs(first < horizon, second < horizon))
+        errors += not low <= 0 <= high, Design(n).decides(n, time_z(first, second, horizon, 1.0))
+    return float(errors[0]) / trials, float(errors[1]) / trials
+
+
+def _stop(looks: Iterable[_Look], design: Design) -> tuple[int, float]:
+    """Return the episodes after which a verdict is reached and the lesser of the statistics that reach it, 0 at an open end."""
+    return next(((n, min(z)) for n, z in looks if design.decides(n, *z)), (design.max_episodes, 0.0))
+
+
+def _trials(population: Population, design: Design, trials: int, seed: int) -> Iterator[Iterator[_Look]]:
+    """Yield the looks of each benchmark."""
     generator = np.random.default_rng(seed)
     for _ in range(trials):
-        method, dense = population.draw(design.num_seeds, generator)
-        known = dense[: design.dense_episodes or 0]
-        yield ((n, _statistics(method[:n], dense[:n], known[n:], population.horizon)) for n in design.ends)
+        yield _looks(*population.draw(design.num_seeds, generator), design, population)
+
+
+def _looks(method: NDArray, dense: NDArray, design: Design, population: Population) -> Iterator[_Look]:
+    """Yield the number of episodes and both statistics at each look."""
+    known, horizon = dense[: design.dense_episodes or 0], population.horizon
+    return ((n, _statistics(method[:n], dense[:n], known[n:], horizon)) for n in design.ends)
 
 
 def _statistics(method: NDArray, dense: NDArray, more: NDArray, horizon: int) -> tuple[float, float]:
