@@ -38,7 +38,8 @@ class PrunerConfig:
         final_temperature: of ``"gumbel"`` at the last update; between, it falls or rises by the same factor in every
             update. None leaves it as it is.
         variety: weight of a reward for masks that follow the observation, see
-            :func:`~torchrl_sparse.training.pruner.loss.mutual_information`; 0 as published.
+            :func:`~torchrl_sparse.training.pruner.loss.variety_reward`; 0 as published.
+        information: bits of a cell up to which variety is rewarded, by its logarithm; None rewards it by itself, without end.
         sparsity: ``"global"``, or ``"block"``: every block has to reach the rate by itself (the paper's ablation).
         cost: what the rate counts: ``"blocks"`` (published), or each weighed by the ``"flops"`` or the measured
             ``"seconds"`` of its type.
@@ -71,6 +72,7 @@ class PrunerConfig:
     temperature: float = 1.0
     final_temperature: float | None = None
     variety: float = 0.0
+    information: float | None = None
     sparsity: Literal["global", "block"] = "global"
     cost: Cost = "blocks"
     reuse: Reuse = "block"
@@ -105,6 +107,10 @@ class PrunerConfig:
                 raise ValueError(f"{name}: expected a positive number, got {value}")
         if not self.variety >= 0:
             raise ValueError(f"variety: expected a weight >= 0, got {self.variety}")
+        if self.information is not None and not 0 < self.information <= 1:
+            raise ValueError(f"information: expected bits in (0, 1], or None, got {self.information}")
+        if self.information is not None and self.variety == 0:
+            raise ValueError(f"information: expected None without variety, got {self.information}")
 
     def temperature_at(self, progress: float) -> float:
         """Return the temperature at a share of the training, 0 to 1.

@@ -16,6 +16,7 @@ __all__ = [
     "mutual_information",
     "rate_metrics",
     "sparsity_loss",
+    "variety_reward",
     "varying_share",
     "weighted_rate",
 ]
@@ -55,6 +56,20 @@ def mutual_information(logits: Tensor) -> Tensor:
     """
     probability = logits[:, 1:].sigmoid().clamp(1e-6, 1 - 1e-6)  # an entropy's slope is infinite at its ends
     return (_entropy(probability.mean(dim=0)) - _entropy(probability).mean(dim=0)).mean()
+
+
+def variety_reward(information: Tensor, asked: float | None) -> Tensor:
+    """Return the reward of masks that tell ``information`` bits of their observations, a scalar.
+
+    Information itself, if none is asked for. Its slope goes to 0 as gates come to prune alike, and then nothing holds them
+    apart; with bits that are ``asked`` it is ``log2(information / asked)``, whose slope does not, and 0 from there on.
+
+    >>> variety_reward(torch.tensor(0.01), 0.04).item(), variety_reward(torch.tensor(0.5), 0.04).item()
+    (-2.0, 0.0)
+    """
+    if asked is None:
+        return information
+    return (information.clamp(min=1e-8) / asked).log2().clamp(max=0)
 
 
 def _entropy(probability: Tensor) -> Tensor:

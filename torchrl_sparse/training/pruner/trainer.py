@@ -39,6 +39,7 @@ from torchrl_sparse.training.pruner.loss import (
     mutual_information,
     rate_metrics,
     sparsity_loss,
+    variety_reward,
     varying_share,
 )
 from torchrl_sparse.training.trainer import Trainer, checksum
@@ -117,8 +118,10 @@ class PrunerTrainer(Trainer):
         sparsity = sparsity_loss(gate, rate, self.weight, per_block=config.sparsity == "block")
         information = mutual_information(logits)
         loss = fidelity + config.beta * sparsity
+        if config.variety:
+            loss = loss - config.variety * variety_reward(information, config.information)
         return {
-            "loss": loss - config.variety * information if config.variety else loss,
+            "loss": loss,
             "fidelity": fidelity,
             "sparsity": sparsity,
             "information": information.detach(),
