@@ -57,6 +57,18 @@ def test_a_reward_for_variety_makes_masks_follow_the_observation(policy, targets
     assert information[1] > 1.2 * information[0] > 0
 
 
+def test_information_that_is_asked_for_is_kept_where_a_reward_of_itself_lets_go(policy, targets):
+    """Both begin alike, and a high weight of the rate drives their masks together."""
+    kept = {}
+    for asked in (None, 0.05):
+        gates = sag_gates(policy)
+        spread_logits(gates, targets, 0.5)
+        options = {"variety": 0.1, "information": asked, "rate": 0.8, "beta": 5.0}
+        trainer = trainer_of(policy, targets, gates, max_updates=60, epochs=100, lr=3e-3, **options)
+        kept[asked] = [trainer.train_step()["information"] for _ in range(trainer.total)][-1]
+    assert kept[None] < 0.02 < kept[0.05]
+
+
 def begun_from_a_mask(policy, targets):
     """SAG's training as the recipe's `init` begins it; how far so few updates get from random gates is a matter of rounding."""
     gates = sag_gates(policy)
@@ -193,6 +205,8 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
         ({"lr": 0.0}, "lr: expected a positive number, got 0.0"),
         ({"final_temperature": 0.0}, "final_temperature: expected a positive number, got 0.0"),
         ({"variety": -1.0}, "variety: expected a weight >= 0, got -1.0"),
+        ({"variety": 0.1, "information": 1.5}, r"information: expected bits in \(0, 1\], or None, got 1.5"),
+        ({"information": 0.1}, "information: expected None without variety, got 0.1"),
     ],
 )
 def test_a_wrong_configuration_is_refused(options, message):
