@@ -192,7 +192,7 @@ OPTIONS: dict[str, Any] = {
     "temperature": Positive,
     "final_temperature": Positive | None,
     "variety": NotNegative,
-    "information": Between | None,
+    "information": Share | None,
     "spread": Positive | None,
     "sparsity": Word,
     "cost": Word,

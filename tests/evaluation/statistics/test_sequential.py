@@ -105,7 +105,7 @@ def test_published_simulations_are_what_their_commands_make(name, dense_episodes
         assert tasks[0] == tasks[1] != []
 
 
-def test_equal_methods_that_dense_stopped_seem_to_differ_no_more_often_than_intervals_say():
+def test_equal_methods_that_dense_stopped_seem_to_differ_about_as_often_as_intervals_say():
     """With one look nothing but the intervals is tested."""
     population = Population(0.8, -0.15, 100)
     for design in (Design(200), Design(300, looks=15)):

@@ -102,8 +102,7 @@ def simulate_stopping(
         ValueError: for a design that is none.
     """
     design = Design(max_episodes, looks, dense_episodes)
-    simulated = (tuple(simulate(design, trials, seed)) for simulate in (_type_one, _savings, _pairs))
-    type_one, saved, pairs = simulated
+    type_one, saved, pairs = (tuple(cases(design, trials, seed)) for cases in (_type_one, _savings, _pairs))
     return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, dense_episodes, pairs)
 
 
