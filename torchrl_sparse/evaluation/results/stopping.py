@@ -20,7 +20,7 @@ from torchrl_sparse.evaluation.statistics.stopping import (
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
-    "PairError",
+    "EqualPair",
     "SavedEpisodes",
     "StoppingResults",
     "TypeOne",
@@ -60,7 +60,7 @@ class SavedEpisodes:
 
 
 @dataclass(frozen=True)
-class PairError:
+class EqualPair:
     """How often the intervals of two equal methods exclude that they are, at a true difference of both from dense.
 
     Attributes:
@@ -85,7 +85,7 @@ class StoppingResults:
     type_one: tuple[TypeOne, ...]
     savings: tuple[SavedEpisodes, ...]
     dense_episodes: int | None = None
-    pairs: tuple[PairError, ...] = ()
+    pairs: tuple[EqualPair, ...] = ()
 
 
 def simulate_stopping(
@@ -123,11 +123,11 @@ def _savings(design: Design, trials: int, seed: int) -> Iterator[SavedEpisodes]:
                 yield SavedEpisodes(task, difference, method.ratio, savings(method, design, trials, seed))
 
 
-def _pairs(design: Design, trials: int, seed: int) -> Iterator[PairError]:
+def _pairs(design: Design, trials: int, seed: int) -> Iterator[EqualPair]:
     for task, equal in _TASKS.items():
         for difference in _PAIR_DIFFERENCES:
             both = replace(equal, difference=difference)
-            yield PairError(task, difference, *pair_errors(both, design, trials, seed))
+            yield EqualPair(task, difference, *pair_errors(both, design, trials, seed))
 
 
 def load_stopping(path: str | os.PathLike) -> StoppingResults:
