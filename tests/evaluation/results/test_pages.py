@@ -8,8 +8,8 @@ import pytest
 
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.evaluation.results.pages import find_pages, write_pages, write_tables
-from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.results.schema import load_results, save_results
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult, read_episodes
 
 ASSETS = Path(__file__).parents[3] / "assets"
 
@@ -90,6 +90,17 @@ def test_pairs_count_the_episodes_beside_the_results(root):
     heading, row = table('results.json pairs="bac : ddim10"', root)
     assert heading == ["method", "against", "success", "difference, points", "verdict"]
     assert row[:3] == ["bac", "ddim10", "20 : 15"]
+
+
+def test_a_row_counts_as_many_episodes_as_its_results_say_whatever_its_log_has():
+    name, results = "ddpm3_logsnr", load_results(ASSETS / "lift_two_ways/results.json")
+    counted = results.methods[name].success
+    log = [*read_episodes(ASSETS / f"lift_two_ways/episodes/{name}.jsonl")]
+    assert counted.n < len(log)  # played further for another table
+    heading, row = table(f"lift_two_ways/results.json rows=ways methods={name}", ASSETS)
+    told = dict(zip(heading, row, strict=True))
+    assert int(told["episodes"]) == counted.n
+    assert int(told["way 0"]) + int(told["way 1"]) == counted.k
 
 
 def test_other_files_of_results_have_their_tables():
