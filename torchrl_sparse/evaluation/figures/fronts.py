@@ -60,6 +60,7 @@ _FAMILIES = (
     _Family("deterministic steps", r"ddim\d+(_logsnr)?", "#E69F00", "^"),
     _Family("stochastic steps, 8 bits", r"ddpm\d+(_logsnr)?:int8", "#56B4E9", "o"),
     _Family("dense, 8 bits", "dense:int8", "#56B4E9", "s"),
+    _Family("dense, bf16", "dense:bf16", "#B5DDF2", "s"),
     _Family("SAG", "sag", "#CC79A7", "D"),
     _Family("its mean mask", "sag_fixed", "#E7B5D0", "D"),
     _Family("L2C", "l2c", "#009E73", "v"),
@@ -67,10 +68,13 @@ _FAMILIES = (
     _Family("fixed interval", "uniform7", "#4D4D4D", "X"),
     _Family("BAC on ten stochastic steps", "bac_ddpm10", "#F2A19B", "P"),
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
+    _Family("L2C on them", "l2c_type70_ddpm10", "#66C2A5", "v"),
+    _Family("a pruner that looks, on them", "sag_type70_ddpm10", "#882255", "D"),
     _Family("the last two of five, from the last chunk", "ddpm5_logsnr_warm2", "#7F3C8D", "<"),
     _Family("searched mask and timesteps", "searched", "#D55E00", "*"),
     _Family("TTS", "tts", "#8C564B", "p"),
     _Family("its mean choice", "tts_fixed", "#C49C94", "p"),
+    _Family("a searched choice", "recalling", "#E8C9C0", "p"),
 )
 
 _USUAL_INTERVAL = 8  # environment steps between queries, of all policies here
@@ -135,9 +139,10 @@ def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -
     _share_scales(*grid)
     grid[0][0].set_ylabel("success or score,\npoints over dense's")
     grid[1][0].set_ylabel("time to success over dense's,\nlog scale, less is further up")
+    shown = [family.label for family in axis.families if family.label in handles]
     figure.legend(
-        handles.values(),
-        handles.keys(),
+        [handles[label] for label in shown],
+        shown,
         loc="outside lower center",
         ncols=2 if len(tasks) <= 2 else 4,
         frameon=False,
