@@ -182,10 +182,12 @@ def _scores(path: Path) -> Table:
 
 def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
     """Read the episodes of methods that are of these results, of each as many as they say; a log may have more."""
-    logs = {name: read_episodes(path.parent / "episodes" / f"{name}.jsonl") for name in names}
-    ends = {name: results.first_seed + results.methods[name].success.n for name in names}
-    seeds = {name: range(results.first_seed, end) for name, end in ends.items()}
-    return {name: [episode for episode in log if episode.seed in seeds[name]] for name, log in logs.items()}
+    found = {}
+    for name in names:
+        seeds = range(results.first_seed, results.first_seed + results.methods[name].success.n)
+        log = read_episodes(path.parent / "episodes" / f"{name}.jsonl")
+        found[name] = [episode for episode in log if episode.seed in seeds]
+    return found
 
 
 def _table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
