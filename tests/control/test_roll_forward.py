@@ -60,6 +60,17 @@ def test_a_linear_world_is_found_exactly(model):
     torch.testing.assert_close(stale, torch.cat(expected).mean(dim=0))
 
 
+def test_commands_that_never_turn_leave_the_model_as_it_is(model):
+    # As demonstrations of Can do: entries of the rotation are 1 or 0 in every step, which makes their columns one and the same.
+    still = torch.tensor([1.0, 0.0, 1.0]).expand(30, 3)
+    episodes = [
+        (states, torch.cat([actions, still], dim=1)) for states, actions in map(episode, [30] * 4, range(4))
+    ]
+    weight = StateModel.fit(episodes).weight
+    torch.testing.assert_close(torch.cat([weight[:5], weight[-1:]]), model.weight, rtol=0, atol=1e-12)
+    assert not weight[5:8].any()
+
+
 def test_a_number_that_never_changes_stays():
     states, actions = episode(30, 0)
     model = StateModel.fit([(torch.cat([states, torch.full((30, 1), 7.0)], dim=1), actions)])
