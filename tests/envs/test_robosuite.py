@@ -232,10 +232,15 @@ def test_a_ready_made_environment_is_made_anew_where_it_is_sent():
     assert (copy.reset() == first).all()
 
 
-@pytest.mark.parametrize("task", ["Lift", "TwoArmTransport"])
-def test_observing_only_when_asked_changes_no_bit_of_an_episode(task):
-    spared, usual = (RobosuiteEnv(task, action_mode="delta", seeds=[7]) for _ in range(2))
-    del usual.sim_env._update_observables  # the class's own, in every substep
+@pytest.mark.parametrize(
+    ("task", "mode"), [("Lift", "delta"), ("LiftMoving", "absolute"), ("TwoArmTransport", "delta")]
+)
+def test_what_substeps_are_spared_changes_no_bit_of_an_episode(task, mode):
+    spared, usual = (RobosuiteEnv(task, action_mode=mode, seeds=[7]) for _ in range(2))
+    del (
+        usual.sim_env._update_observables,
+        usual.sim_env._load_robots,
+    )  # the class's own, which do all in every substep
     torch.manual_seed(0)
     actions = [spared.action_spec.rand() for _ in range(12)]
     for one, other in zip(*(steps_of(env, actions) for env in (spared, usual)), strict=True):

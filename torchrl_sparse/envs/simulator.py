@@ -6,9 +6,11 @@ import logging
 import os
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+import numpy as np
 
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
@@ -57,6 +59,7 @@ def make_simulator(
         control_freq=control_freq,
     )
     _observe_when_asked(sim_env)
+    _command_arms_alone(sim_env)
     return sim_env
 
 
@@ -69,6 +72,39 @@ def _observe_when_asked(sim_env: Any) -> None:
             update(force=True)
 
     sim_env._update_observables = update_if_forced
+
+
+def _command_arms_alone(sim_env: Any) -> None:
+    """Spare the simulator, in all substeps of a step but the first, what its robots' control finds unchanged there.
+
+    That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has.
+    """
+    load = sim_env._load_robots
+
+    def load_robots() -> None:  # at each reset
+        load()
+        for robot in sim_env.robots:
+            robot.control = _arms_between_actions(robot)
+
+    sim_env._load_robots = load_robots
+
+
+def _arms_between_actions(robot: Any) -> Callable[..., None]:
+    """Return the robot's ``control``, which goes on as it was told to where the action is not a new one."""
+    follow = robot.control
+
+    def control(action: np.ndarray, policy_step: bool = False) -> None:
+        if policy_step:
+            return follow(action, policy_step=True)
+        for arm in robot.arms:
+            torques, actuators = (
+                robot.part_controllers[arm].run_controller(),
+                robot._ref_actuators_indexes_dict[arm],
+            )
+            limits = robot.sim.model.actuator_ctrlrange[actuators]
+            robot.sim.data.ctrl[actuators] = np.clip(torques, limits[:, 0], limits[:, 1])
+
+    return control
 
 
 def controller_config(absolute: bool) -> dict:
