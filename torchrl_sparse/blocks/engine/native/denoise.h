@@ -23,6 +23,12 @@
 #elif defined(__x86_64__)
 #define X86
 #include <immintrin.h>
+#if defined(__linux__) && (defined(__clang__) || __GNUC__ >= 11)
+#define X86_TILES
+#include <cpuid.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
 #elif defined(__aarch64__)
 #define ARM
 #include <arm_neon.h>
@@ -169,6 +175,14 @@ struct Buffers {
 #define TARGET "avx512bf16,avx512vnni,avx512f,avx2,fma,f16c"
 #define DOTS
 #include "denoise.h"
+#if defined(X86_TILES)
+#define LEVEL amx
+#define VECTOR 16
+#define TARGET "amx-tile,amx-bf16,avx512bf16,avx512vnni,avx512f,avx2,fma,f16c"
+#define DOTS
+#define TILES
+#include "denoise.h"
+#endif
 #endif
 
 namespace {
@@ -185,17 +199,36 @@ const Level LEVELS[] = {
     {avx2::denoise, avx2::run_blocks, avx2::prune},
     {avx512::denoise, avx512::run_blocks, avx512::prune},
     {avx512_bf16::denoise, avx512_bf16::run_blocks, avx512_bf16::prune},
+#if defined(X86_TILES)
+    {amx::denoise, amx::run_blocks, amx::prune},
+#endif
 #endif
 };
 
-// Instruction sets that this CPU can run: the first 1 to 4 of LEVELS.
+#if defined(X86_TILES)
+// Whether the CPU has AMX, and Linux lets this process use it, for which it has to be asked.
+bool has_tiles() {
+    constexpr unsigned int NEEDED = 1u << 22 | 1u << 24;  // of BF16, and any
+    constexpr long REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM of XFEATURE_XTILEDATA
+    unsigned int a, b, c, d;
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (d & NEEDED) != NEEDED) return false;
+    return syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
+}
+#endif
+
+// Instruction sets that this CPU can run: so many of LEVELS, from the first.
 int32_t levels() {
 #if defined(ARM)
     return 2;
 #elif defined(X86)
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return 1;
     if (!__builtin_cpu_supports("avx512f")) return 2;
-    return __builtin_cpu_supports("avx512bf16") && __builtin_cpu_supports("avx512vnni") ? 4 : 3;
+    if (!__builtin_cpu_supports("avx512bf16") || !__builtin_cpu_supports("avx512vnni")) return 3;
+#if defined(X86_TILES)
+    return has_tiles() ? 5 : 4;
+#else
+    return 4;
+#endif
 #else
     return 1;
 #endif
@@ -395,6 +428,63 @@ INLINE void tiles(int count, const float* x, int ldx, const T* w, int rows, cons
     }
 }
 
+// What `tile` does, where the processor has tiles of its own for it; else false. (8 bits in such tiles were no faster.)
+struct Tiles;
+template <class T>
+INLINE bool in_tiles(Tiles&, int, const float*, ptrdiff_t, const T*, int, const float*, ptrdiff_t, float*, ptrdiff_t) {
+    return false;
+}
+
+#if defined(TILES)
+constexpr int TILE = 16;  // rows, and pairs of BF16 in each
+
+struct Shapes {
+    uint8_t palette = 1, start = 0, reserved[14] = {};
+    uint16_t bytes[16] = {};  // of a row
+    uint8_t rows[16] = {};
+};
+
+struct Tiles {
+    int rows = 0;  // of activations
+
+    // Tiles 0 and 1 are sums, 2 are activations; 3 and 4 are weights.
+    void shape(int count) {
+        Shapes shapes;
+        for (int i = 0; i < 5; i++) {
+            shapes.bytes[i] = 4 * TILE;
+            shapes.rows[i] = (uint8_t)(i < 3 ? count : TILE);
+        }
+        _tile_loadconfig(&shapes);
+        rows = count;
+    }
+    ~Tiles() {
+        if (rows) _tile_release();  // or each switch to another process would save them
+    }
+};
+
+INLINE bool in_tiles(Tiles& tiles, int count, const float* x, ptrdiff_t ldx, const Pair* w, int rows, const float* start,
+                     ptrdiff_t ld_start, float* y, ptrdiff_t ldy) {
+    constexpr int AHEAD = 4 * TILE;
+    if (rows % TILE) return false;
+    if (tiles.rows != count) tiles.shape(count);
+    _tile_loadd(0, start, 4 * ld_start);
+    _tile_loadd(1, start + TILE, 4 * ld_start);
+    for (int k = 0; k < rows; k += TILE, w += TILE * PANEL) {
+        for (int i = 0; i < TILE * PANEL; i += TILE) __builtin_prefetch(w + AHEAD * PANEL + i, 0, 2);
+        _tile_loadd(2, x + k, 4 * ldx);
+        _tile_loadd(3, w, 4 * PANEL);
+        _tile_loadd(4, w + TILE, 4 * PANEL);
+        _tile_dpbf16ps(0, 2, 3);
+        _tile_dpbf16ps(1, 2, 4);
+    }
+    _tile_stored(0, y, 4 * ldy);
+    _tile_stored(1, y + TILE, 4 * ldy);
+    return true;
+}
+#else
+struct Tiles {};
+#endif
+
 // From `first` up to `last`: what is one thread's of so many items.
 struct Range { int first, last; };
 
@@ -402,6 +492,7 @@ struct Range { int first, last; };
 template <class T>
 void multiply(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) {
     const int groups = (n + MAX_ROWS - 1) / MAX_ROWS;
+    Tiles own;
     for (int k = 0; k < a.rows; k += PART) {
         const int depth = a.rows - k < PART ? a.rows - k : PART;
         const T* w = (const T*)a.weight + (size_t)k * a.columns + (size_t)columns.first * depth;
@@ -410,6 +501,8 @@ void multiply(const float* x, int ldx, int n, const Matrix& a, Range columns, fl
         for (int c = columns.first; c < columns.last; c += PANEL, w += (size_t)depth * PANEL)
             for (int g = 0; g < groups; g++) {
                 const int m = n * g / groups, count = n * (g + 1) / groups - m;
+                if (in_tiles(own, count, x + m * ldx + k, ldx, w, depth, start + m * ld_start + c, ld_start, y + m * ldy + c, ldy))
+                    continue;
                 tiles<MAX_ROWS>(count, x + m * ldx + k, ldx, w, depth, start + m * ld_start + c, ld_start,
                                 y + m * ldy + c, ldy);
             }
@@ -832,5 +925,6 @@ void prune(const Pruner& p, const Member& who, const float* observation, float* 
 #undef VECTOR
 #undef TARGET
 #undef DOTS
+#undef TILES
 #undef NEON
 #endif

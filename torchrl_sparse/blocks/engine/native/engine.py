@@ -52,7 +52,7 @@ class NativeEngine:
         network: the denoiser, in eval mode; see `native_supports`.
         sampler: the sampler.
         weights: ``"float32"``; ``"float16"`` for half the memory; ``"bfloat16"`` for half the memory and, on a CPU
-            with AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well; ``"int8"`` for a
+            with AMX or AVX512-BF16, twice the multiply-adds, with activations rounded to bfloat16 as well; ``"int8"`` for a
             quarter of the memory and, with AVX512-VNNI, four times the multiply-adds: weights of the trunk are rounded to
             8 bits by output, activations by token between the least and the largest of it, so that no data are needed
             to calibrate them; embedding, head, norms, softmax, cross-attention and the residual stream stay float32.
