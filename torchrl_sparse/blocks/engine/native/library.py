@@ -19,7 +19,10 @@ from torchrl_sparse.blocks.engine.native.packing import Model
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
 
 _OF_MACHINE = {"aarch64": ("neon",), "arm64": ("neon",)}
-INSTRUCTION_SETS = ("portable", *_OF_MACHINE.get(platform.machine(), ("avx2", "avx512", "avx512_bf16", "amx")))
+INSTRUCTION_SETS = (
+    "portable",
+    *_OF_MACHINE.get(platform.machine(), ("avx2", "avx512", "avx512_bf16", "amx")),
+)
 # Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),
