@@ -64,9 +64,7 @@ class StateModel(nn.Module):
         inputs = torch.cat([_inputs(state[:-2], state[1:-1], action[1:-1]) for state, action in long_enough])
         change = torch.cat([state[2:].double() - state[1:-1].double() for state, _ in long_enough])
         scale = inputs.std(dim=0)
-        scale[scale < _SMALLEST_DEVIATION] = (
-            torch.inf
-        )  # several such columns are one and the same, and that of ones is there
+        scale[scale < _SMALLEST_DEVIATION] = torch.inf  # such a column says what that of ones says
         scale[-1] = 1.0
         inputs /= scale
         ridge = _RIDGE * torch.eye(inputs.shape[1], dtype=torch.float64)
