@@ -64,6 +64,13 @@ def test_several_files_are_one_table_or_stand_side_by_side():
     assert table(compared, ASSETS)[1][1] == "1.00×"  # dense is not compared with itself
 
 
+def test_a_policy_with_cameras_has_a_column_of_its_own():
+    files = "lift/test_split/results.json lift_image/results.json"
+    heading, row = table(f'{files} methods="dense" cells="success, %"', ASSETS)
+    assert heading == ["method", "Lift", "Lift, cameras"]
+    assert row[1:] == ["99.5 [99, 100]", "100.0 [99, 100]"]
+
+
 def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
     files = "lift_two_ways/results.json pusht/results.json"
     cells = f'{files} methods="dense | bac" cells="success or score | time vs dense"'

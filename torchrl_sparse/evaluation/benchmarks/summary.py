@@ -23,13 +23,17 @@ def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) ->
     Examples:
         >>> describe_policy(DiffusionPolicy.from_pretrained("assets/lift"), 8).num_inference_steps
         100
+        >>> describe_policy(DiffusionPolicy.from_pretrained("assets/lift_image"), 8).cameras
+        ('image', 'wrist_image')
     """
+    vision = policy.vision if isinstance(policy, DiffusionPolicy) else None
     return PolicyShape(
         params=sum(parameter.numel() for parameter in policy.network.parameters()),
         num_inference_steps=policy.num_inference_steps,
         horizon=policy.horizon,
         n_obs_steps=policy.n_obs_steps,
         n_action_steps=n_action_steps,
+        cameras=() if vision is None else vision.cameras,
     )
 
 

@@ -157,7 +157,7 @@ def _by_task(results: Sequence[AnyResults]) -> dict[str, list[Results]]:
     for one in results:
         if not isinstance(one, Results) or one.dense.time_vs_dense is None:
             raise ValueError(f"fronts: expected results with times to success, got {one.task} without them")
-        tasks.setdefault(f"{one.task}, score" if one.by_degrees else one.task, []).append(one)
+        tasks.setdefault(f"{one.subject}, score" if one.by_degrees else one.subject, []).append(one)
     return tasks
 
 

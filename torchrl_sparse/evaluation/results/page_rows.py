@@ -95,13 +95,13 @@ def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
-    methods = _table(results.task, whole, len(rows[0]))
+    methods = _table(results.subject, whole, len(rows[0]))
     pairs = results.pairs if isinstance(results, Results) else None
-    compared = {"pairs": _table(results.task, comparison_rows(pairs))} if pairs else {}
+    compared = {"pairs": _table(results.subject, comparison_rows(pairs))} if pairs else {}
     if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
         return {"methods": methods} | compared
     headline, budgets = headline_rows(results), budget_rows(results)
-    chosen = {"headline": _table(results.task, headline), "budgets": _table(results.task, budgets)}
+    chosen = {"headline": _table(results.subject, headline), "budgets": _table(results.subject, budgets)}
     return {"methods": methods} | compared | chosen
 
 

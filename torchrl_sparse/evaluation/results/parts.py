@@ -33,13 +33,15 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed."""
+    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed, and the
+    cameras of a diffusion policy that has some."""
 
     params: int
     num_inference_steps: int
     horizon: int
     n_obs_steps: int
     n_action_steps: int
+    cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -146,6 +146,8 @@ class Stopping:
 class _Methods:
     """The fields and methods of both versions."""
 
+    task: str
+    policy: PolicyShape
     methods: dict[str, MethodEntry]
 
     def _check_methods(self, *, same_episodes: bool = True) -> None:
@@ -156,6 +158,11 @@ class _Methods:
             got = method.success.n
             fits = got == n if same_episodes else got <= n
             require(fits, f"methods.{name}.success.n", expected, got)
+
+    @property
+    def subject(self) -> str:
+        """What tables and figures of several results tell apart: the task, and whether the policy has cameras for it."""
+        return f"{self.task}, cameras" if self.policy.cameras else self.task
 
     @property
     def by_degrees(self) -> bool:
