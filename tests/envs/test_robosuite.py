@@ -1,6 +1,8 @@
 """Real robosuite environments, state only."""
 
+import gc
 import pickle
+import weakref
 from functools import partial
 
 import numpy as np
@@ -247,6 +249,19 @@ def test_what_substeps_are_spared_changes_no_bit_of_an_episode(task, mode):
         assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True))
     spared.close()
     usual.close()
+
+
+def test_a_reset_leaves_no_simulator_behind():
+    """Not even until Python looks for cycles, which it may do after hundreds of episodes."""
+    env = RobosuiteEnv("Lift", action_mode="delta", seeds=[7, 8])
+    env.reset()
+    earlier = weakref.ref(env.sim_env.sim), weakref.ref(env.sim_env.robots[0])
+    gc.disable()
+    try:
+        env.reset()
+        assert [find() for find in earlier] == [None, None]
+    finally:
+        gc.enable()
 
 
 def steps_of(env, actions):

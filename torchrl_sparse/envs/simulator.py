@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import types
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -90,17 +91,19 @@ def _command_arms_alone(sim_env: Any) -> None:
 
 
 def _arms_between_actions(robot: Any) -> Callable[..., None]:
-    """Return the robot's ``control``, which goes on as it was told to where the action is not a new one."""
-    follow = robot.control
+    """Return the robot's ``control``, which goes on as it was told to where the action is not a new one.
+
+    It does not keep the robot: with it each reset's simulator would stay in memory until Python looks for cycles.
+    """
+    follow, find = type(robot).control, weakref.ref(robot)
 
     def control(action: np.ndarray, policy_step: bool = False) -> None:
+        robot = find()
         if policy_step:
-            return follow(action, policy_step=True)
+            return follow(robot, action, policy_step=True)
         for arm in robot.arms:
-            torques, actuators = (
-                robot.part_controllers[arm].run_controller(),
-                robot._ref_actuators_indexes_dict[arm],
-            )
+            torques = robot.part_controllers[arm].run_controller()
+            actuators = robot._ref_actuators_indexes_dict[arm]
             limits = robot.sim.model.actuator_ctrlrange[actuators]
             robot.sim.data.ctrl[actuators] = np.clip(torques, limits[:, 0], limits[:, 1])
 
