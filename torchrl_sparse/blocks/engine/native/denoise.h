@@ -12,7 +12,7 @@
 //   sums in the same order whatever the number of threads.
 // * Nothing is allocated: all memory of a query is its `scratch`, so that any number of queries may run at a time.
 // * Every buffer row is padded to whole vectors and the padding of weights is zero, so that no loop has a remainder.
-// * The kernels are written once, with the vector types of GCC and Clang, and compiled for up to four instruction sets by
+// * The kernels are written once, with the vector types of GCC and Clang, and compiled for up to five instruction sets by
 //   including this file in itself. The caller chooses one of LEVELS at run time.
 
 #ifndef VECTOR  // ---------------------------------------------------------------------- what is compiled only once
