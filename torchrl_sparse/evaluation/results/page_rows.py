@@ -161,7 +161,7 @@ def _vla(path: Path) -> dict[str, Table]:
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
     episodes = _episodes(path, results, {name for pair in pairs for name in pair})
-    return _table(results.task, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
+    return _table(results.subject, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
 
 
 def _ways(path: Path) -> Table:
@@ -169,7 +169,7 @@ def _ways(path: Path) -> Table:
     ways = told_ways(_episodes(path, results, results.methods))
     if not ways:
         raise ValueError(f"rows: expected episodes of {results.task} that tell their ways, got none")
-    return _table(results.task, way_rows(ways))
+    return _table(results.subject, way_rows(ways))
 
 
 def _scores(path: Path) -> Table:
@@ -177,7 +177,7 @@ def _scores(path: Path) -> Table:
     scores = told_scores(_episodes(path, results, results.methods))
     if not scores:
         raise ValueError(f"rows: expected episodes of {results.task} with scores, got none")
-    return _table(results.task, score_rows(scores, results.dense.paired_vs_dense.margin))
+    return _table(results.subject, score_rows(scores, results.dense.paired_vs_dense.margin))
 
 
 def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:

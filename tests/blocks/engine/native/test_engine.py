@@ -152,6 +152,18 @@ def test_bfloat16_rounds_and_nothing_else(shape, instruction_set):
     assert (actions - portable.denoise(noise, cond, mask)).abs().max() < 2e-2
 
 
+@pytest.mark.skipif("amx" not in SETS, reason="no AMX")
+@pytest.mark.parametrize("weights", ["float32", "float16", "int8", "bfloat16"])
+def test_the_processors_tiles_change_bits_of_bfloat16_alone(weights):
+    network, sampler = make_network(), Sampler("ddpm", 10)
+    engines = (
+        NativeEngine(network, sampler, weights=weights, instruction_set=name)
+        for name in ("avx512_bf16", "amx")
+    )
+    vectors, tiles = (engine.denoise(*make_query(network, sampler)) for engine in engines)
+    assert torch.equal(vectors, tiles) == (weights != "bfloat16")
+
+
 @pytest.mark.parametrize("weights", ["float32", "float16", "bfloat16", "int8"])
 def test_a_row_of_a_batch_is_bit_identical_to_the_row_alone_and_threads_change_nothing(weights):
     network, sampler = make_network(), Sampler("ddpm", 10)
