@@ -71,6 +71,18 @@ def test_a_policy_with_cameras_has_a_column_of_its_own():
     assert row[1:] == ["99.5 [99, 100]", "100.0 [99, 100]"]
 
 
+def test_policies_of_one_task_are_told_apart_by_the_names_that_they_are_given():
+    files = "lift/results.json lift/test_split/results.json"
+    options = 'methods="dense" cells="success, %"'
+    heading, row = table(f'{files} {options} policies="older | newer"', ASSETS)
+    assert heading == ["method", "older", "newer"]
+    older, newer = (table(f"{file} {options}", ASSETS)[1][1] for file in files.split())
+    assert older != newer
+    assert row[1:] == [older, newer]
+    with pytest.raises(ValueError, match=r"policies: expected 2 names, one for each file, got older"):
+        table(f'{files} {options} policies="older"', ASSETS)
+
+
 def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
     files = "lift_two_ways/results.json pusht/results.json"
     cells = f'{files} methods="dense | bac" cells="success or score | time vs dense"'

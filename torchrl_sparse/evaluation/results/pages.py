@@ -19,6 +19,7 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
   ``episodes/`` beside it.
 - ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
 - Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
+- ``policies="seed 0 | seed 1"`` tells several policies of one task apart: a name for each file, instead of the task's.
 - ``cells="success, % | speed-up"``: side by side, one row per method and one column per task, which holds these columns of the
   method. Of files of the same task the first that has the method counts. ``published=assets/published.json`` puts a paper's
   figures before each (`Published`).
@@ -32,7 +33,7 @@ import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchrl_sparse.evaluation.results.page_rows import Row, Table, read_table
@@ -45,7 +46,7 @@ __all__ = ["find_pages", "write_pages", "write_tables"]
 
 _FOLDERS = ("assets", "recipes", "tests", "torchrl_sparse", "docs")
 _BEGIN, _END = re.compile(r"<!-- table: (.*) -->"), "<!-- end -->"
-_OPTIONS = ("methods", "columns", "rows", "pairs", "tasks", "cells", "published")
+_OPTIONS = ("methods", "columns", "rows", "pairs", "tasks", "policies", "cells", "published")
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,8 @@ def _rows(directive: _Directive, root: Path) -> list[Row]:
     options = directive.options
     pairs = [_pair(pair) for pair in directive.parts("pairs")]
     tables = [read_table(root / file, options.get("rows"), pairs) for file in directive.files]
+    if policies := directive.parts("policies"):
+        tables = _told_apart(tables, policies)
     tasks = list(dict.fromkeys(table.task for table in tables))
     titles = dict(zip(tasks, directive.parts("tasks"), strict=False))
     methods = directive.parts("methods")
@@ -167,6 +170,14 @@ def _rows(directive: _Directive, root: Path) -> list[Row]:
         raise ValueError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
     several = ["task"] if len(tasks) > 1 else []
     return select_columns(rows, directive.parts("columns") or [*several, *tables[0].columns])
+
+
+def _told_apart(tables: Sequence[Table], policies: Sequence[str]) -> list[Table]:
+    if len(policies) != len(tables) or len(set(policies)) < len(policies):
+        raise ValueError(
+            f"policies: expected {len(tables)} names, one for each file, got {' | '.join(policies)}"
+        )
+    return [replace(table, task=policy) for table, policy in zip(tables, policies, strict=True)]
 
 
 def _select_rows(table: Table, methods: Sequence[str]) -> list[Row]:

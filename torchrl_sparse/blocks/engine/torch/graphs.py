@@ -15,7 +15,7 @@ _CAPTURES = threading.Lock()
 
 
 class GraphCapture:
-    """Captures functions without arguments as CUDA graphs. Written for a GPU, never run on one.
+    """Captures functions without arguments as CUDA graphs.
 
     They may launch what they like but read and write only memory that outlives the graph, and may not wait for the device.
     All graphs of one `GraphCapture` take their scratch memory from one pool: none leaves anything there for another, so
