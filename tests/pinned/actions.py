@@ -63,12 +63,17 @@ class Case:
 
 def cases() -> Iterator[Case]:
     """All of what is shipped, and copies under other rules of reuse."""
-    for folder in sorted(path.parent for path in ASSETS.glob("*/model.safetensors")):
+    for folder in policies():
         for method in shipped_methods(folder):
             for engine in ("",) if folder.name == "vla" else engines_of(folder, method):
-                yield Case(folder.name, method, engine)
+                yield Case(str(folder.relative_to(ASSETS)), method, engine)
     for method, rule, engine in product(_COPIED, _RULES, ENGINES):
         yield Case("lift", method, engine, rule)
+
+
+def policies() -> list[Path]:
+    """The folders of all policies; one that is trained anew may lie in that of another."""
+    return sorted(path.parent for path in ASSETS.rglob("model.safetensors"))
 
 
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
@@ -83,13 +88,15 @@ def engines_of(folder: Path, method: str) -> tuple[str, ...]:
 
 def shipped_methods(folder: Path) -> list[str]:
     """Dense, uniform, the planners beside the policy, and what its tables name."""
+    others = [other for other in policies() if folder in other.parents]
     tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
+    tables = [table for table in tables if not any(other in table.parents for other in others)]
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
     named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
     if folder.name == "vla":
         return sorted(named | {path.name for path in files})
-    pruners = {path.parent.name for path in folder.glob("*/config.json")}
+    pruners = {path.parent.name for path in folder.glob("*/pruner.safetensors")}
     return sorted({"dense", "uniform"} | named | pruners | {path.stem for path in files})
 
 
@@ -107,7 +114,7 @@ def _diffusion_answers(case: Case) -> dict[str, Tensor]:
 def _diffusion_queries(folder: Path) -> list:
     """What was observed in the task; one with cameras, which has none of its own, gets Lift's arm and patterns."""
     if not has_cameras(folder):
-        return [build.diffusion_query(**observation) for observation in _OBSERVATIONS[folder.name]]
+        return [build.diffusion_query(**observation) for observation in _OBSERVATIONS[_task_of(folder)]]
     before, after = _images()
     return [
         build.diffusion_query(
@@ -115,6 +122,10 @@ def _diffusion_queries(folder: Path) -> list:
         )
         for observation, images in zip(_OBSERVATIONS["lift"], (before, before, after), strict=True)
     ]
+
+
+def _task_of(folder: Path) -> str:
+    return folder.relative_to(ASSETS).parts[0]
 
 
 def has_cameras(folder: Path) -> bool:
