@@ -5,6 +5,7 @@ import random
 import signal
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -59,6 +60,25 @@ def kill_while_starting(folder, backend, monkeypatch, delays):
 
 def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path, backend, monkeypatch):
     kill_while_starting(tmp_path, backend, monkeypatch, [0.0, 0.2, 1.0])
+
+
+def test_a_worker_that_dies_while_the_next_is_started_is_replaced(tmp_path, monkeypatch):
+    """Before Python 3.12 the pool then closes the pipe that the next is about to be given."""
+    spawn, killed = ProcessPoolExecutor._spawn_process, []
+
+    def kill_the_first(pool):
+        if pool._processes and not killed:
+            killed.extend(pool._processes)
+            os.kill(killed[0], signal.SIGKILL)
+            deadline = time.monotonic() + 5
+            while not pool._call_queue._reader.closed and time.monotonic() < deadline:
+                time.sleep(0.01)
+        spawn(pool)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", kill_the_first)
+    with pytest.warns(RuntimeWarning, match=r"worker died.*; going on from number 0"):
+        assert take(in_order(partial(note, tmp_path, 10**9), 0, workers=2), 4) == [0, 1, 2, 3]
+    assert killed
 
 
 @pytest.mark.slow

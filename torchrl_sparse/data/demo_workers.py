@@ -60,7 +60,7 @@ def in_order(
                 numbers = count(first)
                 while True:
                     while len(ahead) < _AHEAD * workers:
-                        ahead.append(pool.submit(task, next(numbers)))
+                        ahead.append(_submit(pool, task, next(numbers)))
                     ahead.popleft().result()
                     failures, first = 0, first + 1
                     yield first - 1
@@ -82,6 +82,14 @@ def _pool(backend: str, workers: int) -> Executor:
     if backend == "ray":
         return _RayPool()
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin_worker)
+
+
+def _submit(pool: Executor, task: Callable[[int], None], number: int) -> Future:
+    try:
+        return pool.submit(task, number)
+    except OSError:
+        # A worker died while the next was started, and the pool closed what that was to be given. Asked again it says so.
+        return pool.submit(task, number)
 
 
 def _begin_worker() -> None:
