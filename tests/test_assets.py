@@ -15,6 +15,7 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
 FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
+UNKEPT = [folder for folder in FOLDERS if folder.parent.name == "seeds"]  # of further training seeds
 SEEING = [folder for folder in FOLDERS if folder.is_relative_to(ASSETS / "vla")]
 
 
@@ -23,8 +24,8 @@ def name(folder: Path) -> str:
 
 
 def policy_of(folder: Path) -> Path:
-    """The folder of the policy whose episodes these are: the task's."""
-    return ASSETS / folder.relative_to(ASSETS).parts[0]
+    """The folder of the policy whose episodes these are: the nearest that has one."""
+    return next(path for path in (folder, *folder.parents) if (path / "model.safetensors").exists())
 
 
 def identity(log: Path) -> dict:
@@ -36,7 +37,7 @@ def outcomes(log: Path) -> dict[int, bool]:
     return {seed: episode.success for seed, episode in EpisodeLog(log, identity(log)).episodes.items()}
 
 
-@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder not in SEEING], ids=name)
+@pytest.mark.parametrize("folder", [path for path in FOLDERS if path not in [*SEEING, *UNKEPT]], ids=name)
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
     planners = policy_of(folder)
     policy = DiffusionPolicy.from_pretrained(planners)
@@ -44,6 +45,14 @@ def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
         method = make_method(log.stem, policy, num_updates=10, planners=planners, calibration=pytest.fail)
         published = identity(log)
         assert published | method_identity(log.stem, method) == published, log
+
+
+@pytest.mark.parametrize("folder", UNKEPT, ids=name)
+def test_episodes_of_a_training_seed_belong_to_one_policy_which_is_not_the_kept_one(folder):
+    kept = json.loads((policy_of(folder) / "bac.json").read_text(encoding="utf-8"))["policy"]
+    found = {identity(log)["policy"] for log in (folder / "episodes").glob("*.jsonl")}
+    assert len(found) == 1
+    assert kept not in found
 
 
 @pytest.mark.parametrize("folder", SEEING, ids=name)
