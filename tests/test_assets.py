@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.pinned.actions import policy_of
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
@@ -21,11 +22,6 @@ SEEING = [folder for folder in FOLDERS if folder.is_relative_to(ASSETS / "vla")]
 
 def name(folder: Path) -> str:
     return folder.relative_to(ASSETS).as_posix()
-
-
-def policy_of(folder: Path) -> Path:
-    """The folder of the policy whose episodes these are: the nearest that has one."""
-    return next(path for path in (folder, *folder.parents) if (path / "model.safetensors").exists())
 
 
 def identity(log: Path) -> dict:

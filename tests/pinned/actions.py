@@ -76,6 +76,11 @@ def policies() -> list[Path]:
     return sorted(path.parent for path in ASSETS.rglob("model.safetensors"))
 
 
+def policy_of(folder: Path) -> Path:
+    """The folder of the policy that results or episodes in ``folder`` are of: the nearest that has one."""
+    return next(path for path in (folder, *folder.parents) if (path / "model.safetensors").exists())
+
+
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
     """The engines that a method is asked in: not PyTorch's where it recalls earlier queries, or is much as dense is."""
     if method in _AS_DENSE:
@@ -88,9 +93,8 @@ def engines_of(folder: Path, method: str) -> tuple[str, ...]:
 
 def shipped_methods(folder: Path) -> list[str]:
     """Dense, uniform, the planners beside the policy, and what its tables name."""
-    others = [other for other in policies() if folder in other.parents]
     tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
-    tables = [table for table in tables if not any(other in table.parents for other in others)]
+    tables = [table for table in tables if policy_of(table.parent) == folder]
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
     named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
