@@ -81,6 +81,7 @@ def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
         terms=Terms(Design(60), 60, by_degrees=True),
         machine=MACHINE,
         policy=POLICY,
+        pairs=[["worse", "same"]],
     )
     save_results(results, tmp_path / "results.json")
     assert load_results(tmp_path / "results.json") == results
@@ -88,13 +89,23 @@ def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
     assert worse.paired_vs_dense.verdict == "undecided"  # nothing was solved, and nothing lost by that
     assert worse.verdicts == {"the score": "inferior"}
     assert (same.is_right, worse.is_right) == (True, False)
-    gains = [a.score - b.score for a, b in zip(runs["worse"].episodes, runs["dense"].episodes, strict=True)]
-    assert worse.score.vs_dense.ci95 == pytest.approx([*ttest_1samp(gains, 0).confidence_interval()])
+    assert worse.score.vs_dense.ci95 == pytest.approx(paired_t_test(runs["worse"], runs["dense"]))
     assert worse.score.p_value < 0.001
     row = results_rows(results)[2]
     assert row["verdict"] == "inferior"
     assert "time vs dense" not in row
     assert "2 comparisons with dense" in format_table(results)
+    (pair,) = results.pairs
+    assert pair.score.ci95 == pytest.approx(paired_t_test(runs["worse"], runs["same"]))
+    (told,) = read_table(tmp_path / "results.json", "pairs").rows
+    assert (told["success"], told["verdict"]) == ("0 : 0", "inferior")
+    assert told["difference, points"].startswith("-36.0 [")
+    assert "time ratio" not in told
+
+
+def paired_t_test(ours, theirs):
+    pairs = zip(ours.episodes, theirs.episodes, strict=True)
+    return [*ttest_1samp([ours.score - theirs.score for ours, theirs in pairs], 0).confidence_interval()]
 
 
 def test_episodes_of_such_a_task_go_on_until_the_score_is_decided():

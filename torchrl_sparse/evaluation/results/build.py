@@ -216,9 +216,14 @@ def compare_pair(
     """
     pairs, horizon = pair_episodes(method, episodes, against, others), terms.episode_horizon
     solved, times = pairs.success_difference(terms.margin), pairs.time_ratio(horizon, terms.time_margin)
-    counts = tuple(map(sum, pairs.solved))
     return PairedEntry(
-        method, against, counts, len(pairs.method), Difference.of(solved), TimeDifference.of(times)
+        method,
+        against,
+        solved=tuple(map(sum, pairs.solved)),
+        n=len(pairs.method),
+        success=Difference.of(solved),
+        time=TimeDifference.of(times),
+        score=_gain(pairs, terms.margin) if terms.by_degrees else None,
     )
 
 
@@ -254,9 +259,13 @@ def _score(name: str, pairs: EpisodePairs, terms: Terms) -> Score:
     if name == DENSE:
         return Score(mean, ci, Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior"), None)
     n, design = len(pairs.method), terms.design
-    gain, gain_ci = pairs.score_difference(design.confidence(n))
-    gained = Difference(gain, gain_ci, terms.margin, verdict(gain_ci, terms.margin))
+    gained = _gain(pairs, terms.margin, design.confidence(n))
     return Score(mean, ci, gained, design.p_value(abs(terms.score_statistic(pairs)), n))
+
+
+def _gain(pairs: EpisodePairs, margin: float, confidence: float = 0.95) -> Difference:
+    diff, ci = pairs.score_difference(confidence)
+    return Difference(diff, ci, margin, verdict(ci, margin))
 
 
 def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:

@@ -232,6 +232,7 @@ class PairedEntry:
         n: episodes of each.
         success: of the first minus that of the second.
         time: restricted mean time of the first over that of the second.
+        score: mean score of the first minus that of the second, where a task is done by degrees.
     """
 
     method: str
@@ -240,6 +241,12 @@ class PairedEntry:
     n: int
     success: Difference
     time: TimeDifference
+    score: Difference | None = None
+
+    @property
+    def judged(self) -> Difference:
+        """What the verdict is on: the score, where a task is done by degrees, else success."""
+        return self.score or self.success
 
     def __post_init__(self) -> None:
         require(all(0 <= k <= self.n for k in self.solved), "solved", f"0 to {self.n}", self.solved)

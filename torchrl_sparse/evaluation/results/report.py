@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
-from torchrl_sparse.evaluation.results.parts import Difference, EpisodeCost, PairedEntry, TokensKept
+from torchrl_sparse.evaluation.results.parts import (
+    Difference,
+    EpisodeCost,
+    PairedEntry,
+    TimeDifference,
+    TokensKept,
+)
 from torchrl_sparse.evaluation.results.schema import (
     DENSE,
     AnyResults,
@@ -177,15 +183,18 @@ def _pair_row(
 
 
 def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:
-    """Return the rows of the table of a file's pairs, with times: column -> text."""
+    """Return the rows of the table of a file's pairs, with times where success and time decide: column -> text."""
     return [
         {
-            **_success_cells((pair.method, pair.against), pair.solved, pair.success),
-            "time ratio": ratio_text(pair.time),
-            "time verdict": verdict_text(pair.time),
+            **_success_cells((pair.method, pair.against), pair.solved, pair.judged),
+            **({} if pair.score else _pair_time_cells(pair.time)),
         }
         for pair in pairs
     ]
+
+
+def _pair_time_cells(time: TimeDifference) -> dict[str, str]:
+    return {"time ratio": ratio_text(time), "time verdict": verdict_text(time)}
 
 
 def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Difference) -> dict[str, str]:
