@@ -1,4 +1,5 @@
 import json
+from dataclasses import asdict
 
 import pytest
 
@@ -30,6 +31,15 @@ def test_log_survives_reopening(path):
     assert list(again.episodes.values()) == [*first.episodes.values()]
     assert again.episodes[3].fine == (False, True)
     assert again.missing([0, 1, 2, 3]) == [0, 2]
+
+
+def test_a_line_tells_what_is_not_at_its_default_and_one_that_tells_all_is_the_same(path):
+    EpisodeLog(path).append(episode(3, score=0.0))
+    header, line = path.read_text().splitlines()
+    told = {"seed", "success", "length", "queries", "flops_total", "prune_rate", "score"}
+    assert json.loads(line).keys() == told
+    path.write_text(f"{header}\n{json.dumps(asdict(episode(3, score=0.0)))}\n")
+    assert EpisodeLog(path).episodes == {3: episode(3, score=0.0)}
 
 
 def test_every_append_is_on_disk_at_once(path):

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -127,8 +127,8 @@ class _Header:
 class EpisodeLog:
     """Append-only JSON-lines file of :class:`EpisodeResult`, one per seed, safe against a kill at any moment.
 
-    The first line names what was evaluated. Every episode is one line, flushed to the disk before
-    :meth:`append` returns.
+    The first line names what was evaluated. Every episode is one line, without what is at its default, flushed to the disk
+    before :meth:`append` returns.
     A last line without its newline was torn by a kill: it is cut off on opening, and its seed runs again.
 
     Args:
@@ -182,7 +182,7 @@ class EpisodeLog:
         """
         if episode.seed in self.episodes:
             raise ValueError(f"{self.path}: seed {episode.seed} is already in the log")
-        self._write(asdict(episode))
+        self._write(_told(episode))
         self.episodes[episode.seed] = episode
 
     def missing(self, seeds: Iterable[int]) -> list[int]:
@@ -201,6 +201,12 @@ class EpisodeLog:
             raise ValueError(
                 f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
             )
+
+
+def _told(episode: EpisodeResult) -> dict[str, Any]:
+    """Return what of an episode is not its default: most know neither tokens nor parts nor ways."""
+    values = ((field, getattr(episode, field.name)) for field in fields(episode))
+    return {field.name: value for field, value in values if value != field.default}
 
 
 def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
