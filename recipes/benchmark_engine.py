@@ -73,7 +73,8 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
         instruction_sets=config.instruction_sets,
     )
     variants = case.variants()
-    first = first_calls(case, variants)
+    with progress(f"{name}, first calls", "call", len(variants)) as show:
+        first = first_calls(case, variants, on_call=show)
     variants = {variant: variants[variant] for variant in first}
     repeats = 1 if config.quick else entry.repeats
     with progress(name, "round", repeats) as show:

@@ -127,6 +127,16 @@ def test_a_variant_that_answers_otherwise_is_never_timed(case):
         first_calls(case, {"torch dense": wrong})
 
 
+def test_the_reference_answers_each_kind_of_query_once_and_every_call_is_told(case, monkeypatch):
+    answered, told = [], []
+    reference = case.reference
+    monkeypatch.setattr(case, "reference", lambda kind: answered.append(kind) or reference(kind))
+    variants = {name: v for name, v in case.variants().items() if name in ("torch ddim2", "native ddim2")}
+    first_calls(case, variants, on_call=lambda *call: told.append(call))
+    assert answered == ["ddim2"]
+    assert told == [(n + 1, len(variants)) for n in range(len(variants))]
+
+
 def test_a_baseline_that_cannot_be_compiled_is_left_out_and_says_so(case, capsys):
     def fail():
         raise RuntimeError("no compiler\nand more")

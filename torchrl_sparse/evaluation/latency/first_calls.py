@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import torch
+from torch import Tensor
 
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant
 from torchrl_sparse.runtime.clock import synchronised_clock
@@ -30,25 +32,36 @@ class FirstCall:
     peak_bytes: int | None
 
 
-def first_calls(case: EngineCase, variants: Mapping[str, Variant]) -> dict[str, FirstCall]:
+def first_calls(
+    case: EngineCase,
+    variants: Mapping[str, Variant],
+    on_call: Callable[[int, int], None] | None = None,
+) -> dict[str, FirstCall]:
     """Call every variant once; one that cannot be compiled here is left out, and a line says so.
+
+    Args:
+        case: of the variants; its reference answers each kind of query once, whatever the number of its variants.
+        variants: by name.
+        on_call: called as ``on_call(done, total)`` after each.
 
     Raises:
         ValueError: naming the variant whose actions are not those of the reference.
     """
-    first = {}
-    for name, variant in variants.items():
+    first, reference = {}, cache(case.reference)
+    for done, (name, variant) in enumerate(variants.items(), 1):
         try:
-            first[name] = _first_call(case, name, variant)
+            first[name] = _first_call(case, name, variant, reference(variant.kind))
         except RuntimeError as error:
             if not name.startswith("eager-compiled"):
                 raise
             print(f"no {name}: {str(error).splitlines()[0]}")
+        if on_call is not None:
+            on_call(done, len(variants))
     return first
 
 
-def _first_call(case: EngineCase, name: str, variant: Variant) -> FirstCall:
-    expected, on_gpu = case.reference(variant.kind), case.device.type == "cuda"
+def _first_call(case: EngineCase, name: str, variant: Variant, expected: Tensor) -> FirstCall:
+    on_gpu = case.device.type == "cuda"
     others = _begin_peak(case.device) - _weight_bytes(case) if on_gpu else 0
     start = synchronised_clock(case.device)
     actions = variant.call()
