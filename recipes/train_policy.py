@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.data.robomimic import read_all_demos
+from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -46,7 +46,7 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     config.network = with_published(config.task, config.network)
     config.train = with_published(config.task, config.train)
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
-    demos = read_all_demos(
+    demos = read_demos(
         config.demos,
         task.proprioception_keys if cameras else task.state_keys,
         filter_key=config.filter_key,

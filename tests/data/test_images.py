@@ -18,18 +18,22 @@ LENGTHS = (5, 3, 8)
 CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 
 
-@pytest.fixture
-def path(tmp_path):
-    random = np.random.default_rng(0)
-    with h5py.File(tmp_path / "demos.h5", "w") as file:
-        for index, length in enumerate(LENGTHS):
+def write(path, lengths=LENGTHS, frame=(6, 8), seed=0):
+    random = np.random.default_rng(seed)
+    with h5py.File(path, "w") as file:
+        for index, length in enumerate(lengths):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = length
             demo["actions"] = random.uniform(-1, 1, (length, 7))
             demo["obs/robot0_eef_pos"] = random.uniform(-1, 1, (length, 3))
             for camera in CAMERAS.values():
-                demo[f"obs/{camera}"] = random.integers(0, 256, (length, 6, 8, 3), dtype=np.uint8)
-    return tmp_path / "demos.h5"
+                demo[f"obs/{camera}"] = random.integers(0, 256, (length, *frame, 3), dtype=np.uint8)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return write(tmp_path / "demos.h5")
 
 
 @pytest.mark.parametrize("mapped", [False, True])
@@ -52,11 +56,37 @@ def test_images_come_with_the_channels_first(path, tmp_path, mapped):
     assert demos.windows(rows, 2)[keys.HISTORY_STATE].shape == (len(rows), 2, 3)
 
 
+@pytest.mark.parametrize("mapped", [False, True])
+def test_images_of_several_files_are_laid_end_to_end_with_what_belongs_to_them(path, tmp_path, mapped):
+    paths = [path, write(tmp_path / "more.h5", (4, 2), seed=1)]
+    alone = [read_demos(each, ["robot0_eef_pos"], cameras=CAMERAS) for each in paths]
+    folder = tmp_path / "images" if mapped else None
+    both = read_demos(paths, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=folder)
+    assert both.starts.diff().tolist() == [*LENGTHS, 4, 2]
+    for key in (keys.STATE, keys.ACTION, *(("observation", name) for name in CAMERAS)):
+        assert torch.equal(torch.as_tensor(both.data[key]), torch.cat([each.data[key] for each in alone]))
+
+
+def test_a_later_file_with_other_images_or_none_is_named_and_nothing_is_written(path, tmp_path):
+    smaller = write(tmp_path / "smaller.h5", (4,), frame=(6, 6))
+    without = write(tmp_path / "without.h5", (4,))
+    with h5py.File(without, "r+") as file:
+        replaced(None)(file, "demo_0")
+    options = {"cameras": CAMERAS, "image_folder": tmp_path / "images"}
+    with pytest.raises(
+        ValueError, match=r"smaller\.h5, demo_0, obs/agentview_image: expected images \[3, 6, 8\]"
+    ):
+        read_demos([path, smaller], ["robot0_eef_pos"], **options)
+    with pytest.raises(ValueError, match=r"without\.h5, demo_0, obs/agentview_image: expected a dataset"):
+        read_demos([path, without], ["robot0_eef_pos"], **options)
+    assert not list((tmp_path / "images").iterdir())
+
+
 def replaced(value):
-    def change(file):
-        del file["data/demo_1/obs/agentview_image"]
+    def change(file, demo="demo_1"):
+        del file[f"data/{demo}/obs/agentview_image"]
         if value is not None:
-            file["data/demo_1/obs/agentview_image"] = value
+            file[f"data/{demo}/obs/agentview_image"] = value
 
     return change
 

@@ -21,6 +21,8 @@ def test_they_come_in_the_order_of_the_demonstrations_numbers(tmp_path):
     words = [f"lift cube {index}" for index in range(12)]
     path = write(tmp_path / "demos.h5", [json.dumps({"lang": each, "layout": 3}) for each in words])
     assert read_instructions(path) == words
+    again = write(tmp_path / "more.h5", [json.dumps({"lang": "lift the ball"})])
+    assert read_instructions([path, again]) == [*words, "lift the ball"]
 
 
 @pytest.mark.parametrize("meta", [None, "{}", '{"lang": ""}'])

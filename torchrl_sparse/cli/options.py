@@ -48,7 +48,9 @@ OPTIONS: dict[str, Any] = {
     "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
     **dict.fromkeys(("planners", "schedule"), Word),
     "demos": Word | None,
-    "train_policy.demos": Annotated[Any, AfterValidator(_path_or_paths)],
+    **dict.fromkeys(
+        ("train_policy.demos", "train_vla.demos"), Annotated[Any, AfterValidator(_path_or_paths)]
+    ),
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 
 from torchrl_sparse.data.hdf5_bounds import ARRAYS, IMAGES, Room, count_attribute, member, most_demos
 
-__all__ = ["ArrayReader", "demo_group", "demo_names", "naming", "open_demo", "open_demos"]
+__all__ = ["ArrayReader", "demo_group", "demo_names", "each_path", "naming", "open_demo", "open_demos"]
 
 _DAMAGE = (OSError, KeyError, RuntimeError, TypeError)  # h5py reports damaged files through all of them
 _NAME = re.compile(r"demo_[0-9]{1,9}")
@@ -49,6 +49,15 @@ def naming(where: str) -> Iterator[None]:
         yield
     except _DAMAGE as error:
         raise ValueError(f"{where}: cannot be read: {error}") from error
+
+
+def each_path(paths: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    """Return one path, or several, as a list.
+
+    >>> each_path("data/lift.h5"), each_path(["a.h5", "b.h5"])
+    (['data/lift.h5'], ['a.h5', 'b.h5'])
+    """
+    return [paths] if isinstance(paths, str | Path) else list(paths)
 
 
 def demo_names(path: str | Path, file: h5py.File, filter_key: str | None = None) -> list[str]:

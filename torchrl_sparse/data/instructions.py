@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 
 from torchrl_sparse.data.hdf5_bounds import text_attribute
-from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
+from torchrl_sparse.data.hdf5_reader import demo_names, each_path, open_demos
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["read_instruction", "read_instructions"]
@@ -31,8 +32,8 @@ def read_instruction(demo: h5py.Group) -> str | None:
     raise ValueError(f"{demo.name}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
 
 
-def read_instructions(path: str | Path) -> list[str]:
-    """Read the instruction of every demonstration of a robomimic file, in the order of `read_demos`.
+def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
+    """Read the instruction of every demonstration of a robomimic file, or of several, in the order of `read_demos`.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -42,6 +43,10 @@ def read_instructions(path: str | Path) -> list[str]:
         >>> read_instructions("data/lift_named_proficient.h5")[0]  # doctest: +SKIP
         'lift the green cube'
     """
+    return [words for path in each_path(paths) for words in _read_file(path)]
+
+
+def _read_file(path: str | Path) -> list[str]:
     with open_demos(path) as file:
         return [_required(path, file["data"][name]) for name in demo_names(path, file)]
 

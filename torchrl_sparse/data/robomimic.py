@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -24,12 +23,19 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.hdf5_bounds import count_attribute
-from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
-from torchrl_sparse.data.images import read_images
+from torchrl_sparse.data.hdf5_reader import (
+    ArrayReader,
+    demo_group,
+    demo_names,
+    each_path,
+    open_demo,
+    open_demos,
+)
+from torchrl_sparse.data.images import RecordedImages, read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
-__all__ = ["Demonstrations", "join_demos", "read_all_demos", "read_demos"]
+__all__ = ["Demonstrations", "join_demos", "read_demos"]
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,7 @@ class Demonstrations:
 
 
 def read_demos(
-    path: str | Path,
+    paths: str | Path | Sequence[str | Path],
     state_keys: Sequence[str],
     *,
     filter_key: str | None = None,
@@ -122,12 +128,12 @@ def read_demos(
     poses: bool = True,
     task: str | None = None,
 ) -> Demonstrations:
-    """Read all demonstrations of a robomimic file, in the order of their numbers.
+    """Read all demonstrations of a robomimic file, in the order of their numbers, or of several files, see `join_demos`.
 
     Args:
-        path: HDF5 file.
+        paths: of an HDF5 file, or of several, such as those of DAgger's rounds.
         state_keys: observations that make up the state, concatenated in this order.
-        filter_key: only those that the file lists as ``mask/<filter_key>``, e.g. "train" or "better".
+        filter_key: only those that a file lists as ``mask/<filter_key>``, e.g. "train" or "better".
         cameras: images to read: the name here -> the observation there, e.g. ``{"image": "agentview_image"}``.
         image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
             memory by default.
@@ -139,8 +145,8 @@ def read_demos(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if the file is truncated or malformed, its actions are deltas, it is of another task, or there is no such
-            filter key; the message names file, demonstration and dataset.
+        ValueError: if a file is truncated or malformed, its actions are deltas, it is of another task, or there is no such
+            filter key; the message names file, demonstration and dataset. As `join_demos` if files differ.
 
     Examples:
         >>> demos = read_demos("data/lift.h5", find_robosuite_task("Lift").state_keys)  # doctest: +SKIP
@@ -149,6 +155,21 @@ def read_demos(
     """
     if not state_keys:
         raise ValueError("state_keys: expected at least one observation key, got none")
+    files, parts = [], []
+    for path in each_path(paths):
+        names, part = _read_numbers(path, state_keys, filter_key, poses, task)
+        files.append(RecordedImages(path, dict(zip(names, part.starts.diff().tolist(), strict=True))))
+        parts.append(part)
+    demos = join_demos(parts)
+    for name, key in (cameras or {}).items():
+        demos.data["observation", name] = read_images(files, key, image_folder)
+    return demos
+
+
+def _read_numbers(
+    path: str | Path, state_keys: Sequence[str], filter_key: str | None, poses: bool, task: str | None
+) -> tuple[list[str], Demonstrations]:
+    """Return the names of a file's demonstrations, and these without images."""
     with open_demos(path) as file:
         names, control = demo_names(path, file, filter_key), None
         if task is not None:
@@ -161,37 +182,14 @@ def read_demos(
         episodes = [
             _read_episode(f"{path}, {name}", reader, data, name, state_keys, convert) for name in names
         ]
-        lengths = [len(action) for _, action, _ in episodes]
-        steps = dict(zip(names, lengths, strict=True))
-        images = {
-            ("observation", name): read_images(path, data, steps, key, image_folder)
-            for name, key in (cameras or {}).items()
-        }
     widths = sorted({(state.shape[1], action.shape[1]) for state, action, _ in episodes})
     if len(widths) > 1:
         raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
     states, actions, driven = zip(*episodes, strict=True)
+    starts = torch.tensor([0, *map(len, actions)]).cumsum(0)
     state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
-    data = TensorDict({keys.STATE: state, keys.ACTION: action, **images}, batch_size=[len(state)])
-    return Demonstrations(data, torch.tensor([0, *lengths]).cumsum(0), torch.tensor(driven))
-
-
-def read_all_demos(paths: str | Sequence[str], state_keys: Sequence[str], **options: Any) -> Demonstrations:
-    """Read the demonstrations of a file, or of several, see `join_demos`.
-
-    Args:
-        paths: of the files.
-        state_keys, options: of `read_demos`.
-
-    Raises:
-        ValueError: as `read_demos` and `join_demos`, and for several files with cameras.
-    """
-    paths = [paths] if isinstance(paths, str) else list(paths)
-    if options.get("cameras") and len(paths) > 1:
-        raise ValueError(
-            f"demos: expected one file with cameras, whose images are streamed, got {len(paths)}"
-        )
-    return join_demos([read_demos(path, state_keys, **options) for path in paths])
+    data = TensorDict({keys.STATE: state, keys.ACTION: action}, batch_size=[len(state)])
+    return names, Demonstrations(data, starts, torch.tensor(driven))
 
 
 def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:

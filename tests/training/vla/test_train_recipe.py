@@ -63,7 +63,8 @@ def test_a_language_model_is_adapted_and_saved_without_it(demos, tmp_path):
     base, out = write_llama(tmp_path / "base.gguf"), tmp_path / "out"
     sizes = ["size=tiny", "network.chunk_size=2", "+network.patch_size=7", f"base={base}", "rank=2"]
     stages = ["grounding.locate_steps=2", "grounding.refer_steps=2"]
-    train_unbroken("train_vla", out, [f"demos={demos}", *sizes, *stages, "batch_size=2", "max_steps=6"])
+    twice = f"demos=[{demos},{demos}]"
+    train_unbroken("train_vla", out, [twice, *sizes, *stages, "batch_size=2", "max_steps=6"])
     names = load_file(out / "policy/model.safetensors").keys()
     assert any(name.endswith(".mlp.up_proj.up") for name in names)
     assert not any(name.endswith((".mlp.up_proj.weight", "embed_tokens.weight")) for name in names)
