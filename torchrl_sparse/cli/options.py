@@ -38,6 +38,7 @@ Between = Annotated[float, Field(gt=0, lt=1)]
 Word = Annotated[str, Field(min_length=1)]
 Words = Annotated[list[Word], Field(min_length=1)]
 Pair = Annotated[list[Word], Field(min_length=2, max_length=2)]
+Paths = Annotated[Any, AfterValidator(_path_or_paths)]
 Section = dict[str, Any]
 
 OPTIONS: dict[str, Any] = {
@@ -48,9 +49,7 @@ OPTIONS: dict[str, Any] = {
     "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
     **dict.fromkeys(("planners", "schedule"), Word),
     "demos": Word | None,
-    **dict.fromkeys(
-        ("train_policy.demos", "train_vla.demos"), Annotated[Any, AfterValidator(_path_or_paths)]
-    ),
+    **dict.fromkeys(("train_policy.demos", "train_vla.demos"), Paths),
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,
