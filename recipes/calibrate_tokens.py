@@ -27,7 +27,7 @@ from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
-from torchrl_sparse.evaluation.figures.tokens import plot_token_budget
+from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget, fewest_tokens, numbered_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
@@ -58,7 +58,7 @@ def main(config: DictConfig) -> None:
     budget = TokenBudget(config.method, number, config.measure, config.tolerance, points, settings)
     out = Path(config.out)
     budget.save_pretrained(out)
-    plot_token_budget(budget, out.with_suffix(".png"))
+    plot_token_budgets([budget], out.with_suffix(".png"))
     print(f"{out}: {config.method}@{number:g}, {config.measure} within {config.tolerance:g} of dense")
     base = "" if config.base is None else f" base={config.base}"
     methods = f"methods=[dense,{config.method}@{number:g}]"

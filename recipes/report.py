@@ -11,7 +11,8 @@ Or draw what methods gain and lose on all tasks in one picture; of several files
 
     python recipes/report.py fronts=[assets/lift/test_split/results.json,assets/pusht/results.json] out=outputs/fronts.png
 
-and ``spending=`` what methods that ask more often, or for several samples, spend a second.
+and ``spending=`` what methods that ask more often, or for several samples, spend a second, ``budgets=`` what pruners of visual
+tokens lose over the tokens that they keep, as `calibrate_tokens` measured it.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.fronts import plot_fronts, plot_spending
 from torchrl_sparse.evaluation.figures.html_report import write_report
+from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results
+from torchrl_sparse.methods.token_budget import TokenBudget
 
 
 @recipe("report", out="file")
@@ -44,6 +47,8 @@ def main(config: DictConfig) -> None:
         print(plot_fronts([load_results(path) for path in config.fronts], config.out))
     elif config.spending:
         print(plot_spending([load_results(path) for path in config.spending], config.out))
+    elif config.budgets:
+        print(plot_token_budgets([TokenBudget.from_pretrained(path) for path in config.budgets], config.out))
     else:
         faults = write_report(config.runs, config.out, title=config.title)
         for fault in faults.values():

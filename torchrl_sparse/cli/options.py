@@ -54,7 +54,7 @@ OPTIONS: dict[str, Any] = {
     "dense_log": Word | None,
     "runs": Word,
     "results": Words,
-    **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending"), list[Word]),
+    **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending", "budgets"), list[Word]),
     "root": Word,
     "title": str,
     "sweep": Word,

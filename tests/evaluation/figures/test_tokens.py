@@ -2,13 +2,16 @@ import numpy as np
 import pytest
 
 from tests.evaluation.figures.test_plots import has_color, read
+from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.tokens import (
     _QUERY,
     draw_tokens,
     plot_control,
+    plot_token_budgets,
     plot_token_strip,
     plot_tokens_per_layer,
 )
+from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 3, 24, 24), np.uint8)
 
@@ -75,3 +78,28 @@ def test_tokens_per_layer(tmp_path):
     read(plot_tokens_per_layer(depth, 8, tmp_path / "layers.png"))
     with pytest.raises(ValueError, match=r"at least one method, got \{'none': \[0, 32\]\}"):
         plot_tokens_per_layer({"none": np.zeros((0, 32))}, 8, tmp_path / "layers.png")
+
+
+def budget(method, measure="action_error", losses=(0.1, 0.05, 0.01)):
+    points = tuple(BudgetPoint(0.1 * (1 + i), 20.0 * (1 + i), loss) for i, loss in enumerate(losses))
+    return TokenBudget(method, points[-1].number, measure, 0.03, points)
+
+
+def test_budgets_of_several_methods_are_drawn_each_in_its_colour(tmp_path):
+    budgets = [budget("specprune"), budget("frame_difference", losses=(0.2, 0.1, 0.02))]
+    together = read(plot_token_budgets(budgets, tmp_path / "both.png"))
+    alone = read(plot_token_budgets(budgets[:1], tmp_path / "one.png"))
+    colors = method_colors(["specprune", "frame_difference"])
+    assert all(has_color(together, color) for color in colors.values())
+    assert has_color(alone, colors["specprune"])
+    assert not has_color(alone, colors["frame_difference"])
+
+
+@pytest.mark.parametrize(
+    ("budgets", "got"),
+    [([], "no budget"), ([budget("fastv"), budget("random", "success")], "action_error, success")],
+)
+def test_budgets_by_different_measures_are_not_drawn_together(tmp_path, budgets, got):
+    with pytest.raises(ValueError, match=f"^budgets: expected one measure, got {got}$"):
+        plot_token_budgets(budgets, tmp_path / "no.png")
+    assert not (tmp_path / "no.png").exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,10 @@ from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.methods.token_budget import TokenBudget
 
-__all__ = ["draw_tokens", "plot_control", "plot_token_budget", "plot_token_strip", "plot_tokens_per_layer"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_tokens", "plot_control", "plot_token_budgets", "plot_token_strip", "plot_tokens_per_layer"]
 
 _GONE = np.array((24, 24, 28), np.float32)
 _DIMMEST = 0.18  # of the image still shows through a token that was dropped before the decoder
@@ -156,25 +160,38 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
     return save_figure(figure, path)
 
 
-def plot_token_budget(budget: TokenBudget, path: str | os.PathLike) -> Path:
-    """Draw what every number loses over the tokens that it keeps, with the tolerance and the choice.
+def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) -> Path:
+    """Draw what every number of each method loses over the tokens that it keeps, with the tolerance and the choice.
 
     Args:
-        budget: calibrated.
+        budgets: calibrated by one measure, of different methods.
         path: of the PNG.
+
+    Raises:
+        ValueError: if there is none, or they were calibrated by different measures.
     """
-    points = sorted(budget.points, key=lambda point: point.kept)
+    measures = sorted({budget.measure for budget in budgets})
+    if len(measures) != 1:
+        raise ValueError(f"budgets: expected one measure, got {', '.join(measures) or 'no budget'}")
     figure, axes = make_figure(9, 4.2)
-    axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=_SPEED, linewidth=1.8)
+    colors = method_colors(budget.method for budget in budgets)
+    for budget in budgets:
+        _draw_budget(axes, budget, colors[budget.method])
+    for tolerance in sorted({budget.tolerance for budget in budgets}):
+        axes.axhline(tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
+    axes.set_xlabel("visual tokens in a decoder layer, mean")
+    axes.set_ylabel("action error" if measures == ["action_error"] else "success lost")
+    axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
+    axes.legend(frameon=False)
+    return save_figure(figure, path)
+
+
+def _draw_budget(axes: Axes, budget: TokenBudget, color: str) -> None:
+    points = sorted(budget.points, key=lambda point: point.kept)
+    axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=color, linewidth=1.8)
     for point in points:
         place = (point.kept, point.loss)
         axes.annotate(f"{point.number:g}", place, (4, 6), textcoords="offset points", fontsize=9)
         if point.number == budget.number:
-            axes.plot(
-                *place, "o", color=_QUERY, markersize=11, label=f"chosen: {budget.method}@{point.number:g}"
-            )
-    axes.axhline(budget.tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
-    axes.set_xlabel("visual tokens in a decoder layer, mean")
-    axes.set_ylabel("action error" if budget.measure == "action_error" else "success lost")
-    axes.legend(frameon=False)
-    return save_figure(figure, path)
+            chosen = f"chosen: {budget.method}@{point.number:g}"
+            axes.plot(*place, "o", color=color, markeredgecolor="#333333", markersize=11, label=chosen)
