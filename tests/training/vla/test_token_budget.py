@@ -17,6 +17,7 @@ from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.random import RandomPruner
 from torchrl_sparse.tokens.specprune import SpecPrune
 from torchrl_sparse.training.vla.token_budget import (
     demonstrated_queries,
@@ -92,6 +93,9 @@ def test_queries_of_demonstrations_begin_with_each_episode():
     back = SpecPrune(alpha=0.2, budget=PER_CAMERA, dynamic=False, look_back=2)
     assert measure_errors(make_policy(), found, {0.2: back}, 1)[0].kept < CONFIG.num_visual
     assert measure_errors(make_policy(), found, {0.2: pruner(0.2)}, 1)[0].kept < CONFIG.num_visual
+    # What is drawn at random is drawn alike whatever else is measured.
+    few, more = {0.5: RandomPruner(0.5)}, {0.3: RandomPruner(0.3), 0.5: RandomPruner(0.5)}
+    assert measure_errors(make_policy(), found, few, 1)[0] == measure_errors(make_policy(), found, more, 1)[1]
 
 
 def toy_env(seeds):

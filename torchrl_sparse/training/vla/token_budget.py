@@ -60,7 +60,8 @@ def demonstrated_queries(
 ) -> Iterator[list[TensorDictBase]]:
     """Take the same from demonstrations with images, one query each ``every`` steps; no simulator is needed.
 
-    The hand's velocity, which demonstrations do not keep, is that of the step before each query, as `EndEffectorVelocity`'s.
+    The hand's velocity, which demonstrations do not keep, is that of the step before each query, as `EndEffectorVelocity`'s;
+    an episode's seed is its place in the file, so that a pruner that draws tokens draws the same ones each time.
 
     Args:
         policy: whose inputs are taken.
@@ -75,8 +76,10 @@ def demonstrated_queries(
         state = steps[keys.STATE]
         before = torch.cat([state[:1], state[:-1]])  # an episode begins at rest
         steps[keys.EEF_VEL] = twists(before, state, poses) * control_freq
+        steps[keys.EPISODE_STEP] = torch.arange(len(steps))[:, None]
+        steps[keys.EPISODE_SEED] = torch.full((len(steps), 1), index)
         steps = steps[::every]
-        steps[keys.IS_INIT] = torch.arange(len(steps))[:, None] == 0
+        steps[keys.IS_INIT] = steps[keys.EPISODE_STEP] == 0
         yield [step.set(keys.INSTRUCTION, instruction) for step in steps.unbind(0)]
 
 
