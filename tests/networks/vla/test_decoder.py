@@ -134,6 +134,23 @@ def test_dropping_is_masking_out(decoder, reference, sequence):
     assert ours.depth[0].tolist() == [2, 4, 4, 4, 4, 2, 4, 4]
 
 
+def test_training_in_bf16_on_a_cpu_has_the_gradient_of_the_whole_precision(decoder, sequence):
+    """Rows of several lengths, so that attention is masked: the plain products of training, against PyTorch's own."""
+
+    def gradients(bf16):
+        decoder.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            decoded = decoder(sequence, Drop(1, [[0, 5], [3], []]))
+        real = torch.arange(decoded.hidden.shape[1]) < decoded.lengths[:, None]
+        (decoded.hidden.float() * real[..., None]).pow(3).mean().backward()
+        layers = [layer.self_attn for layer in decoder.llama.layers]
+        return torch.cat([a.q_proj.weight.grad.ravel() for a in layers])
+
+    exact, rounded = gradients(False), gradients(True)
+    assert torch.cosine_similarity(exact, rounded, dim=0) > 0.995
+    assert 0.95 < rounded.norm() / exact.norm() < 1.05
+
+
 @torch.no_grad()
 def test_scores_are_the_attention_of_the_text_under_original_ids(decoder, reference, sequence):
     pruner = Drop(0, [[0, 5], [3], [7, 6, 1]])

@@ -190,6 +190,21 @@ def _run_layer(
     query, key = backbones.apply_rotary_pos_emb(query, key, *rotary)
     if (groups := query.shape[1] // key.shape[1]) > 1:
         key, value = (shared.repeat_interleave(groups, dim=1) for shared in (key, value))
-    attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+    attended = _attend(query, key, value, mask)
     hidden = hidden + attention.o_proj(attended.transpose(1, 2).flatten(2))
     return hidden + layer.mlp(layer.post_attention_layernorm(hidden)), query, key
+
+
+def _attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the attention of queries [B, heads, S, head_dim] to keys, ``mask`` bool [B, 1, 1, S] what they may see.
+
+    Where a CPU trains in bf16, three plain operations take half the time of PyTorch's own with its gradient, or less.
+    """
+    trains = torch.is_grad_enabled() and torch.is_autocast_enabled("cpu")
+    if not (trains and query.device.type == "cpu"):
+        return functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+    query, key, value = (each.to(torch.get_autocast_dtype("cpu")) for each in (query, key, value))
+    logits = torch.matmul(query * query.shape[-1] ** -0.5, key.transpose(-1, -2))
+    if mask is not None:
+        logits = logits.masked_fill(~mask, -torch.inf)
+    return torch.matmul(logits.softmax(-1), value)
