@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NonTensorStack, TensorDict
 from torch import Tensor, nn
@@ -172,7 +173,9 @@ class VLATrainer(DemonstrationTrainer):
         """Return sums that tell one set of demonstrations from another. Pictures are read once, not at every checkpoint."""
         data, objects = self.demos.episodes.data, self.demos.objects
         sums = {
-            "/".join(key): int(data[key].sum(dtype=torch.int64)) for key in self.policy.network.config.cameras
+            # numpy's sum of bytes is sixteen times as fast as torch's
+            "/".join(key): int(data[key].numpy().sum(dtype=np.int64))
+            for key in self.policy.network.config.cameras
         }
         sums[keys.ACTION] = checksum(data[keys.ACTION])
         if self.stages != GroundingConfig():
