@@ -49,7 +49,7 @@ class PolicyTrainer(DemonstrationTrainer):
     ) -> None:
         self.network, self.normalizer, self.demos, self.vision = network, normalizer, demos, vision
         self.loss = DiffusionLoss(network, normalizer, Sampler(), vision)
-        self._data_checksum = sum(_checksum(value) for value in demos.data.values(True, True))
+        self._data_checksum = sum(checksum(value) for value in demos.data.values(True, True))
         sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
         groups, module = optimizer_groups(network, config.weight_decay), network
         if vision is not None:
@@ -84,8 +84,3 @@ class PolicyTrainer(DemonstrationTrainer):
 def _attention(device: torch.device) -> AbstractContextManager:
     """On a CPU the plain kernel: PyTorch's choice without dropout, the fused one, is slow on chunks as short as these."""
     return sdpa_kernel(SDPBackend.MATH) if device.type == "cpu" else nullcontext()
-
-
-def _checksum(value: Tensor) -> float:
-    """Return the sum of all entries; images are summed without a copy of them in another type."""
-    return checksum(value) if value.is_floating_point() else float(value.sum(dtype=torch.int64))
