@@ -155,7 +155,7 @@ class EpisodeLog:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         header = asdict(_Header(1, self.identity))
         content = self.path.read_bytes() if self.path.exists() else b""
-        if (json.dumps(header) + "\n").encode().startswith(content):
+        if _line(header).encode().startswith(content):
             # A new log, or one killed while its header was written.
             self.path.write_bytes(b"")
             self._write(header)
@@ -191,7 +191,7 @@ class EpisodeLog:
 
     def _write(self, data: Mapping[str, Any]) -> None:
         with naming_full_disk(self.path), open(self.path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(data, allow_nan=False) + "\n")
+            file.write(_line(data))
             file.flush()
             os.fsync(file.fileno())
 
@@ -201,6 +201,10 @@ class EpisodeLog:
             raise ValueError(
                 f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
             )
+
+
+def _line(data: Mapping[str, Any]) -> str:
+    return json.dumps(data, allow_nan=False, separators=(",", ":")) + "\n"
 
 
 def _told(episode: EpisodeResult) -> dict[str, Any]:
