@@ -175,23 +175,27 @@ def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) 
         raise ValueError(f"budgets: expected one measure, got {', '.join(measures) or 'no budget'}")
     figure, axes = make_figure(9, 4.2)
     colors = method_colors(budget.method for budget in budgets)
-    for budget in budgets:
-        _draw_budget(axes, budget, colors[budget.method])
+    for index, budget in enumerate(budgets):
+        _draw_budget(axes, budget, colors[budget.method], above=index % 2 == 0)
     for tolerance in sorted({budget.tolerance for budget in budgets}):
         axes.axhline(tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
     axes.set_xlabel("visual tokens in a decoder layer, mean")
     axes.set_ylabel("action error" if measures == ["action_error"] else "success lost")
-    axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
+    low, high = axes.get_ylim()
+    axes.set_ylim(bottom=min(0, low) - 0.05 * high)  # room for numbers below a curve that comes close to zero
     axes.legend(frameon=False)
     return save_figure(figure, path)
 
 
-def _draw_budget(axes: Axes, budget: TokenBudget, color: str) -> None:
+def _draw_budget(axes: Axes, budget: TokenBudget, color: str, above: bool) -> None:
+    """Draw one curve, its numbers ``above`` it or below, so that those of curves that meet can be told apart."""
     points = sorted(budget.points, key=lambda point: point.kept)
     axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=color, linewidth=1.8)
     for point in points:
         place = (point.kept, point.loss)
-        axes.annotate(f"{point.number:g}", place, (4, 6), textcoords="offset points", fontsize=9)
+        offset = (4, 6) if above else (-6, -15)
+        text = f"{point.number:g}"
+        axes.annotate(text, place, offset, textcoords="offset points", fontsize=9, color=color)
         if point.number == budget.number:
             chosen = f"chosen: {budget.method}@{point.number:g}"
             axes.plot(*place, "o", color=color, markeredgecolor="#333333", markersize=11, label=chosen)
