@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.pinned.actions import policy_of
+from tests.pinned.actions import is_vla, policy_of
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
@@ -18,7 +18,7 @@ ASSETS = Path(__file__).parents[1] / "assets"
 FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
 # Of further training seeds, and of a policy that knows four ways.
 UNKEPT = [folder for folder in FOLDERS if folder.parent.name == "seeds" or folder.name == "four"]
-SEEING = [folder for folder in FOLDERS if folder.is_relative_to(ASSETS / "vla")]
+SEEING = [folder for folder in FOLDERS if is_vla(policy_of(folder))]
 
 
 def name(folder: Path) -> str:

@@ -53,19 +53,19 @@ class Case:
     def tolerance(self) -> float:
         """In normalised units, in which actions span [-1, 1]. Scalar code and AVX-512 were seen to differ by 3e-6, engines by
         9e-6; features of cameras, which a convolution of another machine may sum in another order, by 1e-5 of themselves."""
-        return 1e-3 if self.asset != "vla" and has_cameras(ASSETS / self.asset) else 2e-5
+        return 1e-3 if has_cameras(ASSETS / self.asset) else 2e-5
 
     def answer(self) -> dict[str, Tensor]:
         """Normalised chunk [Q, n, A], mask [Q, ...] and FLOPs [Q, 1] of the Q queries."""
         torch.manual_seed(0)
-        return _vla_answers(self) if self.asset == "vla" else _diffusion_answers(self)
+        return _vla_answers(self) if is_vla(ASSETS / self.asset) else _diffusion_answers(self)
 
 
 def cases() -> Iterator[Case]:
     """All of what is shipped, and copies under other rules of reuse."""
     for folder in policies():
         for method in shipped_methods(folder):
-            for engine in ("",) if folder.name == "vla" else engines_of(folder, method):
+            for engine in ("",) if is_vla(folder) else engines_of(folder, method):
                 yield Case(str(folder.relative_to(ASSETS)), method, engine)
     for method, rule, engine in product(_COPIED, _RULES, ENGINES):
         yield Case("lift", method, engine, rule)
@@ -98,7 +98,7 @@ def shipped_methods(folder: Path) -> list[str]:
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
     named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
-    if folder.name == "vla":
+    if is_vla(folder):
         return sorted(named | {path.name for path in files})
     pruners = {path.parent.name for path in folder.glob("*/pruner.safetensors")}
     return sorted({"dense", "uniform"} | named | pruners | {path.stem for path in files})
@@ -133,7 +133,15 @@ def _task_of(folder: Path) -> str:
 
 
 def has_cameras(folder: Path) -> bool:
-    return "vision" in json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    return "vision" in _config(folder)
+
+
+def is_vla(folder: Path) -> bool:
+    return "vla_policy" in _config(folder)["format"]
+
+
+def _config(folder: Path) -> dict:
+    return json.loads((folder / "config.json").read_text(encoding="utf-8"))
 
 
 def _reusing(folder: Path, copies: Path, rule: str) -> Path:
