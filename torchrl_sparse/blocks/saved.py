@@ -60,8 +60,8 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
 def saved_planners(folder: str | os.PathLike) -> list[str]:
     """Return the names of the planners in a folder, sorted: ``NAME.json`` or ``NAME/`` of a format in :data:`PLANNERS`.
 
-    >>> saved_planners("assets/lift")
-    ['bac', 'bac_blockwise', 'bac_ddpm10', 'bac_m6', 'bac_unified', 'l2c', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
+    >>> saved_planners("assets/lift")[4:]
+    ['bac_unified', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
     """
     files = {path.stem: path for path in Path(folder).glob("*.json")}
     files |= {path.parent.name: path for path in Path(folder).glob("*/config.json")}

@@ -39,7 +39,7 @@ def default_methods(planners: Path) -> list[str]:
     """Return the methods that need no file, and every planner that is saved in a folder.
 
     >>> default_methods(Path("assets/lift"))[5:]
-    ['bac_blockwise', 'bac', 'bac_ddpm10', 'bac_m6', 'l2c', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
+    ['bac_blockwise', 'bac', 'bac_ddpm10', 'bac_m6', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
     """
     return list(dict.fromkeys([*_ALWAYS, *saved_planners(planners)]))
 

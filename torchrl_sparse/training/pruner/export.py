@@ -77,7 +77,7 @@ def exported(folder: str | Path) -> list[str]:
     """Return the names under which a benchmark finds what `export_planner` wrote into ``folder``.
 
     >>> exported("assets/lift")
-    ['l2c']
+    ['l2c', 'l2c_noise']
     """
     names = ("pruner", "fixed.json", "l2c.json", "l2c_noise.json")
     return [Path(name).stem for name in names if (Path(folder) / name).exists()]
