@@ -80,14 +80,26 @@ def _command_arms_alone(sim_env: Any) -> None:
 
     That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has.
     """
-    load = sim_env._load_robots
+    from robosuite.environments.robot_env import RobotEnv
+
+    load, act = sim_env._load_robots, sim_env._pre_action
 
     def load_robots() -> None:  # at each reset
         load()
         for robot in sim_env.robots:
             robot.control = _arms_between_actions(robot)
 
+    def pre_action(action: np.ndarray, policy_step: bool = False) -> None:
+        if policy_step:
+            return act(action, policy_step=True)
+        for robot in sim_env.robots:
+            robot.control(action)
+
     sim_env._load_robots = load_robots
+    if (
+        type(sim_env)._pre_action is RobotEnv._pre_action
+    ):  # a task in which something moves by itself has its own
+        sim_env._pre_action = pre_action
 
 
 def _arms_between_actions(robot: Any) -> Callable[..., None]:
@@ -102,12 +114,38 @@ def _arms_between_actions(robot: Any) -> Callable[..., None]:
         if policy_step:
             return follow(robot, action, policy_step=True)
         for arm in robot.arms:
-            torques = robot.part_controllers[arm].run_controller()
+            controller = robot.part_controllers[arm]
+            _look_once(controller)
+            torques = controller.run_controller()
             actuators = robot._ref_actuators_indexes_dict[arm]
             limits = robot.sim.model.actuator_ctrlrange[actuators]
             robot.sim.data.ctrl[actuators] = np.clip(torques, limits[:, 0], limits[:, 1])
 
     return control
+
+
+def _look_once(controller: Any) -> None:
+    """Do what the controller's ``update`` does, with both of its site's Jacobians from one call instead of each from two."""
+    if not (controller.new_update and controller.lite_physics and controller.num_ref_sites == 1):
+        return  # it looks itself
+    import mujoco  # reads MUJOCO_GL
+
+    sim, joints = controller.sim, controller.qvel_index
+    model, data = sim.model._model, sim.data._data
+    site = sim.model.site_name2id(controller.ref_name)
+    jacobians = np.zeros((2, 3, model.nv))
+    mujoco.mj_jacSite(model, data, *jacobians, site)
+    controller.ref_pos[:] = data.site_xpos[site]
+    controller.ref_ori_mat[:] = data.site_xmat[site].reshape(3, 3)
+    controller.ref_pos_vel[:], controller.ref_ori_vel[:] = (each.dot(data.qvel) for each in jacobians)
+    controller.J_pos[:], controller.J_ori[:] = jacobians[:, :, joints]
+    controller.J_full[:3], controller.J_full[3:] = controller.J_pos, controller.J_ori
+    controller.joint_pos = np.array(data.qpos[controller.qpos_index])
+    controller.joint_vel = np.array(data.qvel[joints])
+    inertia = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, inertia, data.qM)
+    controller.mass_matrix = inertia[joints, :][:, joints]
+    controller.new_update = False
 
 
 def controller_config(absolute: bool) -> dict:
