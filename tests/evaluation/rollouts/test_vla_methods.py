@@ -16,6 +16,7 @@ from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.evaluation import load_results
 from torchrl_sparse.evaluation.rollouts.vla_methods import (
     matching_share,
+    method_identity,
     prepared_queries,
     seen_images,
 )
@@ -47,6 +48,14 @@ def test_a_matching_share_keeps_as_many_tokens(make):
 def test_a_pruner_that_cannot_keep_so_few_is_refused():
     with pytest.raises(ValueError, match=r"as few as 1.0 visual tokens, got at least \d"):
         matching_share(FastVPruner, make_policy(), [episode(2)], 1.0)
+
+
+def test_a_number_in_a_methods_name_makes_the_calibrated_one_beside_the_policy_no_other_method():
+    policy, settings = make_policy(), {"early": 4}
+    plain = method_identity("specprune@0.2", 0.2, policy, {"specprune": settings})
+    assert method_identity("specprune@0.2", 0.2, policy, {"specprune": {"alpha": 0.3, **settings}}) == plain
+    told = method_identity("specprune", None, policy, {"specprune": {"alpha": 0.3, **settings}})
+    assert told["options"] == {"alpha": 0.3, **settings}
 
 
 def test_prepared_queries_remember_those_before():

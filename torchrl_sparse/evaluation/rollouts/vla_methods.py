@@ -34,7 +34,12 @@ def method_identity(text: str, number: float | None, policy: VLAPolicy, settings
     identity = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
     method = TOKEN_METHODS[TokenMethodName.parse(text).name]
     if method.settings is not None:
-        identity["options"] = settings_of(text, settings)
+        beside = (
+            () if number is None else (method.number,)
+        )  # what the number takes the place of does not count
+        identity["options"] = {
+            name: value for name, value in settings_of(text, settings).items() if name not in beside
+        }
     if method.controller is not None:
         identity["controller"] = dict(settings.get("controller", {}))
     return identity
