@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from tests.evaluation.figures.test_plots import has_color, read
 from torchrl_sparse.evaluation.figures.colors import method_colors
@@ -93,6 +94,16 @@ def test_budgets_of_several_methods_are_drawn_each_in_its_colour(tmp_path):
     assert all(has_color(together, color) for color in colors.values())
     assert has_color(alone, colors["specprune"])
     assert not has_color(alone, colors["frame_difference"])
+
+
+def test_numbers_are_written_beside_two_curves_and_not_beside_more(monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(Axes, "annotate", lambda self, text, *args, **kwargs: drawn.append(text))
+    budgets = [budget("specprune"), budget("frame_difference"), budget("random")]
+    plot_token_budgets(budgets[:2], tmp_path / "two.png")
+    assert drawn == ["0.1", "0.2", "0.3"] * 2
+    plot_token_budgets(budgets, tmp_path / "three.png")
+    assert len(drawn) == 6
 
 
 @pytest.mark.parametrize(

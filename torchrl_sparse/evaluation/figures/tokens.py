@@ -163,6 +163,8 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
 def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) -> Path:
     """Draw what every number of each method loses over the tokens that it keeps, with the tolerance and the choice.
 
+    One curve or two have their numbers beside them; of more, which would cover each other's, the legend says the chosen.
+
     Args:
         budgets: calibrated by one measure, of different methods.
         path: of the PNG.
@@ -175,8 +177,10 @@ def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) 
         raise ValueError(f"budgets: expected one measure, got {', '.join(measures) or 'no budget'}")
     figure, axes = make_figure(9, 4.2)
     colors = method_colors(budget.method for budget in budgets)
+    above, below = (4, 6), (-6, -15)
     for index, budget in enumerate(budgets):
-        _draw_budget(axes, budget, colors[budget.method], above=index % 2 == 0)
+        offset = None if len(budgets) > 2 else (above, below)[index]
+        _draw_budget(axes, budget, colors[budget.method], offset)
     for tolerance in sorted({budget.tolerance for budget in budgets}):
         axes.axhline(tolerance, color="#333333", linewidth=1, linestyle="--", label="tolerance")
     axes.set_xlabel("visual tokens in a decoder layer, mean")
@@ -187,15 +191,14 @@ def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) 
     return save_figure(figure, path)
 
 
-def _draw_budget(axes: Axes, budget: TokenBudget, color: str, above: bool) -> None:
-    """Draw one curve, its numbers ``above`` it or below, so that those of curves that meet can be told apart."""
+def _draw_budget(axes: Axes, budget: TokenBudget, color: str, offset: tuple[int, int] | None) -> None:
+    """Draw one curve, with its numbers that many points from theirs."""
     points = sorted(budget.points, key=lambda point: point.kept)
     axes.plot([p.kept for p in points], [p.loss for p in points], "o-", color=color, linewidth=1.8)
     for point in points:
-        place = (point.kept, point.loss)
-        offset = (4, 6) if above else (-6, -15)
-        text = f"{point.number:g}"
-        axes.annotate(text, place, offset, textcoords="offset points", fontsize=9, color=color)
+        place, text = (point.kept, point.loss), f"{point.number:g}"
+        if offset is not None:
+            axes.annotate(text, place, offset, textcoords="offset points", fontsize=9, color=color)
         if point.number == budget.number:
-            chosen = f"chosen: {budget.method}@{point.number:g}"
+            chosen = f"chosen: {budget.method}@{text}"
             axes.plot(*place, "o", color=color, markeredgecolor="#333333", markersize=11, label=chosen)
