@@ -5,15 +5,12 @@ import json
 import math
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from tests.evaluation.synthetic import make_results
+from tests.evaluation.synthetic import VERSION_1, make_results
 from torchrl_sparse.evaluation.results.schema import Results, Results1, Stopping, load_results, save_results
 from torchrl_sparse.storage.json import parse_json, to_plain
-
-ASSETS = Path(__file__).parents[3] / "assets"
 
 
 def read(content):
@@ -138,16 +135,15 @@ def test_methods_may_stop_early_where_the_file_says_so():
 
 
 def test_version_1_can_be_read_and_is_no_version_2():
-    path = ASSETS / "vla" / "results.json"
-    results = load_results(path)
+    results = load_results(VERSION_1)
     assert isinstance(results, Results1)
     assert results.first_seed == 100_000
     with pytest.raises(ValueError, match="schema: expected 2, got 1"):
-        read(json.loads(path.read_text()))
+        read(json.loads(VERSION_1.read_text()))
 
 
 def test_version_1_holds_nothing_of_version_2(tmp_path):
-    content = json.loads((ASSETS / "vla" / "results.json").read_text())
+    content = json.loads(VERSION_1.read_text())
     content["methods"]["dense"]["restricted_mean_time"] = 100.0
     (tmp_path / "results.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"methods.dense.restricted_mean_time: expected no such key"):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.evaluation.synthetic import make_results, make_runs
+from tests.evaluation.synthetic import VERSION_1, make_results, make_runs
 from torchrl_sparse.evaluation.results.aggregate import (
     aggregate_results,
     aggregate_rows,
@@ -38,7 +38,7 @@ def old(tmp_path):
     content["schema"] = 1
     for key in ("split", "episode_horizon", "early_cut"):
         del content[key]
-    first = {*load_results("assets/vla/results.json").dense.__dataclass_fields__}
+    first = {*load_results(VERSION_1).dense.__dataclass_fields__}
     for method in content["methods"].values():
         for key in [*method]:
             if key not in first:
@@ -115,7 +115,7 @@ def test_tasks_are_put_together_for_the_methods_that_all_have(tasks, tmp_path):
 def test_what_cannot_be_put_together_is_named(tasks):
     with pytest.raises(ValueError, match="aggregate: expected different tasks of one split"):
         aggregate_results([tasks[0], tasks[0].parent / ".." / "Lift" / "results.json"])
-    with pytest.raises(ValueError, match=r"vla/results.json: schema: expected 2 to aggregate, got 1"):
-        aggregate_results(["assets/vla/results.json"])
+    with pytest.raises(ValueError, match=r"version_1.json: schema: expected 2 to aggregate, got 1"):
+        aggregate_results([VERSION_1])
     with pytest.raises(FileNotFoundError, match=r"expected a file nothing.json"):
         aggregate_results(["nothing.json"])
