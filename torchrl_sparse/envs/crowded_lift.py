@@ -16,10 +16,8 @@ import numpy as np
 from torchrl_sparse.envs.named_lift import LiftNamed
 
 CROWD = ("red", "green", "blue", "yellow", "purple")
-RADII = (
-    0.21,
-    0.25,
-)  # m, half axes of the ball's ellipse about the table's centre, outside of where cubes are placed
+# m, half axes of the ball's ellipse about the table's centre, outside of where cubes are placed
+RADII = (0.21, 0.25)
 PERIOD = (4.0, 6.0)  # s, of a round: about 0.3 m/s
 BALL_RADIUS = 0.025  # m
 _RGBA = "1 0.5 0 1"
