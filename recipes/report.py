@@ -4,8 +4,8 @@
 
 Or make a `results.json` of schema 1 anew in schema 2, with times from the episodes beside it; or put several tasks together:
 
-    python recipes/report.py upgrade=[assets/can/results.json,assets/can/results_400.json]
-    python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results_400.json] out=outputs/aggregate.json
+    python recipes/report.py upgrade=[outputs/can/results.json,outputs/lift/results.json]
+    python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results.json] out=outputs/aggregate.json
 
 Or draw what methods gain and lose on all tasks in one picture; of several files of a task the first that has a method counts:
 

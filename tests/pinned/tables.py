@@ -40,7 +40,7 @@ def _normalise(line: str) -> str:
 
 def _maker(path: Path):
     makers = {
-        "*/sweep_*/results.json": _sweep,
+        "lift/results_steps.json": _sweep,
         "results*.json": _results,
         "realtime.json": _realtime,
         "engine/engine*.json": _engine,
@@ -68,7 +68,7 @@ def _vla_latency(path: Path) -> list[str]:
 
 
 def _sweep(path: Path) -> list[str]:
-    """Also the merged table and the metrics of its trials: the dense method and another each."""
+    """Also the merged table and the metrics of a sweep whose trials were the dense method and another each."""
     whole = build.load_results(path)
     dense, *tested = whole.methods
     trials = [

@@ -3,7 +3,7 @@
 Two comments of a line each enclose every such table; what lies between them is replaced (`recipes/pages.py`), and
 `tests/test_pages.py` fails where a page and its JSON differ::
 
-    <!-- table: assets/can/results_400.json methods="dense | ddim10 | sag" columns="method | success | verdict | p50, ms" -->
+    <!-- table: assets/can/results.json methods="dense | ddim10 | sag" columns="method | success | verdict | p50, ms" -->
     <!-- end -->
 
 Files are named from the root of the repository. Lists are separated by ``|`` and quoted. Options:
