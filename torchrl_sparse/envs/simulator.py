@@ -84,8 +84,11 @@ def _command_arms_alone(sim_env: Any) -> None:
 
     load, act = sim_env._load_robots, sim_env._pre_action
 
-    def load_robots() -> None:  # at each reset
+    def load_robots() -> None:  # at each reset, but for one to a state that was saved
         load()
+        take_over()
+
+    def take_over() -> None:
         for robot in sim_env.robots:
             robot.control = _arms_between_actions(robot)
 
@@ -95,10 +98,10 @@ def _command_arms_alone(sim_env: Any) -> None:
         for robot in sim_env.robots:
             robot.control(action)
 
+    take_over()
     sim_env._load_robots = load_robots
-    if (
-        type(sim_env)._pre_action is RobotEnv._pre_action
-    ):  # a task in which something moves by itself has its own
+    # A task in which something moves by itself has its own.
+    if type(sim_env)._pre_action is RobotEnv._pre_action:
         sim_env._pre_action = pre_action
 
 
