@@ -34,12 +34,9 @@ def method_identity(text: str, number: float | None, policy: VLAPolicy, settings
     identity = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
     method = TOKEN_METHODS[TokenMethodName.parse(text).name]
     if method.settings is not None:
-        beside = (
-            () if number is None else (method.number,)
-        )  # what the number takes the place of does not count
-        identity["options"] = {
-            name: value for name, value in settings_of(text, settings).items() if name not in beside
-        }
+        identity["options"] = settings_of(text, settings)
+        if number is not None:  # which takes the place of a calibrated one
+            identity["options"].pop(method.number, None)
     if method.controller is not None:
         identity["controller"] = dict(settings.get("controller", {}))
     return identity
