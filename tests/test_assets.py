@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.pinned.actions import is_vla, policy_of
+from tests.pinned.actions import is_kept, is_vla, policy_of
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
@@ -16,8 +16,7 @@ from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 ASSETS = Path(__file__).parents[1] / "assets"
 FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
-# Of further training seeds, and of a policy that knows four ways.
-UNKEPT = [folder for folder in FOLDERS if folder.parent.name == "seeds" or folder.name == "four"]
+UNKEPT = [folder for folder in FOLDERS if not is_kept(folder)]
 SEEING = [folder for folder in FOLDERS if is_vla(policy_of(folder))]
 
 

@@ -29,6 +29,8 @@ _AS_DENSE = {"dense_noise", "ddim100"}
 _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
 # Not of the policy's planner; and what rounded weights answer depends on the instruction set.
 _EXECUTED_OR_ROUNDED = re.compile(r"_every\d|_of\d|:")
+# Results alone: of further training seeds, of a policy that knows four ways, and of one that was trained for less time.
+_WITHOUT_WEIGHTS = {"seeds", "four", "shorter"}
 _INSTRUCTION, _KEPT = "lift the green cube", 50.0
 
 
@@ -81,6 +83,11 @@ def policy_of(folder: Path) -> Path:
     return next(path for path in (folder, *folder.parents) if (path / "model.safetensors").exists())
 
 
+def is_kept(folder: Path) -> bool:
+    """Whether results or episodes in ``folder`` are of a policy whose weights are here."""
+    return _WITHOUT_WEIGHTS.isdisjoint(folder.relative_to(ASSETS).parts)
+
+
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
     """The engines that a method is asked in: not PyTorch's where it recalls earlier queries, or is much as dense is."""
     if method in _AS_DENSE:
@@ -94,7 +101,7 @@ def engines_of(folder: Path, method: str) -> tuple[str, ...]:
 def shipped_methods(folder: Path) -> list[str]:
     """Dense, uniform, the planners beside the policy, and what its tables name."""
     tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
-    tables = [table for table in tables if policy_of(table.parent) == folder]
+    tables = [table for table in tables if is_kept(table.parent) and policy_of(table.parent) == folder]
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
     named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
