@@ -33,6 +33,12 @@ def test_tables_on_pages_are_those_of_their_json():
     assert not differ, f"python recipes/pages.py writes them: {', '.join(map(str, differ))}"
 
 
+@pytest.mark.parametrize("page", [name for name in PAGES if name.endswith("README.md")])
+def test_the_site_leads_to_it(page):
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    assert f": {page}\n" in navigation
+
+
 @every_page
 def test_no_table_of_results_is_written_by_hand(page):
     of_results = ("success", "p50", "speed-up", "FLOPs ratio", "verdict")
