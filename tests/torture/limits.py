@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import resource
@@ -64,6 +65,7 @@ def run_limited(
 def _work(call: Callable[[], Any], writer: int, seconds: int, gigabytes: float | None) -> None:
     """Do the child's part; never return."""
     try:
+        faulthandler.disable()  # how it ended is told by its status, not on stderr
         torch.set_num_threads(1)
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
