@@ -20,9 +20,8 @@ demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
 		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
-# Files come as they are named: sorted by how many tests they have, xdist's own order, the longest would come last.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 lint: install
 	$(BIN)/ruff check .
