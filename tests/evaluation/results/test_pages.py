@@ -83,6 +83,19 @@ def test_policies_of_one_task_are_told_apart_by_the_names_that_they_are_given():
         table(f'{files} {options} policies="older"', ASSETS)
 
 
+def test_files_of_one_policy_share_its_column():
+    files = "lift/test_split/results.json lift/test_split/results_reuse.json square/results.json"
+    options = 'methods="dense | searched" cells="success, %" policies="Lift | Lift | Square"'
+    heading, dense, searched = table(f"{files} {options}", ASSETS)
+    assert heading == ["method", "Lift", "Square"]
+    assert (dense[1], searched[1]) == tuple(
+        table(f'lift/test_split/{file}.json methods="{method}" columns="success, %"', ASSETS)[1][0]
+        for file, method in (("results", "dense"), ("results_reuse", "searched"))
+    )
+    with pytest.raises(ValueError, match=r"policies: expected Lift to be of Lift, got a file of NutAssembly"):
+        table(f"{files} {options.replace('Square', 'Lift')}", ASSETS)
+
+
 def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
     files = "lift_two_ways/results.json pusht/results.json"
     cells = f'{files} methods="dense | bac" cells="success or score | time vs dense"'

@@ -20,6 +20,7 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
 - ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
 - Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
 - ``policies="seed 0 | seed 1"`` tells several policies of one task apart: a name for each file, instead of the task's.
+  Files of one policy have the same name.
 - ``cells="success, % | speed-up"``: side by side, one row per method and one column per task, which holds these columns of the
   method. Of files of the same task the first that has the method counts. ``published=assets/published.json`` puts a paper's
   figures before each (`Published`).
@@ -173,10 +174,14 @@ def _rows(directive: _Directive, root: Path) -> list[Row]:
 
 
 def _told_apart(tables: Sequence[Table], policies: Sequence[str]) -> list[Table]:
-    if len(policies) != len(tables) or len(set(policies)) < len(policies):
+    if len(policies) != len(tables):
         raise ValueError(
             f"policies: expected {len(tables)} names, one for each file, got {' | '.join(policies)}"
         )
+    tasks: dict[str, str] = {}
+    for table, policy in zip(tables, policies, strict=True):
+        if tasks.setdefault(policy, table.task) != table.task:
+            raise ValueError(f"policies: expected {policy} to be of {tasks[policy]}, got a file of {table.task}")
     return [replace(table, task=policy) for table, policy in zip(tables, policies, strict=True)]
 
 
