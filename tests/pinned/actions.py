@@ -29,7 +29,7 @@ _AS_DENSE = {"dense_noise", "ddim100"}
 _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
 # Not of the policy's planner; and what rounded weights answer depends on the instruction set.
 _EXECUTED_OR_ROUNDED = re.compile(r"_every\d|_of\d|:")
-# Results alone: of further training seeds, of a policy that knows four ways, of one that was trained for less time, and of one that another went on from.
+# Results alone: of other training seeds, of a policy that knows four ways, of one of less training, of what another began from.
 _WITHOUT_WEIGHTS = {"seeds", "four", "shorter", "weaker"}
 _INSTRUCTION, _KEPT = "lift the green cube", 50.0
 

@@ -152,14 +152,13 @@ class StateTask(_Named):
     """A task of another simulator, which an optional extra brings; a `Task` whose policies observe the simulator's state.
 
     Attributes:
-        name: of the task in results.
-        alias: short name.
+        name, alias: of the task in results, and a short one.
         state_dim, action_dim: sizes of the published low-dimensional observation and action.
         environment: ``"module:class"`` of the environment.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
             without one.
+        early_cut, by_degrees: see `Task`.
         way_of: see `RobosuiteTask`.
-        by_degrees: see `Task`.
     """
 
     name: str
@@ -168,6 +167,7 @@ class StateTask(_Named):
     action_dim: int
     environment: str
     expert: str | None = None
+    early_cut: int | None = None
     way_of: str | None = None
     by_degrees: bool = False
 
@@ -213,8 +213,8 @@ def _expert(place: str) -> str:
 _LIFT = _expert("lift:LiftExpert")
 _CUBES = tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue", "yellow", "purple"))
 # early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; two ways 49,
-# 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22 and
-# of the two ways on the 23rd, before any table that uses it.
+# 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22, of
+# two ways on the 23rd, of 200 and 600 demonstrations (384, 118) on the 27th, before any table that uses it.
 _ROBOSUITE = (
     RobosuiteTask("Lift", "lift", 1, 10, 400, ("lift the red cube",), expert=_LIFT, early_cut=44),
     RobosuiteTask(
@@ -254,6 +254,7 @@ _ROBOSUITE = (
         *("TwoArmTransport", "transport", 2, 41, 700),
         instructions=("hand the hammer over and put it into the target bin",),
         expert=_expert("two_arm_transport:TwoArmTransportExpert"),
+        early_cut=480,
     ),
     RobosuiteTask(
         *("ToolHang", "tool_hang", 1, 44, 700, ("assemble the frame and hang the tool on it",)),
@@ -267,6 +268,7 @@ _OTHERS = (
     StateTask(
         *("BlockPush", "block_push", 16, 2, f"{_ENVS}.block_push:BlockPushEnv"),
         expert=_expert("block_push:BlockPushExpert"),
+        early_cut=148,
         way_of=f"{_ENVS}.block_push:way_of",
     ),
     StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv"),

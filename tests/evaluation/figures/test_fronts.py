@@ -12,7 +12,9 @@ from tests.evaluation.synthetic import VERSION_1
 from torchrl_sparse.evaluation.figures import fronts
 from torchrl_sparse.evaluation.results.schema import load_results
 
-LIFT, CAN, SQUARE = (Path("assets", task, "test_split/results.json") for task in ("lift", "can", "square/weaker"))
+LIFT, CAN, SQUARE = (
+    Path("assets", task, "test_split/results.json") for task in ("lift", "can", "square/weaker")
+)
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, lo
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.carried_noise import carried_noise_rows, load_carried_noise
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
+from torchrl_sparse.evaluation.results.completed import completed_rows, told_completed
 from torchrl_sparse.evaluation.results.engine_report import (
     COLUMNS,
     engine_rows,
@@ -78,7 +79,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     if pairs:
         return _pairs(path, pairs)
     if which in _OF_EPISODES:
-        return _OF_EPISODES[which](path)
+        return _told(path, which)
     tables = read_tables(path)
     name = which or next(iter(tables))
     if name not in tables:
@@ -164,20 +165,13 @@ def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     return _table(results.subject, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
 
 
-def _ways(path: Path) -> Table:
+def _told(path: Path, which: str) -> Table:
+    tell, rows, expected = _OF_EPISODES[which]
     results = load_results(path)
-    ways = told_ways(_episodes(path, results, results.methods))
-    if not ways:
-        raise ValueError(f"rows: expected episodes of {results.task} that tell their ways, got none")
-    return _table(results.subject, way_rows(ways))
-
-
-def _scores(path: Path) -> Table:
-    results = load_results(path)
-    scores = told_scores(_episodes(path, results, results.methods))
-    if not scores:
-        raise ValueError(f"rows: expected episodes of {results.task} with scores, got none")
-    return _table(results.subject, score_rows(scores, results.dense.paired_vs_dense.margin))
+    told = tell(_episodes(path, results, results.methods))
+    if not told:
+        raise ValueError(f"rows: expected episodes of {results.task} {expected}, got none")
+    return _table(results.subject, rows(told, results))
 
 
 def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
@@ -231,7 +225,15 @@ def _stopping(path: Path) -> dict[str, Table]:
     return {name: _table(f"{results.trials} trials", rows) for name, rows in stopping_rows(results).items()}
 
 
-_OF_EPISODES = {"ways": _ways, "scores": _scores}
+_OF_EPISODES: dict[str, tuple[Callable, Callable, str]] = {
+    "completed": (told_completed, lambda told, _: completed_rows(told), "that count its parts"),
+    "ways": (told_ways, lambda told, _: way_rows(told), "that tell their ways"),
+    "scores": (
+        told_scores,
+        lambda told, results: score_rows(told, results.dense.paired_vs_dense.margin),
+        "with scores",
+    ),
+}
 _READERS = {
     "results": _results,
     "acceleration": _acceleration,

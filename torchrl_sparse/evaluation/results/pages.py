@@ -15,8 +15,8 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
   ``engine.json`` also has ``f32 arithmetic alone, ms``, and what reads its weights, ``memory alone, ms``.
 - ``rows``: which table of a file with several: ``played`` of an ``acceleration.json``, a shape of an ``engine.json``,
   ``methods``, ``parts`` or ``products`` of a ``vla_latency.json``, ``success`` or ``time`` of an ``offline_agreement.json``, or
-  ``headline`` or ``budgets`` of a ``results*.json`` with times, see `choices`, or its ``ways`` or ``scores``, from the
-  ``episodes/`` beside it.
+  ``headline`` or ``budgets`` of a ``results*.json`` with times, see `choices`, or its ``ways``, ``completed`` (parts of
+  the task) or ``scores``, from the ``episodes/`` beside it.
 - ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
 - Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
 - ``policies="seed 0 | seed 1"`` tells several policies of one task apart: a name for each file, instead of the task's.
@@ -181,7 +181,9 @@ def _told_apart(tables: Sequence[Table], policies: Sequence[str]) -> list[Table]
     tasks: dict[str, str] = {}
     for table, policy in zip(tables, policies, strict=True):
         if tasks.setdefault(policy, table.task) != table.task:
-            raise ValueError(f"policies: expected {policy} to be of {tasks[policy]}, got a file of {table.task}")
+            raise ValueError(
+                f"policies: expected {policy} to be of {tasks[policy]}, got a file of {table.task}"
+            )
     return [replace(table, task=policy) for table, policy in zip(tables, policies, strict=True)]
 
 
