@@ -20,6 +20,7 @@ from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.evaluation.results.completed import count_levels
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
@@ -73,7 +74,7 @@ def summarize(episodes: list[EpisodeResult]) -> str:
         f"steps {sum(episode.length for episode in episodes) / n:.1f}",
     ]
     if parts := [episode.completed for episode in episodes if episode.completed is not None]:
-        told += [f"p{i} {sum(part >= i for part in parts) / n:.2f}" for i in range(1, max(1, *parts) + 1)]
+        told += [f"{level} {k / n:.2f}" for level, k in count_levels(parts).items()]
     if ways := [episode.way for episode in episodes if episode.way is not None]:
         told.append(describe_ways(ways))
     return ", ".join(told)

@@ -8,7 +8,7 @@ from torchrl_sparse.evaluation.results.text import percent_range
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
 
-__all__ = ["completed_rows", "told_completed"]
+__all__ = ["completed_rows", "count_levels", "told_completed"]
 
 
 def told_completed(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
@@ -28,13 +28,22 @@ def completed_rows(completed: Mapping[str, Sequence[int]]) -> list[dict[str, str
     >>> completed_rows({"dense": [2, 2, 1, 2], "ddim3": [0, 1, 0, 0]})[1]["p1"]
     '1/4 [5, 70] %'
     """
-    most = max(1, *(count for told in completed.values() for count in told))
+    most = max(count for told in completed.values() for count in told)
     return [
-        {"method": name, **{f"p{level}": _at_least(level, told) for level in range(1, most + 1)}}
+        {"method": name, **{level: _share(k, len(told)) for level, k in count_levels(told, most).items()}}
         for name, told in completed.items()
     ]
 
 
-def _at_least(level: int, told: Sequence[int]) -> str:
-    k, n = sum(count >= level for count in told), len(told)
+def count_levels(told: Sequence[int], most: int = 0) -> dict[str, int]:
+    """Return of how many episodes at least one part was done, two, … up to ``most`` or the most of any episode.
+
+    >>> count_levels([2, 2, 1, 0])
+    {'p1': 3, 'p2': 2}
+    """
+    levels = range(1, max(1, most, *told) + 1)
+    return {f"p{level}": sum(count >= level for count in told) for level in levels}
+
+
+def _share(k: int, n: int) -> str:
     return f"{k}/{n} {percent_range(wilson_interval(k, n))} %"
