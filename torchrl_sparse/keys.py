@@ -50,6 +50,8 @@ constant                          shape, dtype           meaning
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
 ``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
+``UNTIL_QUERY``                   i64 [*B, 1]            steps from the next observation to the next query at the earliest; 0
+                                                         where the next observation may be asked about
 ``QUERIED``                       bool [*B, 1]           this step called the policy
 ``CANDIDATES``                    f32 [*B, S, n, A]      chunks of a query that was asked S times, of which one is played
 ``CHOSEN``                        i64 [*B, 1]            which of them
@@ -114,6 +116,7 @@ REPLAN = ("control", "replan")
 FINE = ("control", "fine")
 CONTROL_STEP = ("control", "step")
 AGE = ("control", "age")
+UNTIL_QUERY = ("control", "until_query")
 QUERIED = ("control", "queried")
 CANDIDATES = ("control", "candidates")
 CHOSEN = ("control", "chosen")

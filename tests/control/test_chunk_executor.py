@@ -64,6 +64,7 @@ def test_only_due_samples_reach_the_policy_and_others_keep_their_answer():
     assert policy.rows == [3, 1]
     assert td[keys.QUERIED].flatten().tolist() == [False, True, False]
     assert td[keys.AGE].flatten().tolist() == [1, 0, 1]
+    assert td[keys.UNTIL_QUERY].flatten().tolist() == [2, 3, 2]
     assert td[keys.ACTION].tolist() == [[0, 1, 1], [6, 2, 0], [2, 1, 1]]
     assert td[NOTE].flatten().tolist() == [0, 60, 20]
 
@@ -85,12 +86,15 @@ def test_gate_replans_single_samples_in_the_middle_of_a_chunk():
     td = step(executor, td, [0.0, 0.0], [False, False])
     assert policy.rows == [2, 1]
     assert td[keys.AGE].flatten().tolist() == [2, 1]
+    assert td[keys.UNTIL_QUERY].flatten().tolist() == [0, 0]  # the controller may ask at any step
     assert keys.REPLAN in executor.out_keys
 
 
 def test_every_key_of_the_policy_is_declared():
     executor = ChunkExecutor(CountingPolicy())
-    assert {keys.ACTION, keys.AGE, keys.QUERIED, *CountingPolicy().out_keys} == set(executor.out_keys)
+    assert {keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *CountingPolicy().out_keys} == set(
+        executor.out_keys
+    )
     assert set(executor.in_keys) == {keys.IS_INIT, "input"}
 
 

@@ -69,6 +69,20 @@ def test_plays_what_two_clocks_say(delay, period):
     assert play(executor, 60) == expected(delay, period, 9, 60)
 
 
+@pytest.mark.parametrize("delay", [0, 2, 5])
+def test_no_query_comes_before_it_was_announced(delay):
+    executor, td = RealtimeExecutor(ClockPolicy(), HOLD, 4, latency=delay / 20), TensorDict(batch_size=[1])
+    until, queried = [], []
+    for now in range(24):
+        td["now"], td[keys.IS_INIT] = torch.full((1, 1), float(now)), torch.tensor([[now == 0]])
+        td = executor(td)
+        until.append(td[keys.UNTIL_QUERY].item())
+        queried.append(td[keys.QUERIED].item())
+    assert max(until) == 3
+    assert sum(queried) > 3
+    assert not any(any(queried[now + 1 : now + 1 + left]) for now, left in enumerate(until))
+
+
 def test_a_measured_latency_is_that_of_each_query():
     policy = ClockPolicy(latency=0.12)
     executor = RealtimeExecutor(policy, HOLD, 4)

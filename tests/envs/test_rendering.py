@@ -1,5 +1,6 @@
 """A handful of rendered steps; skipped only where the system has no GL library."""
 
+from contextlib import closing
 from unittest import mock
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from torchrl_sparse import keys
+from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys
+from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.rendering import CameraRenderer
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 
@@ -66,11 +68,11 @@ def test_what_is_out_of_view_is_not_drawn_and_not_missed(env, camera):
 def test_a_renderer_goes_on_with_the_next_episodes_model(env):
     env.reset()
     env.render("frontview", 40, 40)
-    (renderer,) = (r for size, r in env._renderers.items() if size == (40, 40))
+    (renderer,) = (r for size, r in env._cameras._renderers.items() if size == (40, 40))
     env.reset(initial_state=env.get_initial_state())
     env.reset()
     image = env.render("frontview", 40, 40)
-    assert env._renderers[40, 40] is renderer
+    assert env._cameras._renderers[40, 40] is renderer
     fresh = CameraRenderer(env.sim_env.sim, 40, 40)
     assert np.array_equal(fresh.image("frontview"), image)
     fresh.close()
@@ -90,3 +92,35 @@ def test_a_renderer_does_not_follow_into_another_scene(env):
 def test_unknown_camera_is_named(env):
     with pytest.raises(ValueError, match=r"camera: expected one of .*agentview.*got 'drone'"):
         env.render("drone")
+
+
+def test_frames_that_no_query_sees_are_not_rendered_and_change_nothing(env):
+    policy = DiffusionPolicy.from_pretrained("assets/lift_image")
+    policy.sampler = Sampler("ddpm", 2)
+    make = diffusion_env("lift", policy)
+    played = {}
+    for seen in (None, policy.n_obs_steps):
+        with (
+            closing(make(seeds=[100000], seen_frames=seen)) as shown,
+            mock.patch.object(
+                CameraRenderer, "image", autospec=True, side_effect=CameraRenderer.image
+            ) as image,
+        ):
+            played[seen] = shown.rollout(11, ChunkExecutor(policy, n_action_steps=4)), image.call_count
+    (every, all_frames), (fewer, seen_frames) = played.values()
+    assert torch.equal(every[keys.CHUNK], fewer[keys.CHUNK])
+    assert torch.equal(every["next"][keys.STATE], fewer["next"][keys.STATE])
+    # The first; after steps 0 to 10, those of the last two before each query, at 4, 8 and, to come, 12.
+    assert (all_frames, seen_frames) == (2 * 12, 2 * 6)
+    same = (every["next"][keys.IMAGE] == fewer["next"][keys.IMAGE]).flatten(1).all(1)
+    assert same.tolist() == [False, False, True, True] * 2 + [False, False, True]
+
+
+def test_without_an_executor_every_frame_is_rendered():
+    shown = RobosuiteEnv("Lift", camera="agentview", image_size=48, seeds=[0], seen_frames=1)
+    with (
+        closing(shown),
+        mock.patch.object(CameraRenderer, "image", autospec=True, side_effect=CameraRenderer.image) as image,
+    ):
+        shown.rollout(3)
+    assert image.call_count == 4

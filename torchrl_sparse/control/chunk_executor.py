@@ -88,7 +88,13 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def out_keys(self):
-        own = [keys.ACTION, keys.AGE, keys.QUERIED, *([keys.CHOSEN] if self.selector is not None else ())]
+        own = [
+            keys.ACTION,
+            keys.AGE,
+            keys.UNTIL_QUERY,
+            keys.QUERIED,
+            *([keys.CHOSEN] if self.selector is not None else ()),
+        ]
         return _unique(
             [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
         )
@@ -103,6 +109,7 @@ class ChunkExecutor(TensorDictModuleBase):
         self._clear_costs(tensordict, ~due)
         age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
+        tensordict.set(keys.UNTIL_QUERY, self._until_query(age))
         tensordict.set(keys.QUERIED, due)
         return tensordict.set(keys.ACTION, self._serve(tensordict, age))
 
@@ -144,6 +151,11 @@ class ChunkExecutor(TensorDictModuleBase):
     def _age(self, tensordict: TensorDictBase) -> Tensor:
         """Return i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
         return keys.recall(tensordict, keys.AGE, (1,), self.n_action_steps)
+
+    def _until_query(self, age: Tensor) -> Tensor:
+        """Return i64 [*B, 1]: steps from the next observation to the next query at the earliest."""
+        left = (self.n_action_steps - 1 - age).clamp(min=0)
+        return left if self.controller is None else torch.zeros_like(left)  # which may ask at any step
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """Return bool [*B, 1]: samples without an action to serve."""

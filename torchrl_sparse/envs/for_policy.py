@@ -21,6 +21,8 @@ _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None) -> Callable[..., EnvBase]:
     """Return a maker of environments that show what ``policy`` was trained on; its keywords are those of `make_env`.
 
+    Frames that no query of its executor sees are not rendered (``seen_frames`` of `RobosuiteEnv`; None renders all).
+
     Args:
         task: see `make_env`.
         policy: decides the history's length, the cameras and the size of their images, and by its ``source`` which
@@ -126,7 +128,8 @@ def _image_options(policy: DiffusionPolicy) -> dict[str, Any]:
     cameras = {name: named.get(name, "") for name in policy.vision.cameras}
     if not all(cameras.values()) or not cameras.keys() <= _CAMERA_OPTIONS.keys():
         raise ValueError(f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {named}")
-    return {**camera_options(cameras), "image_size": policy.vision.image_size[0], "object_state": False}
+    shown = {"image_size": policy.vision.image_size[0], "seen_frames": policy.n_obs_steps}
+    return {**camera_options(cameras), **shown, "object_state": False}
 
 
 def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import atexit
 import math
 import os
+from collections.abc import Mapping
 from itertools import product
 from typing import Any
 
 import numpy as np
+import torch
+from tensordict import NestedKey
+from torch import Tensor
 
 from torchrl_sparse.runtime.failure import RunFailed
 
@@ -120,6 +124,49 @@ class CameraRenderer:
         self._gl.make_current()
         self._context.free()
         self._gl.free()
+
+
+class Cameras:
+    """The cameras that an environment observes, and any other that is asked for; one renderer for each size of image.
+
+    Args:
+        names: the cameras, by the key of each one's images.
+        size: height and width of these images, pixels.
+        fast: see `CameraRenderer`, whose errors are those of `images` and `render`.
+    """
+
+    def __init__(self, names: Mapping[NestedKey, str], size: int, *, fast: bool = True):
+        self.names = dict(names)
+        self.size = size
+        self._fast = fast
+        self._renderers: dict[tuple[int, int], CameraRenderer] = {}
+        self._last: dict[NestedKey, Tensor] = {}
+
+    def images(self, sim: Any, *, again: bool = False) -> Mapping[NestedKey, Tensor]:
+        """Return u8 [3, size, size] of each camera; ``again`` gives those of the call before and renders nothing."""
+        if not again:
+            shown = {key: self.render(sim, name, self.size, self.size) for key, name in self.names.items()}
+            self._last = {
+                key: torch.from_numpy(image).permute(2, 0, 1).contiguous() for key, image in shown.items()
+            }
+        return self._last
+
+    def render(self, sim: Any, camera: str, height: int, width: int) -> np.ndarray:
+        """Return u8 [height, width, 3] of the present state, top row first."""
+        size = (height, width)
+        renderer = self._renderers.get(size)
+        if renderer is not None and not renderer.follow(sim):
+            self._renderers.pop(size).close()
+            renderer = None
+        if renderer is None:
+            renderer = self._renderers[size] = CameraRenderer(sim, height, width, fast=self._fast)
+        return renderer.image(camera)
+
+    def close(self) -> None:
+        """Free all GL contexts; what is asked for later gets new ones."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers = {}
 
 
 def _same_uploads(one: Any, other: Any) -> bool:

@@ -13,7 +13,7 @@ from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.conventions import Convention, check_convention, object_state
-from torchrl_sparse.envs.rendering import CameraRenderer
+from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
 from torchrl_sparse.envs.tasks import find_robosuite_task
@@ -63,6 +63,8 @@ class RobosuiteEnv(SeededEnv):
         state_keys: robosuite's names of the observations that make up the state, in order; None for the task's.
         convention: the version of robosuite whose meaning the objects' state has, see `torchrl_sparse.envs.conventions`.
         fast_render: see `CameraRenderer`.
+        seen_frames: render those frames alone that a policy of so many observation steps sees, as its executor tells under
+            ``("control", "until_query")``, and repeat the last one in place of the others; None renders each.
         instruction: write ``"language_instruction"``; True for the episode's own words. Words of your own are written as
             they are; for a task with several instructions they have to be one of those, and that one counts in every episode.
         reward_shaping: robosuite's dense reward instead of 1 on success.
@@ -93,6 +95,7 @@ class RobosuiteEnv(SeededEnv):
         state_keys: Sequence[str] | None = None,
         convention: Convention = "1.5",
         fast_render: bool = True,
+        seen_frames: int | None = None,
         instruction: bool | str = False,
         reward_shaping: bool = False,
         device: torch.device | str = "cpu",
@@ -103,24 +106,23 @@ class RobosuiteEnv(SeededEnv):
         horizon = self.task.horizon if horizon is None else horizon
         super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.way_of is not None, device=device)
         self.action_mode = action_mode
-        self._cameras = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
-        self._cameras = {key: name for key, name in self._cameras.items() if name is not None}
-        if image_size is not None and not self._cameras:
+        named = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
+        named = {key: name for key, name in named.items() if name is not None}
+        if image_size is not None and not named:
             raise ValueError(
                 f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
             )
-        self._image_size = 84 if image_size is None else image_size
+        self._cameras = Cameras(named, 84 if image_size is None else image_size, fast=fast_render)
+        self._seen_frames, self._unseen = seen_frames, False
         own_keys = self.task.state_keys if object_state else self.task.proprioception_keys
         self._state_keys = own_keys if state_keys is None else tuple(state_keys)
         self._state_size = self.task.state_size(self._state_keys)
         check_convention(convention, self.task.name)
         self._convention: Convention = convention
-        self._fast_render = fast_render
         self._instruction = instruction
         if isinstance(instruction, str) and self.task.has_choice:
             self.task.check_instruction(instruction)
         self._restored_xml: str | None = None
-        self._renderers: dict[tuple[int, int], CameraRenderer] = {}
         self.sim_env = make_simulator(
             self.task, absolute=action_mode == "absolute", reward_shaping=reward_shaping
         )
@@ -129,7 +131,7 @@ class RobosuiteEnv(SeededEnv):
     # -- specs ---------------------------------------------------------------------------------------------------------
 
     def _describe(self) -> None:
-        size = self._image_size
+        size = self._cameras.size
         if self.action_mode == "absolute":
             action = Unbounded((ABSOLUTE_DIM * self.task.arms,))
         else:
@@ -137,7 +139,7 @@ class RobosuiteEnv(SeededEnv):
         self._make_specs(self._state_size, action)
         observation = self.observation_spec
         observation[keys.EEF_VEL] = Unbounded((6 * self.task.arms,), device=self.device)
-        for key in self._cameras:
+        for key in self._cameras.names:
             observation[key] = Bounded(0, 255, (3, size, size), dtype=torch.uint8, device=self.device)
         if self._instruction:
             example = self.task.instructions[0]
@@ -149,6 +151,7 @@ class RobosuiteEnv(SeededEnv):
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
     ) -> TensorDictBase:
+        self._unseen = False
         if initial_state is None:
             return super()._reset(tensordict, **kwargs)
         self._start_from_state(initial_state)
@@ -199,6 +202,15 @@ class RobosuiteEnv(SeededEnv):
             self.sim_env.instruction = words
 
     # -- steps ---------------------------------------------------------------------------------------------------------
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._unseen = self._goes_unseen(tensordict)
+        return super()._step(tensordict)
+
+    def _goes_unseen(self, tensordict: TensorDictBase) -> bool:
+        """Tell whether no query will see the frames after this step."""
+        ahead = tensordict.get(keys.UNTIL_QUERY, None)
+        return None not in (ahead, self._seen_frames) and int(ahead) >= self._seen_frames
 
     def _advance(self, action: np.ndarray) -> float:
         command = self._pose(action) if self.action_mode == "absolute" else action
@@ -254,9 +266,8 @@ class RobosuiteEnv(SeededEnv):
     def _observe(self) -> TensorDict:
         out = super()._observe()
         out[keys.EEF_VEL] = torch.as_tensor(self._eef_velocity(), dtype=torch.float32)
-        for key, camera in self._cameras.items():
-            image = self.render(camera, self._image_size, self._image_size)
-            out[key] = torch.from_numpy(image).permute(2, 0, 1).contiguous()
+        for key, image in self._cameras.images(self.sim_env.sim, again=self._unseen).items():
+            out[key] = image
         if self._instruction:
             out[keys.INSTRUCTION] = self.instruction
         return out
@@ -275,23 +286,11 @@ class RobosuiteEnv(SeededEnv):
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
         """Return a u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
-        size, sim = (height, width), self.sim_env.sim
-        renderer = self._renderers.get(size)
-        if renderer is not None and not renderer.follow(sim):
-            self._renderers.pop(size).close()
-            renderer = None
-        if renderer is None:
-            renderer = self._renderers[size] = CameraRenderer(sim, height, width, fast=self._fast_render)
-        return renderer.image(camera)
+        return self._cameras.render(self.sim_env.sim, camera, height, width)
 
     # -- clean-up ------------------------------------------------------------------------------------------------------
 
-    def _close_renderers(self) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers = {}
-
     def close(self, *, raise_if_closed: bool = True) -> Any:
-        self._close_renderers()
+        self._cameras.close()
         self.sim_env.close()
         return super().close(raise_if_closed=raise_if_closed)
