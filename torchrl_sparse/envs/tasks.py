@@ -1,11 +1,11 @@
 """The tasks by name: `TASKS` is the one table, whose entries are each a `Task`.
 
-A new task is a file with its environment, and one line here or, from outside the package, ``TASKS[task.name] = task``.
-Simulators and experts are named as ``"module:attribute"`` and imported when one is made: optional extras cost nothing before.
+A new task is a file with its environment, and one entry here or, from outside, ``TASKS[task.name] = task``. Simulators and
+experts are named as ``"module:attribute"`` and imported when one is made: optional extras cost nothing before.
 
-Layouts of robosuite's tasks follow the low-dimensional ones of Diffusion Policy (arXiv:2303.04137): the task's object state
-first, then position, quaternion and finger positions of each arm. The quaternion is read from the grip *site*, the frame that
-absolute actions command; robosuite's ``robot0_eef_quat`` is another frame, about 90 degrees off.
+Layouts of robosuite's tasks follow Diffusion Policy's low-dimensional ones (arXiv:2303.04137): the objects' state, then each
+arm's position, quaternion and finger positions. The quaternion is that of the grip *site*, the frame that absolute actions
+command; robosuite's ``robot0_eef_quat`` is another frame, about 90 degrees off.
 """
 
 from __future__ import annotations
@@ -125,11 +125,7 @@ class RobosuiteTask(_Named):
         return slice(end - self.state_size([key]), end)
 
     def state_size(self, state_keys: Sequence[str]) -> int:
-        """Return how many numbers the observations have together.
-
-        Raises:
-            ValueError: for a name that no low-dimensional policy of the task observes, or one that comes twice.
-        """
+        """Return how many numbers the observations have together; ValueError for an unknown name, or one that comes twice."""
         arms = {f"robot{i}_{name}": size for i in range(self.arms) for name, size in _OBSERVED.items()}
         sizes = {"object": self.object_dim, **arms}
         if not state_keys or not set(state_keys) <= sizes.keys() or len({*state_keys}) < len(state_keys):
@@ -212,9 +208,9 @@ def _expert(place: str) -> str:
 
 _LIFT = _expert("lift:LiftExpert")
 _CUBES = tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue", "yellow", "purple"))
-# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes (35, 121.1, 140; all solved; two ways 49,
-# 98 solved), rounded up, from `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` on 2026-11-22, of
-# two ways on the 23rd, of 200 and 600 demonstrations (384, 118) on the 27th, before any table that uses it.
+# early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes, rounded up, before any table that uses it: by
+# `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` (35, 121.1, 140, all solved; Lift's two ways
+# 49, 98 solved; 2026-11-22 and 23), of the 200 demonstrations of transport (384) and Can's two ways (115), of 600 of blocks (118).
 _ROBOSUITE = (
     RobosuiteTask("Lift", "lift", 1, 10, 400, ("lift the red cube",), expert=_LIFT, early_cut=44),
     RobosuiteTask(
@@ -229,11 +225,8 @@ _ROBOSUITE = (
     ),
     *(
         RobosuiteTask(
-            *(name, alias, 1, 10, 400, ("lift the red cube around the ball",)),
-            module=f"{_ENVS}.lift_ways",
-            expert=_expert("lift:LiftWaysExpert"),
-            early_cut=cut,
-            way_of=f"{_ENVS}.lift_ways:way_of_{number}",
+            *(name, alias, 1, 10, 400, ("lift the red cube around the ball",), f"{_ENVS}.lift_ways"),
+            *(_expert("lift:LiftWaysExpert"), cut, f"{_ENVS}.lift_ways:way_of_{number}"),
         )
         for name, alias, number, cut in (
             ("LiftTwoWays", "lift_two_ways", "two", 62),
@@ -244,6 +237,10 @@ _ROBOSUITE = (
         *("PickPlaceCan", "can", 1, 14, 400, ("put the can into its bin",)),
         expert=_expert("pick_place_can:PickPlaceCanExpert"),
         early_cut=152,
+    ),
+    RobosuiteTask(
+        *("CanTwoWays", "can_two_ways", 1, 14, 400, ("put the can into its bin, around the pillar",)),
+        *(f"{_ENVS}.can_ways", _expert("pick_place_can:CanWaysExpert"), 144, f"{_ENVS}.can_ways:way_of"),
     ),
     RobosuiteTask(
         *("NutAssemblySquare", "square", 1, 14, 400, ("put the square nut on the square peg",)),

@@ -53,11 +53,11 @@ class LiftWaysExpert(LiftExpert):
         sim_env = self.sim_env
         if sim_env.passed > 0.02:
             return super().waypoints()
-        way = (2 * (self.style.bow > 0) + (self.style.offset > 0)) % sim_env.ways
+        way = (2 * (self.style.bow > 0) + (self.style.offset > 0)) % len(sim_env.obstacle.directions)
         _, rotation = self.body(sim_env.cube.root_body)
         hand = self.hand()
         side = np.arctan2(rotation[1, 0], rotation[0, 0])
-        direction = sim_env.directions[way]
-        clear = (hand.position - sim_env.ball) @ direction > 0.7 * _BERTH
-        beside = sim_env.ball + _BERTH * direction + (0.04 if clear else -0.05) * sim_env.along
+        direction = sim_env.obstacle.directions[way]
+        clear = (hand.position - sim_env.centre) @ direction > 0.7 * _BERTH
+        beside = sim_env.centre + _BERTH * direction + (0.04 if clear else -0.05) * sim_env.obstacle.along
         return [Waypoint(beside, downward(nearest(side, hand.yaw, np.pi / 2)), OPEN)]

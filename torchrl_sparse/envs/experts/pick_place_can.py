@@ -13,6 +13,7 @@ _WALLS = 0.92  # m, the can's height from which it may travel sideways
 _CARRY = 0.13  # m over the place of release
 _PLACE = np.array([-0.04, -0.04])  # m from the bin's centre, where the arm need not stretch
 _BESIDE = 0.07  # m from a wall across y, within which open fingers that move along y would meet it; no episode begins there
+_BERTH = 0.09  # m from the pillar's centre, at which it is passed
 _RELEASE = 0.12  # m over the bin's floor, the can's height when let go: half of it below the walls' top
 
 
@@ -61,8 +62,12 @@ class PickPlaceCanExpert(Expert):
         goal = self.above(hand, release, clearance=_CARRY)
         rising = np.clip((can[2] - _WALLS) / 0.04, 0.0, 1.0)
         travels = 1.0 if self._over_bin(can, margin=0.025) else rising
-        goal[:2] = hand.position[:2] + travels * (goal[:2] - hand.position[:2])
+        goal[:2] = hand.position[:2] + travels * (self._towards(hand, goal) - hand.position[:2])
         return Waypoint(goal, downward(0.0), CLOSED)
+
+    def _towards(self, hand: Hand, goal: np.ndarray) -> np.ndarray:
+        """Return f64 [2], m: where the hand that carries the can to ``goal`` goes over the walls."""
+        return goal[:2]
 
     def _over_bin(self, can: np.ndarray, margin: float) -> bool:
         """Tell whether the can's centre is over its quarter of the bin, ``margin`` m or more from the edge."""
@@ -72,3 +77,20 @@ class PickPlaceCanExpert(Expert):
     def _let_go(self, hand: Hand, held: bool) -> Waypoint:
         up = np.array([0.0, 0.0, 0.0 if held else 0.15])
         return Waypoint(hand.position + up, downward(0.0), OPEN)
+
+
+class CanWaysExpert(PickPlaceCanExpert):
+    """The same round a pillar: the can is carried to a point beside it first, on one of the ways, at random.
+
+    The sign of the operator's bow, a fair coin, chooses the way; nothing shows of it once the can is grasped.
+    """
+
+    def _towards(self, hand: Hand, goal: np.ndarray) -> np.ndarray:
+        sim_env = self.sim_env
+        if sim_env.passed > 0.02:
+            return super()._towards(hand, goal)
+        obstacle = sim_env.obstacle
+        direction = np.asarray(obstacle.directions[int(self.style.bow > 0)])
+        clear = (hand.position - sim_env.centre) @ direction > 0.7 * _BERTH
+        beside = sim_env.centre + _BERTH * direction + (0.05 if clear else -0.06) * np.asarray(obstacle.along)
+        return beside[:2]

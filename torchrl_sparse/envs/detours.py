@@ -1,0 +1,101 @@
+"""Something in the way that may be passed on several sides, which are equally good: a task with several ways, by construction.
+
+It is not simulated: whoever takes the grip site into it has failed the episode. So a policy that averages over the ways of its
+demonstrations, which pass on all sides, goes into it; one that knows a single way succeeds, but its rollouts have less entropy
+than the demonstrations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
+
+__all__ = ["Detour", "Obstacle"]
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """What is in the way, and how it is passed. Places are relative to its centre, f64 [3] in m.
+
+    Attributes:
+        radius: m.
+        along: unit vector of the straight way, past the obstacle.
+        directions: unit vectors from the obstacle to where each way passes it.
+        upright: whether it is a pillar, at any height, instead of a ball.
+    """
+
+    radius: float
+    along: Sequence[float]
+    directions: Sequence[Sequence[float]]
+    upright: bool = False
+
+    def holds(self, places: np.ndarray) -> np.ndarray:
+        """Tell, bool [...], which places [..., 3] are inside."""
+        return np.linalg.norm(places[..., : 2 if self.upright else 3], axis=-1) < self.radius
+
+    def passed(self, places: np.ndarray) -> np.ndarray:
+        """Return how far places [..., 3] are beyond the obstacle, m; negative before it."""
+        return places @ np.asarray(self.along)
+
+    def side(self, place: np.ndarray) -> int:
+        """Return the way whose side a place [3] is on."""
+        return int((np.asarray(self.directions) @ place).argmax())
+
+    def way_of(self, places: np.ndarray) -> int:
+        """Return the way of an episode of these places [T, 3]; `NO_WAY` short of the obstacle, `BETWEEN` if any is inside.
+
+        >>> ball = Obstacle(0.03, (1, 0, 0), [(0, 1, 0), (0, -1, 0)])
+        >>> ball.way_of(np.array([[-0.1, 0, 0], [0.01, -0.05, 0]])), ball.way_of(np.array([[-0.1, 0, 0]]))
+        (1, -1)
+        """
+        if self.holds(places).any():
+            return BETWEEN
+        beyond = self.passed(places) > 0
+        return self.side(places[beyond.argmax()]) if beyond.any() else NO_WAY
+
+
+class Detour:
+    """A robosuite environment with an obstacle, which a subclass puts before robosuite's own class and says where it is.
+
+    Attributes:
+        obstacle: what is in the way.
+        way: on which side of it the hand passed in this episode; `NO_WAY` before that, `BETWEEN` once it was inside.
+    """
+
+    obstacle: Obstacle
+    sim: Any
+    robots: Any
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Where the obstacle is, f64 [3], m."""
+        raise NotImplementedError
+
+    @property
+    def passed(self) -> float:
+        """How far the hand is beyond the obstacle, m; negative before it."""
+        return float(self.obstacle.passed(self._place()))
+
+    def _place(self) -> np.ndarray:
+        """Return the grip site relative to the obstacle, f64 [3], m."""
+        return self.sim.data.site_xpos[self.robots[0].eef_site_id["right"]] - self.centre
+
+    def _reset_internal(self) -> None:
+        super()._reset_internal()
+        self.way = NO_WAY
+
+    def _pre_action(self, action, policy_step: bool = False) -> None:
+        super()._pre_action(action, policy_step)
+        place = self._place()
+        if self.obstacle.holds(place):
+            self.way = BETWEEN
+        elif self.way == NO_WAY and self.obstacle.passed(place) > 0:
+            self.way = self.obstacle.side(place)
+
+    def _check_success(self) -> bool:
+        return bool(super()._check_success()) and self.way != BETWEEN
