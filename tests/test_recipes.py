@@ -88,8 +88,13 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     aggregate = f"aggregate=[{work}/offline/offline_errors_Lift.json]"
     assert "few, 4 |" in run("offline_errors", aggregate, f"out={work}/together")
     assert {path.suffix for path in (work / "together").iterdir()} == {".json", ".png"}
-    refused = run("offline_errors", *options, "results=[assets/can/results.json]", f"out={work}/no", expect=2)
-    assert "results: assets/can/results.json: expected a table of Lift, got one of PickPlaceCan" in refused
+    refused = run(
+        "offline_errors", *options, "results=[assets/can/weaker/results.json]", f"out={work}/no", expect=2
+    )
+    assert (
+        "results: assets/can/weaker/results.json: expected a table of Lift, got one of PickPlaceCan"
+        in refused
+    )
     assert not (work / "no").exists()
 
 

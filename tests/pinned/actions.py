@@ -30,7 +30,13 @@ _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_te
 # Not of the policy's planner; and what rounded weights answer depends on the instruction set.
 _EXECUTED_OR_ROUNDED = re.compile(r"_every\d|_of\d|:")
 # Results alone: of other training seeds, of a policy that knows four ways, of one of less training, of what another began from.
-_WITHOUT_WEIGHTS = {"seeds", "four", "shorter", "weaker"}
+_WITHOUT_WEIGHTS = (
+    "lift/seeds",
+    "lift_two_ways/seeds",
+    "lift_two_ways/four",
+    "pusht/shorter",
+    "square/weaker",
+)
 _INSTRUCTION, _KEPT = "lift the green cube", 50.0
 
 
@@ -85,7 +91,7 @@ def policy_of(folder: Path) -> Path:
 
 def is_kept(folder: Path) -> bool:
     """Whether results or episodes in ``folder`` are of a policy whose weights are here."""
-    return _WITHOUT_WEIGHTS.isdisjoint(folder.relative_to(ASSETS).parts)
+    return not any(folder.is_relative_to(ASSETS / results) for results in _WITHOUT_WEIGHTS)
 
 
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:

@@ -210,7 +210,7 @@ _LIFT = _expert("lift:LiftExpert")
 _CUBES = tuple(f"lift the {colour} cube" for colour in ("red", "green", "blue", "yellow", "purple"))
 # early_cut: 1.25 times the 90th percentile of the steps of 100 scripted episodes, rounded up, before any table that uses it: by
 # `recipes/collect_demos.py task=TASK episodes=100 seed=10000 keep_failures=true` (35, 121.1, 140, all solved; Lift's two ways
-# 49, 98 solved; 2026-11-22 and 23), of the 200 demonstrations of transport (384) and Can's two ways (115), of 600 of blocks (118).
+# 49, 98 solved; 2026-11-22 and 23), of the 200 demonstrations of transport (384) and Can's two ways (115), 600 of blocks (118).
 _ROBOSUITE = (
     RobosuiteTask("Lift", "lift", 1, 10, 400, ("lift the red cube",), expert=_LIFT, early_cut=44),
     RobosuiteTask(

@@ -13,7 +13,7 @@ from torchrl_sparse.evaluation.figures import fronts
 from torchrl_sparse.evaluation.results.schema import load_results
 
 LIFT, CAN, SQUARE = (
-    Path("assets", task, "test_split/results.json") for task in ("lift", "can", "square/weaker")
+    Path("assets", task, "test_split/results.json") for task in ("lift", "can/weaker", "square/weaker")
 )
 
 
