@@ -49,7 +49,7 @@ def test_dense_comes_first_and_once():
 
 
 def test_a_rate_that_moves_settles_at_the_mean_of_its_episodes_within_its_bounds():
-    policy = DiffusionPolicy.from_pretrained("assets/can")
+    policy = DiffusionPolicy.from_pretrained("assets/can/weaker")
     for mean, settled in ((0.6, 0.6), (0.9, 0.8), (0.1, 0.5)):
         moved = policy.with_plan(SAGPruner.from_pretrained("assets/can/weaker/sag_rates"))
         settle_rates({"sag_rates@0.8-0.5": moved}, {"sag_rates@0.8-0.5": [_episode(0, mean)]})

@@ -65,7 +65,7 @@ def test_outcomes_are_those_of_the_table():
 
 def test_tables_are_put_together_by_their_ranks(results, tmp_path):
     """Of two tables alike the mean is that of each; chance orders the methods of both so in 2 of 4! ** 2 cases."""
-    other = replace(results, task="Can", played={"assets/can/weaker/results.json": results.played["a.json"]})
+    other = replace(results, task="Can", played={"assets/can/results.json": results.played["a.json"]})
     agreement = agreement_of([results, other])
     error = agreement.success["error"]
     assert error.tables == pytest.approx({"a": 1.0, "can": 1.0})
