@@ -116,6 +116,11 @@ def test_frames_that_no_query_sees_are_not_rendered_and_change_nothing(env):
     assert same.tolist() == [False, False, True, True] * 2 + [False, False, True]
 
 
+def test_no_frames_seen_at_all_is_refused():
+    with pytest.raises(ValueError, match="seen_frames: expected None or at least 1, got 0"):
+        RobosuiteEnv("Lift", camera="agentview", seen_frames=0)
+
+
 def test_without_an_executor_every_frame_is_rendered():
     shown = RobosuiteEnv("Lift", camera="agentview", image_size=48, seeds=[0], seen_frames=1)
     with (

@@ -15,13 +15,12 @@ import_robosuite()  # quietly, before anything else imports it
 from robosuite.environments.manipulation.pick_place import PickPlaceCan  # noqa: E402
 
 _PILLAR = np.array([0.12, 0.015, 0.8])  # m: over the walls, where the straight way from the mean start leads
-_AWAY = (1.0, 0.0, 0.0)  # from the robot
 
 
 class CanTwoWays(Detour, PickPlaceCan):
     """The pillar is passed between it and the robot (0) or behind it (1)."""
 
-    obstacle = Obstacle(0.03, (0.0, 1.0, 0.0), [tuple(-x for x in _AWAY), _AWAY], upright=True)
+    obstacle = Obstacle(0.03, (0.0, 1.0, 0.0), [(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)], upright=True)
     centre = _PILLAR
 
 

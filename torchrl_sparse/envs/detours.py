@@ -64,17 +64,14 @@ class Detour:
 
     Attributes:
         obstacle: what is in the way.
+        centre: where it is, f64 [3], m.
         way: on which side of it the hand passed in this episode; `NO_WAY` before that, `BETWEEN` once it was inside.
     """
 
     obstacle: Obstacle
+    centre: np.ndarray
     sim: Any
     robots: Any
-
-    @property
-    def centre(self) -> np.ndarray:
-        """Where the obstacle is, f64 [3], m."""
-        raise NotImplementedError
 
     @property
     def passed(self) -> float:

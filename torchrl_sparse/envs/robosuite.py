@@ -70,8 +70,8 @@ class RobosuiteEnv(SeededEnv):
         reward_shaping: robosuite's dense reward instead of 1 on success.
 
     Raises:
-        ValueError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, or an action of a
-            wrong size or that is not finite.
+        ValueError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, ``seen_frames`` below 1,
+            or an action of a wrong size or that is not finite.
 
     Examples:
         >>> env = RobosuiteEnv("Lift", seeds=[7])
@@ -112,6 +112,8 @@ class RobosuiteEnv(SeededEnv):
             raise ValueError(
                 f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
             )
+        if seen_frames is not None and seen_frames < 1:
+            raise ValueError(f"seen_frames: expected None or at least 1, got {seen_frames}")
         self._cameras = Cameras(named, 84 if image_size is None else image_size, fast=fast_render)
         self._seen_frames, self._unseen = seen_frames, False
         own_keys = self.task.state_keys if object_state else self.task.proprioception_keys
@@ -209,8 +211,9 @@ class RobosuiteEnv(SeededEnv):
 
     def _goes_unseen(self, tensordict: TensorDictBase) -> bool:
         """Tell whether no query will see the frames after this step."""
-        ahead = tensordict.get(keys.UNTIL_QUERY, None)
-        return None not in (ahead, self._seen_frames) and int(ahead) >= self._seen_frames
+        if self._seen_frames is None or (ahead := tensordict.get(keys.UNTIL_QUERY, None)) is None:
+            return False
+        return int(ahead) >= self._seen_frames
 
     def _advance(self, action: np.ndarray) -> float:
         command = self._pose(action) if self.action_mode == "absolute" else action
