@@ -22,7 +22,7 @@ from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.looking import plot_looking, plot_reuse_sources
 from torchrl_sparse.evaluation.statistics.looking import looking
@@ -42,7 +42,7 @@ def main(config: DictConfig) -> None:
         raise ValueError(f"oracle.attempts: expected 0 without a pruner, got {config.oracle.attempts}")
     policy, task = make_policy(config), find_task(config.task).name
     n_action_steps = published_shape(task).n_action_steps
-    seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
+    seeds = tuning_seeds(DEVELOPMENT_SEED, config.episodes)
     played = policy if config.played == "pruned" else policy.with_plan(None)
     actor = ChunkExecutor(played, n_action_steps)
     queries = record_queries(actor, diffusion_env(task, policy), seeds)

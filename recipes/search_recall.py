@@ -22,7 +22,7 @@ from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED
+from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.statistics.looking import episode_rows, planned_queries
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -58,7 +58,7 @@ def make_judges(policy: DiffusionPolicy, schedule: CacheSchedule, config: DictCo
     """Return one to search with and, of the same queries on other noise, one that the search does not see."""
     task = find_task(config.task).name
     n_action_steps = executed_steps(task, policy.source)
-    seeds = range(DEVELOPMENT_SEED, DEVELOPMENT_SEED + config.episodes)
+    seeds = tuning_seeds(DEVELOPMENT_SEED, config.episodes)
     make_env = diffusion_env(task, policy, config.horizon)
     queries = record_queries(ChunkExecutor(policy, n_action_steps), make_env, seeds)
     encoded = planned_queries(policy, queries)

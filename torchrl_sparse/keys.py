@@ -62,7 +62,7 @@ constant                          shape, dtype           meaning
                                                          policy that is asked reads what is expected of its own
 ``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
 ``HOLD``                          f32 [*B, A]            the action that keeps the arm where it is
-``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's denoising loop, or of a VLA's whole network;
+``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's planner and loop, or of a VLA's whole network;
                                                          0 on served steps
 ``LATENCY``                       f32 [*B, 1]            seconds of this query, 0 on served steps
 ================================  =====================  ===========================================================

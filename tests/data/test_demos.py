@@ -269,7 +269,7 @@ def test_an_expert_that_keeps_failing_stops_the_collection(monkeypatch, tmp_path
         collect(tmp_path / "a.h5", Collection("Lift", episodes=2))
 
 
-@pytest.mark.parametrize(("field", "value"), [("episodes", 0), ("seed", -1)])
+@pytest.mark.parametrize(("field", "value"), [("episodes", 0), ("seed", -1), ("seed", 210_000)])
 def test_out_of_range_options_are_named(tmp_path, field, value):
     with pytest.raises(ValueError, match=field):
         collect(tmp_path / "a.h5", Collection(**{"task": "Lift", "episodes": 1, field: value}))

@@ -78,6 +78,7 @@ class Planner(TensorDictModuleBase):
         is_static: True where the mask does not depend on the observation.
         made_for: the only spec that it can be bound to; None serves every policy.
         rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
+        flops: of deciding one mask, 2 * MAC; part of what the query costs.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -100,6 +101,7 @@ class Planner(TensorDictModuleBase):
     is_static = False
     made_for: PlanSpec | None = None
     rate: float | None = None
+    flops: int = 0
 
     def __init__(self) -> None:
         super().__init__()

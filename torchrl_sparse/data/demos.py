@@ -26,6 +26,7 @@ from torchrl_sparse.data.hdf5_writer import episode_outcome, merge_episodes, spl
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
+from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.runtime.backends import check_backend
 from torchrl_sparse.runtime.failure import RunFailed
@@ -45,7 +46,7 @@ class Collection:
         driving: the policy that drives first, of an episode that the expert finishes; None for the expert alone.
 
     Raises:
-        ValueError: if a value is out of its range, or the task has no expert or not of that quality.
+        ValueError: if a value is out of its range, a seed is one of tests, or the task has no expert or not of that quality.
     """
 
     task: str
@@ -60,6 +61,7 @@ class Collection:
             raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
         if self.seed < 0:
             raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+        tuning_seeds(self.seed, self.episodes)  # what is trained on them is not tested on them
         task = find_task(self.task)
         task.load_expert()
         if self.quality not in (known := task.demonstrator.qualities):

@@ -12,9 +12,10 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer, record_queries
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods, measure_methods, settle_rates
 from torchrl_sparse.evaluation.benchmarks.film import captions
-from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
+from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense, flops_executed
 from torchrl_sparse.evaluation.benchmarks.vla import matches_last
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.policies.diffusion.warm_start import WarmStart
 
 LIFT = Path("assets/lift")
 
@@ -69,6 +70,25 @@ def test_all_methods_are_measured_on_the_same_queries(policy, queries):
     assert runs["ddim2"].latency.n == 2
     assert runs["ddim2"].planning is None
     assert runs["ddim2"].episodes == episodes["ddim2"]
+
+
+def test_other_noise_is_no_other_computation_and_has_denses_time(policy, queries):
+    methods = {"dense": policy, "dense_noise": policy.with_noise(1)}
+    episodes = {name: [_episode(7), _episode(8)] for name in methods}
+    runs = measure_methods(methods, episodes, queries, repeats=2, threads=1)
+    assert runs["dense_noise"].latency is runs["dense"].latency
+    assert runs["dense_noise"].action_error[0] > 0.01
+    assert runs["dense_noise"].executed_flops == runs["dense"].executed_flops
+
+
+def test_executed_flops_are_those_of_the_steps_that_queries_took(policy, queries):
+    warm = policy.with_plan(None, start=WarmStart(2))
+    shorter = policy.with_plan(None, policy.sampler.last_steps(2))
+    alone = flops_executed(shorter, answer(shorter, queries[:1]))
+    assert flops_executed(policy, queries) == flops_executed(policy, queries[:1])
+    first, second = answer(warm, queries[:2]).split(1)
+    assert flops_executed(warm, first) == flops_executed(policy, queries)
+    assert flops_executed(warm, second) == pytest.approx(alone)
 
 
 def test_errors_are_of_normalised_actions(policy, queries):

@@ -11,6 +11,7 @@ from torchrl_sparse.evaluation.results.choices import (
     headline,
     headline_rows,
 )
+from torchrl_sparse.evaluation.results.parts import PValues
 
 
 def change(results, **changes):
@@ -37,10 +38,21 @@ def results():
 
 
 def test_the_fastest_that_is_non_inferior_in_both_is_named(results):
-    assert headline(results, goal=9) == ("ddim10", "as fast as asked for, 9×")
+    name, remark = headline(results, goal=9)
+    assert name == "ddim10" and remark.startswith("as fast as asked for, 9×")
     slow = change(results, ddim10=judged(results.methods["ddim10"], "non-inferior", "undecided"))
     assert headline(slow, goal=9) == ("bac", "ddim10, 10.0×, is undecided in time")
     assert headline(slow, goal=20) == ("bac", "no method is 20× as fast")
+
+
+def test_it_says_which_verdict_does_not_survive_a_correction_for_all(results):
+    for success, time, said in (
+        (1e-6, 1e-6, ""),
+        (1e-6, 0.02, "; in time not after Holm's correction for 4 comparisons"),
+        (0.02, 0.02, "; in success and time not after Holm's correction for 4 comparisons"),
+    ):
+        tested = change(results, ddim10={"p_values": PValues(success, time)})
+        assert headline(tested, goal=9) == ("ddim10", f"as fast as asked for, 9×{said}")
 
 
 def test_without_one_it_says_what_the_nearest_lacks(results):

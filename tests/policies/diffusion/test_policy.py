@@ -4,9 +4,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_sparse import BAC, CacheSchedule, Dense, DiffusionPolicy, Sampler, SchedulePlanner, Uniform, keys
+from torchrl_sparse import (
+    BAC,
+    CacheSchedule,
+    Dense,
+    DiffusionPolicy,
+    SAGPruner,
+    Sampler,
+    SchedulePlanner,
+    Uniform,
+    keys,
+)
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
+from torchrl_sparse.blocks.mask import query_flops
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.networks.diffusion.noise import query_seed, sample_noise
 
@@ -87,6 +98,17 @@ def test_flops_follow_the_mask_and_latency_is_measured(policy):
     sparse = policy(request(1))
     assert 0 < sparse[keys.FLOPS].item() < dense[keys.FLOPS].item()
     assert sparse[keys.LATENCY].item() > 0
+
+
+def test_flops_are_those_of_the_loop_and_of_a_planner_that_looks():
+    policy = DiffusionPolicy.from_pretrained("assets/lift")
+    policy.plan = SAGPruner.from_pretrained("assets/lift/sag")
+    td = policy(TensorDict({keys.HISTORY_STATE: torch.zeros(2, 2, 19)}, [2]))
+    of_loop = query_flops(policy.network, td[keys.PRUNE_MASK])
+    assert td[keys.FLOPS].squeeze(-1).tolist() == (of_loop + 2 * policy.plan.network.macs_per_query).tolist()
+    policy.plan = None
+    td = policy(TensorDict({keys.HISTORY_STATE: torch.zeros(2, 2, 19)}, [2]))
+    assert td[keys.FLOPS].squeeze(-1).tolist() == query_flops(policy.network, td[keys.PRUNE_MASK]).tolist()
 
 
 def test_changing_the_sampler_rebinds_the_plan(policy):

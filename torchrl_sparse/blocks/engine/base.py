@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -12,7 +12,21 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Engine", "RecallingEngine", "check_input", "check_query"]
+__all__ = ["Engine", "Overhead", "RecallingEngine", "check_input", "check_query"]
+
+
+class Overhead(NamedTuple):
+    """Multiply-accumulates outside the blocks, batch 1.
+
+    Attributes:
+        step: of every denoising step.
+        memory: of every step that computes cross-attention.
+        query: once.
+    """
+
+    step: int
+    memory: int
+    query: int
 
 
 class Engine(Protocol):
@@ -63,6 +77,10 @@ class Engine(Protocol):
 
     def block_macs(self) -> tuple[int, int, int]:
         """Return the multiply-accumulates that one SA, one CA and one FFN block take here, batch 1."""
+        ...
+
+    def overhead_macs(self) -> Overhead:
+        """Return those outside the blocks."""
         ...
 
 

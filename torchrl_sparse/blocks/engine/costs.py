@@ -1,14 +1,23 @@
-"""The cost of one block in an engine, in seconds and in FLOPs: for planners that budget in time."""
+"""What an engine really does: seconds and FLOPs of a block, for planners that budget in them, and FLOPs of a query."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_sparse.blocks.engine.base import Engine
+import torch
+from torch import Tensor
+
+from torchrl_sparse.blocks.engine.base import Engine, Overhead
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, block_macs
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["BlockCost", "engine_block_costs", "folded_block_macs"]
+__all__ = [
+    "BlockCost",
+    "engine_block_costs",
+    "executed_flops",
+    "folded_block_macs",
+    "folded_overhead_macs",
+]
 
 
 @dataclass(frozen=True)
@@ -43,3 +52,55 @@ def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
     self_attention, _, feed_forward = block_macs(sizes)
     cross_attention = 2 * sizes.horizon * (1 + sizes.n_obs_steps) * network.n_head * sizes.width
     return self_attention, cross_attention, feed_forward
+
+
+def folded_overhead_macs(network: TransformerForDiffusion, *, merged_stem: bool) -> Overhead:
+    """Count what an engine that folds memory multiplies outside the blocks.
+
+    A step embeds the sample and predicts its noise. What the condition is encoded and folded for is done once in a query,
+    but in every step by a condition encoder whose tokens attend to each other.
+
+    Args:
+        network: the denoiser.
+        merged_stem: whether the embedding of observations is merged with the first layer of their encoder.
+
+    >>> sizes = dict(input_dim=10, output_dim=10, horizon=10, n_obs_steps=2, cond_dim=19)
+    >>> folded_overhead_macs(TransformerForDiffusion(**sizes, n_layer=1), merged_stem=False)
+    Overhead(step=51200, memory=0, query=1583104)
+    """
+    sizes = NetworkSizes.of(network)
+    d, tokens = sizes.width, sizes.n_obs_steps
+    stem_and_head = (sizes.input_dim + sizes.output_dim) * d * sizes.horizon
+    # Keys and values of a token, both multiplied into the other projections, and the bias of its scores.
+    fold, embed = sizes.num_layers * (4 * d * d + d), sizes.cond_dim * d
+    if not sizes.num_cond_layers:
+        encode = 4 * embed + 4 * d * d if merged_stem else embed + 8 * d * d
+        return Overhead(stem_and_head, 0, tokens * (encode + fold))
+    memory = 1 + tokens
+    encode = sizes.num_cond_layers * (12 * d * d * memory + 2 * memory * memory * d)
+    return Overhead(stem_and_head + encode, memory * fold, tokens * embed)
+
+
+def executed_flops(engine: Engine, mask: Tensor, num_steps: Tensor | None = None) -> Tensor:
+    """Count the FLOPs (2 * MAC) that ``engine`` really does in queries; norms, softmax, activations and sums are not counted.
+
+    :func:`~torchrl_sparse.blocks.mask.query_flops` has the published count, in which cross-attention multiplies its full
+    matrices and every step encodes the condition anew.
+
+    Args:
+        engine: that runs them.
+        mask: bool [*B, K, 3L], True = pruned.
+        num_steps: i64 [*B, 1], of queries that take only the last so many steps and compute all of the first of those.
+
+    Returns:
+        f64 [*B].
+    """
+    last, blocks = mask.shape[-2], mask.shape[-1]
+    taken = torch.full((*mask.shape[:-2], 1), last) if num_steps is None else num_steps
+    before = torch.arange(last) - (last - taken)  # steps from the first that is taken, [*B, K]
+    computed = (~mask | (before == 0)[..., None]) & (before >= 0)[..., None]
+    macs = torch.tensor(engine.block_macs(), dtype=torch.float64).repeat(blocks // len(BLOCK_TYPES))
+    of_blocks = (computed.double() @ macs).sum(dim=-1)
+    reading = computed[..., BLOCK_TYPES.index("CA") :: len(BLOCK_TYPES)].any(dim=-1).sum(dim=-1)
+    outside = engine.overhead_macs()
+    return 2 * (of_blocks + taken.squeeze(-1) * outside.step + reading * outside.memory + outside.query)

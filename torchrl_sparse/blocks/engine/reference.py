@@ -10,11 +10,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.base import check_query
+from torchrl_sparse.blocks.engine.base import Overhead, check_query
 from torchrl_sparse.blocks.engine.recall import Memory, check_memory
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, num_buffers
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, fixed_macs, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -261,3 +261,7 @@ class ReferenceEngine:
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`; the published count."""
         return block_macs(NetworkSizes.of(self._network))
+
+    def overhead_macs(self) -> Overhead:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.overhead_macs`; the published count."""
+        return Overhead(fixed_macs(NetworkSizes.of(self._network)), memory=0, query=0)

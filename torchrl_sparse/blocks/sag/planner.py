@@ -160,6 +160,11 @@ class SAGPruner(Planner):
         self._rate = value
 
     @property
+    def flops(self) -> int:
+        """Of what depends on the observation; the rest is computed once and kept."""
+        return 2 * self.network.macs_per_query
+
+    @property
     def fingerprint(self) -> str:
         """A name of the weights and the rate."""
         return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})

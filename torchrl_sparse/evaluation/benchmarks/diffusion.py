@@ -11,7 +11,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.saved import saved_planners
 from torchrl_sparse.control.queries import answer
-from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense
+from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense, flops_executed
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.masks import plot_mask_statistics, plot_mask_strip
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
@@ -32,6 +32,7 @@ from torchrl_sparse.runtime.progress import progress
 __all__ = ["default_methods", "draw_methods", "make_methods", "measure_methods", "settle_rates"]
 
 _ALWAYS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
+_SAME_COMPUTATION = {"dense_noise": "dense"}  # of other numbers: it takes as long, and is not timed again
 _SURGING = ("uniform", "bac_blockwise", "bac")  # whose errors BAC's third figure compares
 
 
@@ -88,19 +89,22 @@ def measure_methods(
         repeats: queries that are timed under each method.
         threads: of PyTorch while timing.
     """
+    samples = {name: MethodName.parse(name).samples for name in methods}
+    timed = {name: method for name, method in methods.items() if name not in _SAME_COMPUTATION}
     with progress("latency", "round", repeats) as show:
-        samples = {name: MethodName.parse(name).samples for name in methods}
         latency = time_queries(
-            methods, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
+            timed, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
         )
     planning = time_planning(_adaptive(methods), queries, threads=threads)
+    answers = {name: answer(method, queries) for name, method in methods.items()}
     return {
         name: MethodRun(
             episodes[name],
-            latency[name],
-            error_to_dense(method, answer(method, queries), queries),
+            latency[_SAME_COMPUTATION.get(name, name)],
+            error_to_dense(method, answers[name], queries),
             planning.get(name),
             MethodName.parse(name).every,
+            samples[name] * flops_executed(method, answers[name]),
         )
         for name, method in methods.items()
     }

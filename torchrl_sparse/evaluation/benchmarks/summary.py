@@ -1,16 +1,17 @@
-"""The same for every benchmark: which policy it was of, and how far a method is from dense."""
+"""What benchmarks say of a policy and of its answers: their distance to dense's, and what they took."""
 
 from __future__ import annotations
 
 from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.costs import executed_flops
 from torchrl_sparse.evaluation.results.parts import PolicyShape
 from torchrl_sparse.evaluation.statistics.fidelity import action_error
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
-__all__ = ["describe_policy", "error_to_dense"]
+__all__ = ["describe_policy", "error_to_dense", "flops_executed"]
 
 
 def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) -> PolicyShape:
@@ -49,3 +50,19 @@ def error_to_dense(
     """
     normalize = policy.normalizer.normalize_action
     return action_error(normalize(answers[keys.CHUNK]), normalize(dense_answers[keys.CHUNK]))
+
+
+def flops_executed(policy: DiffusionPolicy, answers: TensorDictBase) -> float:
+    """Return the FLOPs that the planner and the chosen engine really did in a query, mean over ``answers`` [Q].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> policy = DiffusionPolicy.from_pretrained("assets/lift", engine="torch")
+        >>> answers = policy(TensorDict({"history": {"state": torch.zeros(1, 2, 19)}}, [1]))
+        >>> round(answers["cost", "flops"].item() / 1e9, 2), round(flops_executed(policy, answers) / 1e9, 2)
+        (15.74, 12.78)
+    """
+    engine = policy.module["denoise"].current_engine()
+    done = executed_flops(engine, answers[keys.PRUNE_MASK], answers.get(keys.NUM_STEPS, None))
+    return policy.plan.flops + done.mean().item()

@@ -52,6 +52,7 @@ class MethodRun:
             observations and the same noise; (0, 0) for the dense policy.
         planning: of the planner alone, within a query; where it looks at the observation.
         every: environment steps from one query to the next, of a method that says so itself.
+        executed_flops: of a query, that the engine really does; None where that is not counted.
     """
 
     episodes: Sequence[EpisodeResult]
@@ -59,6 +60,7 @@ class MethodRun:
     action_error: tuple[float, float]
     planning: Latency | None = None
     every: int | None = None
+    executed_flops: float | None = None
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,11 @@ def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven:
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),
         prune_rate=cost.prune_rate,
-        flops=Flops(cost.flops_per_query, cost.flops_per_query / totals(dense.episodes).flops_per_query),
+        flops=Flops(
+            cost.flops_per_query,
+            cost.flops_per_query / totals(dense.episodes).flops_per_query,
+            run.executed_flops,
+        ),
         latency_s=Percentiles.of(run.latency),
         speedup_vs_dense=dense.latency.p50 / run.latency.p50,
         speedup_ci95=_speedup_interval(run.latency, dense.latency),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from torchrl_sparse.evaluation.results.comparisons import num_comparisons, survivors
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.text import (
     count_text,
@@ -71,7 +72,7 @@ def headline(results: Results, goal: float = GOAL) -> tuple[str | None, str]:
         default=None,
     )
     if best is not None and speed[best] >= goal:
-        return best, f"as fast as asked for, {goal:g}×"
+        return best, f"as fast as asked for, {goal:g}×{_after_correction(results, best)}"
     nearest = min(
         (name for name in rivals if speed[name] >= goal), key=lambda name: ratios[name], default=None
     )
@@ -96,6 +97,15 @@ def _time_ratios(results: Results) -> dict[str, float]:
     """Return the ratios of the methods whose times are known."""
     ratios = {name: method.time_vs_dense for name, method in results.methods.items()}
     return {name: of_one.ratio for name, of_one in ratios.items() if of_one is not None}
+
+
+def _after_correction(results: Results, name: str) -> str:
+    """Say which verdicts of a method do not survive Holm's correction."""
+    lasting = survivors(results)
+    lost = [what for what in ("success", "time") if f"{name} {what}" not in lasting]
+    if not lost:
+        return ""
+    return f"; in {' and '.join(lost)} not after Holm's correction for {num_comparisons(results)} comparisons"
 
 
 def _lacks(method: MethodEntry) -> Iterator[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
 from torchrl_sparse.evaluation.results.carried_noise import carried_noise_rows, load_carried_noise
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
+from torchrl_sparse.evaluation.results.comparisons import num_comparisons
 from torchrl_sparse.evaluation.results.completed import completed_rows, told_completed
 from torchrl_sparse.evaluation.results.engine_report import (
     COLUMNS,
@@ -48,11 +49,13 @@ class Table:
         task: that it is about.
         columns: that it shows unless others are asked for; the first names a row.
         rows: column -> text; of these and of further columns.
+        comparisons: verdicts among all its rows that † was decided for; 0 where a table marks none.
     """
 
     task: str
     columns: tuple[str, ...]
     rows: Sequence[Row]
+    comparisons: int = 0
 
     def name(self, row: Row) -> str:
         """Return what a row is about: a method, a variant, a part."""
@@ -96,7 +99,8 @@ def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
-    methods = _table(results.subject, whole, len(rows[0]))
+    marked = num_comparisons(results) if isinstance(results, Results) else 0
+    methods = replace(_table(results.subject, whole, len(rows[0])), comparisons=marked)
     pairs = results.pairs if isinstance(results, Results) else None
     compared = {"pairs": _table(results.subject, comparison_rows(pairs))} if pairs else {}
     if not isinstance(results, Results) or results.dense.restricted_mean_time is None:

@@ -143,17 +143,23 @@ def _find_end(lines: Sequence[str], start: int, where: str) -> int:
 
 def _make_table(text: str, root: Path, where: str) -> str:
     try:
-        return markdown_table(_rows(_Directive.parse(text), root))
+        directive = _Directive.parse(text)
+        tables = _read(directive, root)
+        rows = _rows(directive, tables, root)
+        return "\n\n".join(filter(None, (markdown_table(rows), _family(tables, rows))))
     except (FileNotFoundError, ValueError) as error:
         raise type(error)(f"{where}: {error}") from error
 
 
-def _rows(directive: _Directive, root: Path) -> list[Row]:
-    options = directive.options
+def _read(directive: _Directive, root: Path) -> list[Table]:
     pairs = [_pair(pair) for pair in directive.parts("pairs")]
-    tables = [read_table(root / file, options.get("rows"), pairs) for file in directive.files]
-    if policies := directive.parts("policies"):
-        tables = _told_apart(tables, policies)
+    tables = [read_table(root / file, directive.options.get("rows"), pairs) for file in directive.files]
+    policies = directive.parts("policies")
+    return _told_apart(tables, policies) if policies else tables
+
+
+def _rows(directive: _Directive, tables: Sequence[Table], root: Path) -> list[Row]:
+    options = directive.options
     tasks = list(dict.fromkeys(table.task for table in tables))
     titles = dict(zip(tasks, directive.parts("tasks"), strict=False))
     methods = directive.parts("methods")
@@ -171,6 +177,18 @@ def _rows(directive: _Directive, root: Path) -> list[Row]:
         raise ValueError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
     several = ["task"] if len(tasks) > 1 else []
     return select_columns(rows, directive.parts("columns") or [*several, *tables[0].columns])
+
+
+def _family(tables: Sequence[Table], rows: Sequence[Row]) -> str:
+    """Say how many verdicts are given together, below a table that shows any."""
+    if "against" in rows[0]:
+        return f"{sum(len(table.rows) for table in tables)} pairs, not corrected for their number."
+    numbers = [str(table.comparisons) for table in tables if table.comparisons]
+    if not numbers or not {"verdict", "time verdict"} & set(rows[0]):
+        return ""
+    count = numbers[0] if len(numbers) == 1 else f"{', '.join(numbers[:-1])} and {numbers[-1]}"
+    of_each = "" if len(numbers) == 1 else ", file by file"
+    return f"Of {count} comparisons with dense{of_each}; † does not survive Holm's correction for them."
 
 
 def _told_apart(tables: Sequence[Table], policies: Sequence[str]) -> list[Table]:

@@ -184,10 +184,17 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class Flops:
-    """FLOPs of a query, and over those of a dense one."""
+    """FLOPs of a query, by the published count.
+
+    Attributes:
+        per_query: see `torchrl_sparse.blocks.mask`; with the planner's.
+        ratio_to_dense: those over dense's.
+        executed: that the engine really does, mean over the timed queries; None in older files and of VLAs.
+    """
 
     per_query: float
     ratio_to_dense: float
+    executed: float | None = None
 
     def __post_init__(self) -> None:
         require(self.per_query >= 0, "per_query", "at least 0", self.per_query)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
+from torchrl_sparse.evaluation.results.comparisons import num_comparisons, survivors
 from torchrl_sparse.evaluation.results.parts import (
     Difference,
     EpisodeCost,
@@ -37,7 +38,6 @@ from torchrl_sparse.evaluation.statistics.intervals import (
     episodes_needed,
     paired_difference,
 )
-from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
 __all__ = [
     "comparison_rows",
@@ -59,48 +59,27 @@ def format_table(results: AnyResults) -> str:
 
 def results_rows(results: AnyResults) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text."""
-    survivors = _survivors(results)
-    return [_table_row(name, method, survivors) for name, method in results.methods.items()]
+    lasting = survivors(results)
+    return [_table_row(name, method, lasting) for name, method in results.methods.items()]
 
 
-def _survivors(results: AnyResults) -> set[str] | None:
-    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
-    if not isinstance(results, Results):
-        return None
-    if results.by_degrees:
-        scores = {name: method.score.p_value for name, method in results.methods.items()}
-        p_values = {f"{name} success": p for name, p in scores.items() if p is not None}
-        return holm(p_values, _comparisons(results))
-    tested = {name: method.p_values for name, method in results.methods.items() if method.p_values}
-    p_values = {f"{name} success": p.success for name, p in tested.items()}
-    p_values |= {f"{name} time": p.time for name, p in tested.items()}
-    return holm(p_values, _comparisons(results))
-
-
-def _comparisons(results: Results) -> int:
-    """Return the verdicts of the table: on success and on time, or on the score alone, of every method but dense."""
-    return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
-
-
-def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> dict[str, str]:
+def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dict[str, str]:
     error, baseline, score = method.action_error_vs_dense, name == DENSE, method.score
-    survives = survivors is None or f"{name} success" in survivors
+    survives = lasting is None or f"{name} success" in lasting
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
+    executed = method.flops.executed
     return {
         "method": name,
         "success": count_text(method.success),
         **({"score": mean_text(score.mean, score.ci95)} if score else {}),
         "vs dense, points": "" if baseline else difference_text(method.judged),
         "verdict": "baseline" if baseline else verdict_text(method.judged, survives),
-        **(
-            _time_cells(name, method, survivors or ())
-            if isinstance(method, MethodEntry) and not score
-            else {}
-        ),
+        **(_time_cells(name, method, lasting or ()) if isinstance(method, MethodEntry) and not score else {}),
         "pruned": f"{100 * method.prune_rate:.1f} %",
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
         "FLOPs ratio": f"{method.flops.ratio_to_dense:.3f}",
+        **({} if executed is None else {"executed, GFLOPs": f"{executed / 1e9:.2f}"}),
         **(_episode_cells(getattr(method, "per_episode", None))),
         "p50, ms": milliseconds_text(method.latency_s.p50),
         "p95, ms": milliseconds_text(method.latency_s.p95),
@@ -110,7 +89,7 @@ def _table_row(name: str, method: MethodEntry1, survivors: set[str] | None) -> d
     }
 
 
-def _time_cells(name: str, method: MethodEntry, survivors: Collection[str]) -> dict[str, str]:
+def _time_cells(name: str, method: MethodEntry, lasting: Collection[str]) -> dict[str, str]:
     """Return the columns that version 2 adds, empty where a method's episodes are not kept."""
     texts = dict.fromkeys(("time vs dense", "time verdict", "correlation"), "")
     if method.time_vs_dense is None or name == DENSE:
@@ -118,7 +97,7 @@ def _time_cells(name: str, method: MethodEntry, survivors: Collection[str]) -> d
     correlation = method.correlation_with_dense
     return {
         "time vs dense": ratio_text(method.time_vs_dense),
-        "time verdict": verdict_text(method.time_vs_dense, f"{name} time" in survivors),
+        "time verdict": verdict_text(method.time_vs_dense, f"{name} time" in lasting),
         "correlation": "" if correlation is None else f"{correlation:.2f}",
     }
 
@@ -214,12 +193,14 @@ def results_note(results: AnyResults) -> str:
     compared, scored = "difference to dense with Tango's", results.by_degrees
     if scored:
         compared = "score, the highest reward of an episode, and its difference to dense with Student's; verdicts are on it"
-    steps, flops = f"{policy.num_inference_steps} denoising steps", "denoiser only"
+    steps, flops = f"{policy.num_inference_steps} denoising steps", "planner and denoiser, as published"
+    if dense.flops.executed is not None:
+        flops += ", and what the engine executes of it, having folded what a query repeats"
     if dense.tokens:
         steps, flops = f"chunks of {policy.horizon} actions", "whole network"
     lines = [
         f"{results.task}, {_episodes_text(results)}: the same initial states "
-        f"and the same noise for every method. Success with Wilson's 95 % interval, {compared}.",
+        f"and seeds of noise for every method. Success with Wilson's 95 % interval, {compared}.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
         "below 0, whatever the margin.",
@@ -279,7 +260,7 @@ def _time_lines(results: Results) -> Iterator[str]:
 
 def _comparison_lines(results: Results) -> Iterator[str]:
     yield (
-        f"{_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
+        f"{num_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
         "correction for them."
     )
     if lacking := [name for name, method in results.methods.items() if method.time_vs_dense is None]:

@@ -47,6 +47,7 @@ class ActionDenoiser(TensorDictModuleBase):
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
         guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
         recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`.
+        planning_flops: of the planner, which are counted with the loop's.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self.network = network
         self.normalizer = normalizer
         self.warm = self.guided = self.recalls = False
+        self.planning_flops = 0
         self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
         self.engine = EngineSlot(engine)
@@ -112,6 +114,8 @@ class ActionDenoiser(TensorDictModuleBase):
             actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), guide, *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
+        if self.planning_flops:
+            flops = flops + self.planning_flops
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
 
     def _recall(

@@ -146,7 +146,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         self.module["denoise"].sampler = sampler
         denoise = self.module["denoise"]
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
-        denoise.recalls = recalls
+        denoise.recalls, denoise.planning_flops = recalls, plan.flops
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]

@@ -51,6 +51,16 @@ def largest_error(engine, network, sampler, query, masks=None, reuse="block"):
     return (engine.denoise(*query, masks, reuse) - expected).abs().max()
 
 
+@pytest.mark.parametrize(
+    "name", ["dpmpp2m5", "ddim_90_50_10_eta0.5", "ddpm10_trailing", "sde2m6_logsnr", "ddim_7"]
+)
+def test_every_sampler(name):
+    network, sampler = make_network("small"), Sampler.from_name(name)
+    masks = make_masks(network, sampler, batch=3, rate=0.6)
+    query = make_query(network, sampler, batch=3)
+    assert largest_error(TorchEngine(network, sampler), network, sampler, query, masks) < 1e-9
+
+
 @pytest.mark.parametrize(("kind", "steps"), SCHEDULES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_equals_the_reference_for_random_masks(shape, kind, steps):

@@ -16,8 +16,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.base import check_query
-from torchrl_sparse.blocks.engine.costs import folded_block_macs
+from torchrl_sparse.blocks.engine.base import Overhead, check_query
+from torchrl_sparse.blocks.engine.costs import folded_block_macs, folded_overhead_macs
 from torchrl_sparse.blocks.engine.native.arena import PANEL
 from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instruction_level, library
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
@@ -257,6 +257,10 @@ class NativeEngine:
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
         return folded_block_macs(self._network)
+
+    def overhead_macs(self) -> Overhead:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.overhead_macs`."""
+        return folded_overhead_macs(self._network, merged_stem=True)
 
     @contextmanager
     def _scratch(self, packed: PackedNetwork, threads: int) -> Iterator[Tensor]:

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.base import check_query
-from torchrl_sparse.blocks.engine.costs import folded_block_macs
+from torchrl_sparse.blocks.engine.base import Overhead, check_query
+from torchrl_sparse.blocks.engine.costs import folded_block_macs, folded_overhead_macs
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.torch.graphs import padded_batch
 from torchrl_sparse.blocks.engine.torch.linear import can_pack
@@ -110,6 +110,10 @@ class TorchEngine:
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
         return folded_block_macs(self._network)
+
+    def overhead_macs(self) -> Overhead:
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.overhead_macs`."""
+        return folded_overhead_macs(self._network, merged_stem=False)
 
     def _current(self) -> tuple[Tables, WorkspacePool]:
         """Return tables of the present weights, and the workspaces made with them."""

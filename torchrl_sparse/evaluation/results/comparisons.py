@@ -1,0 +1,27 @@
+"""How many verdicts a ``results.json`` gives, and which of them hold together."""
+
+from __future__ import annotations
+
+from torchrl_sparse.evaluation.results.schema import AnyResults, Results
+from torchrl_sparse.evaluation.statistics.multiplicity import holm
+
+__all__ = ["num_comparisons", "survivors"]
+
+
+def num_comparisons(results: Results) -> int:
+    """Return the verdicts of the table: on success and on time, or on the score alone, of every method but dense."""
+    return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
+
+
+def survivors(results: AnyResults) -> set[str] | None:
+    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
+    if not isinstance(results, Results):
+        return None
+    if results.by_degrees:
+        scores = {name: method.score.p_value for name, method in results.methods.items()}
+        p_values = {f"{name} success": p for name, p in scores.items() if p is not None}
+        return holm(p_values, num_comparisons(results))
+    tested = {name: method.p_values for name, method in results.methods.items() if method.p_values}
+    p_values = {f"{name} success": p.success for name, p in tested.items()}
+    p_values |= {f"{name} time": p.time for name, p in tested.items()}
+    return holm(p_values, num_comparisons(results))
