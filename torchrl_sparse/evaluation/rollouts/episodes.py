@@ -22,7 +22,7 @@ class EpisodeResult:
         success: whether the task's predicate held at any step.
         length: environment steps.
         queries: calls of the policy.
-        flops_total: FLOPs (2 * MAC) of all queries together, denoiser only.
+        flops_total: FLOPs (2 * MAC) of all queries together, as `torchrl_sparse.keys.FLOPS` counts them.
         prune_rate: pruned share of the blocks, or of the visual tokens, mean over all queries, in [0, 1].
         latency: seconds of each query as the policy reported it. A batched call reports its duration for
             every row, so these describe the rollout; the figures of a table come from
