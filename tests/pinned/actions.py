@@ -27,6 +27,8 @@ _RULES = ("type", "single")
 # Of dense's hundred steps, for which PyTorch's engine takes a second, with other noise or another sampler.
 _AS_DENSE = {"dense_noise", "ddim100"}
 _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_text(encoding="utf-8"))
+# One policy of each size; that engines agree is tested where engines are.
+_IN_TORCH = {"lift", "pusht", "lift_image"}
 # Not of the policy's planner; and what rounded weights answer depends on the instruction set.
 _EXECUTED_OR_ROUNDED = re.compile(r"_every\d|_of\d|:")
 # Results alone: of other training seeds, of a policy that knows four ways, of one of less training, of what another began from.
@@ -95,8 +97,8 @@ def is_kept(folder: Path) -> bool:
 
 
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
-    """The engines that a method is asked in: not PyTorch's where it recalls earlier queries, or is much as dense is."""
-    if method in _AS_DENSE:
+    """The engines that a method is asked in: not PyTorch's where it recalls earlier queries, or is much as another case is."""
+    if method in _AS_DENSE or folder.name not in _IN_TORCH:
         return ("native",)
     planner = folder / f"{method}.json"
     planner = planner if planner.exists() else folder / method / "config.json"
