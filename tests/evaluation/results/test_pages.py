@@ -48,6 +48,20 @@ def test_rows_and_columns_are_those_asked_for_in_their_order(root):
     assert [row[0] for row in table("results.json", root)[1:]] == ["dense", "ddim10", "bac"]
 
 
+def test_below_verdicts_stands_how_many_there_are_of_their_file(root):
+    def below(directive):
+        return write_tables(page(directive), root).partition("\n<!-- end -->")[0].rstrip().splitlines()[-1]
+
+    said = "Of 4 comparisons with dense; † does not survive Holm's correction for them."
+    assert below("results.json") == said
+    assert below('results.json methods="bac" columns="method | time verdict"') == said
+    assert below('results.json columns="method | speed-up"').startswith("| bac")
+    save_results(make_results(20, names=("dense", "ddim10")), root / "results_again.json")
+    together = "results.json results_again.json"
+    assert below(together).startswith("Of 4 and 2 comparisons with dense, file by file; †")
+    assert below(f'{together} cells="success | speed-up"').startswith("| bac")
+
+
 def test_several_files_are_one_table_or_stand_side_by_side():
     files = "lift/results.json can/weaker/results.json can/weaker/results_steps.json"
     heading, *rows = table(f'{files} methods="sag" tasks="Lift | Can"', ASSETS)

@@ -156,6 +156,20 @@ def test_table_is_markdown_with_aligned_columns():
     assert row["verdict"] == "baseline"
 
 
+def test_what_the_engine_executes_stands_beside_the_published_count():
+    runs = {
+        "dense": replace(run([1] * 20), executed_flops=8e9),
+        "bac": replace(run([1] * 20), executed_flops=2e9),
+    }
+    counted = build(runs)
+    rows = results_rows(counted)
+    assert [row["executed, GFLOPs"] for row in rows] == ["8.00", "2.00"]
+    assert "what the engine executes" in format_table(counted)
+    uncounted = make_results(100)
+    assert "executed, GFLOPs" not in results_rows(uncounted)[0]
+    assert "what the engine executes" not in format_table(uncounted)
+
+
 def test_table_says_when_episodes_cannot_suffice():
     assert "73 are needed" in format_table(make_results(50))
     assert "needed" not in format_table(make_results(100))

@@ -55,6 +55,11 @@ FAULTS = {
         -1.0,
         "methods.bac.flops.per_query: expected at least 0",
     ),
+    "negative executed": (
+        ("methods", "bac", "flops", "executed"),
+        -1.0,
+        "methods.bac.flops.executed: expected at least 0 or null",
+    ),
     "no object": (("machine",), "fast", "machine: expected an object, got 'fast'"),
     "prune rate": (("methods", "bac", "prune_rate"), 90, "methods.bac.prune_rate: expected 0 to 1, got 90"),
     "tokens": (

@@ -93,10 +93,10 @@ def executed_flops(engine: Engine, mask: Tensor, num_steps: Tensor | None = None
         num_steps: i64 [*B, 1], of queries that take only the last so many steps and compute all of the first of those.
 
     Returns:
-        f64 [*B].
+        f64 [*B], on the CPU.
     """
-    last, blocks = mask.shape[-2], mask.shape[-1]
-    taken = torch.full((*mask.shape[:-2], 1), last) if num_steps is None else num_steps
+    mask, last, blocks = mask.cpu(), mask.shape[-2], mask.shape[-1]
+    taken = torch.full((*mask.shape[:-2], 1), last) if num_steps is None else num_steps.cpu()
     before = torch.arange(last) - (last - taken)  # steps from the first that is taken, [*B, K]
     computed = (~mask | (before == 0)[..., None]) & (before >= 0)[..., None]
     macs = torch.tensor(engine.block_macs(), dtype=torch.float64).repeat(blocks // len(BLOCK_TYPES))

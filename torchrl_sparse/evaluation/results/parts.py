@@ -199,6 +199,7 @@ class Flops:
     def __post_init__(self) -> None:
         require(self.per_query >= 0, "per_query", "at least 0", self.per_query)
         require(self.ratio_to_dense >= 0, "ratio_to_dense", "at least 0", self.ratio_to_dense)
+        require(self.executed is None or self.executed >= 0, "executed", "at least 0 or null", self.executed)
 
 
 @dataclass(frozen=True)

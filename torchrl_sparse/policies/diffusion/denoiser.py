@@ -139,7 +139,7 @@ class ActionDenoiser(TensorDictModuleBase):
         """Count the FLOPs of a query under a planner's mask [K, 3L], once: the planner never writes to it."""
         known, flops = self._counted  # read and replaced in one go: other threads may do the same
         if known is not mask:
-            flops = mask_flops(NetworkSizes.of(self.network), mask).item()
+            flops = mask_flops(NetworkSizes.of(self.network), mask).item() + self.planning_flops
             self._counted = mask, flops
         return flops
 
