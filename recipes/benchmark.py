@@ -106,7 +106,7 @@ def main(config: DictConfig) -> None:
     try:
         for name in config.videos:
             if name in actors:
-                film_masks(name, actors[name], make_env, seeds[0], out)
+                film_masks(name, actors[name], make_env, seeds[0], out, config.threads)
     except RuntimeError as error:  # no GL library
         print(f"no video: {error}")
     if config.logger == "wandb":

@@ -105,7 +105,7 @@ def main(config: DictConfig) -> None:
     save_results(results, out / "results.json")
     draw_methods(results, policies, recorded, out)
     for video, name in filmed.items():
-        film_tokens(video, actors[name], make_env, seeds[0], out)
+        film_tokens(video, actors[name], make_env, seeds[0], out, config.threads)
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_table(results)}\n\nFiles are in {out}")

@@ -88,7 +88,9 @@ def film_chosen(
     if (out / f"rollout_{found.chosen}.mp4").exists():
         return
     first = evaluation_seeds("development", seed, 1)[0]
-    film_masks(found.chosen, ChunkExecutor(policy, n_action_steps), make_env, first, out)
+    film_masks(
+        found.chosen, ChunkExecutor(policy, n_action_steps), make_env, first, out, found.machine.threads
+    )
 
 
 def write_acceleration_report(found: Acceleration, out: Path) -> Path:

@@ -17,6 +17,7 @@ from torchrl_sparse.evaluation.figures.masks import mask_panel
 from torchrl_sparse.evaluation.figures.tokens import draw_tokens, plot_control, plot_token_strip
 from torchrl_sparse.evaluation.figures.video import Caption, write_video
 from torchrl_sparse.evaluation.rollouts.vla_methods import seen_images
+from torchrl_sparse.runtime.threads import num_threads
 
 __all__ = ["captions", "film_masks", "film_tokens"]
 
@@ -26,7 +27,7 @@ _ZOOM = 2
 
 
 def film_masks(
-    name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path
+    name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path, threads: int
 ) -> None:
     """Film a diffusion policy's episode, with the latest query's mask beside it where masks depend on the observation.
 
@@ -36,6 +37,7 @@ def film_masks(
         make_env: called as ``make_env(seeds=[seed])``.
         seed: of the episode.
         out: folder of the film.
+        threads: of PyTorch meanwhile, as captions tell what each query took.
 
     Raises:
         RuntimeError: without a GL library, before any query.
@@ -48,7 +50,7 @@ def film_masks(
             frame = np.hstack([frame, mask_panel(step[keys.PRUNE_MASK].numpy(), height=_SIZE)])
         frames.append(frame)
 
-    with closing(make_env(seeds=[seed])) as env:
+    with closing(make_env(seeds=[seed])) as env, num_threads(threads):
         env.base_env.reset()
         env.base_env.render(_CAMERA, _SIZE, _SIZE)  # fails here where there is no GL library
         steps = env.rollout(env.base_env.horizon, actor, callback=photograph)
@@ -57,15 +59,15 @@ def film_masks(
 
 
 def film_tokens(
-    name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path
+    name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path, threads: int
 ) -> None:
     """Film what a vision-language-action policy sees and keeps in an episode; draw a strip of it, and when motion was fine.
 
     Args:
         name: of the method; the files are ``out/rollout_NAME.mp4``, ``strip_NAME.png`` and ``control_NAME.png``.
-        actor, make_env, seed, out: as of `film_masks`; `make_env` renders what the policy sees.
+        actor, make_env, seed, out, threads: as of `film_masks`; `make_env` renders what the policy sees.
     """
-    with closing(make_env(seeds=[seed])) as env:
+    with closing(make_env(seeds=[seed])) as env, num_threads(threads):
         steps = env.rollout(env.base_env.horizon, actor, auto_cast_to_device=True).cpu()
     draw = partial(draw_tokens, num_layers=actor.policy.network.config.llm.layers, scale=_ZOOM)
     pictures = [
