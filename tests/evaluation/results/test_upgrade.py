@@ -7,6 +7,7 @@ import pytest
 
 from tests.evaluation.synthetic import VERSION_1, make_results, make_runs
 from torchrl_sparse.evaluation.results.aggregate import (
+    AggregateResults,
     aggregate_results,
     aggregate_rows,
     load_aggregate,
@@ -14,6 +15,7 @@ from torchrl_sparse.evaluation.results.aggregate import (
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.pages import write_tables
+from torchrl_sparse.evaluation.results.parts import Difference, TimeDifference
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
@@ -110,6 +112,28 @@ def test_tasks_are_put_together_for_the_methods_that_all_have(tasks, tmp_path):
     assert load_aggregate(tmp_path / "aggregate.json") == results
     page = write_tables("<!-- table: aggregate.json -->\n<!-- end -->", tmp_path)
     assert aggregate_rows(results)[0]["time vs dense"] in page
+
+
+def test_verdicts_over_tasks_that_do_not_survive_a_correction_for_all_are_marked(tasks):
+    entry = aggregate_results(tasks).methods["bac"]
+
+    def judged(half):
+        """Two points below dense, give or take half an interval, at twice its time."""
+        success = Difference(-0.02, (-0.02 - half, -0.02 + half), 0.05, "non-inferior")
+        time = TimeDifference(2.0, (1.8, 2.2), 0.1, "inferior")
+        return replace(entry, paired_vs_dense=success, time_vs_dense=time)
+
+    barely, clearly = judged(0.0299), judged(0.01)
+    results = AggregateResults(1, ("Lift", "Can"), "test", {"barely": barely, "clearly": clearly})
+    rows = {row["method"]: row for row in aggregate_rows(results)}
+    # 1.97 standard errors from the margin: p = .0246, which the last of four may have, but none of three that are left.
+    assert rows["barely"]["verdict"] == "non-inferior"
+    assert rows["clearly"]["verdict"] == "non-inferior, worse"
+    several = {f"barely {index}": barely for index in range(2)}
+    rows = aggregate_rows(replace(results, methods=results.methods | several))
+    marked = {row["method"] for row in rows if row["verdict"].endswith("†")}
+    assert marked == {"barely", *several}
+    assert {row["time verdict"] for row in rows} == {"inferior"}
 
 
 def test_what_cannot_be_put_together_is_named(tasks):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
@@ -17,9 +19,17 @@ from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.evaluation.statistics.bootstrap import aggregate_tasks
 from torchrl_sparse.evaluation.statistics.durations import time_verdict
 from torchrl_sparse.evaluation.statistics.intervals import verdict
+from torchrl_sparse.evaluation.statistics.multiplicity import holm
 from torchrl_sparse.storage.json import read_json, write_json
 
-__all__ = ["AggregateResults", "aggregate_results", "aggregate_rows", "load_aggregate", "save_aggregate"]
+__all__ = [
+    "AggregateResults",
+    "aggregate_results",
+    "aggregate_rows",
+    "load_aggregate",
+    "num_verdicts",
+    "save_aggregate",
+]
 
 
 @dataclass(frozen=True)
@@ -99,18 +109,42 @@ def _episodes(path: Path, name: str, seeds: range) -> list[EpisodeResult]:
 
 
 def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
-    """Return the rows of the table, one per method: column -> text."""
+    """Return the rows of the table, one per method: column -> text; † where a verdict does not survive Holm's correction."""
+    lasting = holm(_p_values(results), num_verdicts(results))
     return [
         {
             "method": name,
             "pairs": str(entry.episodes),
             "vs dense, points": points_text(entry.paired_vs_dense.diff, entry.paired_vs_dense.ci95),
-            "verdict": verdict_text(entry.paired_vs_dense),
+            "verdict": verdict_text(entry.paired_vs_dense, f"{name} success" in lasting),
             "time vs dense": ratio_text(entry.time_vs_dense),
-            "time verdict": verdict_text(entry.time_vs_dense),
+            "time verdict": verdict_text(entry.time_vs_dense, f"{name} time" in lasting),
         }
         for name, entry in results.methods.items()
     ]
+
+
+def num_verdicts(results: AggregateResults) -> int:
+    """Return the verdicts of the table: on success and on time, of every method."""
+    return 2 * len(results.methods)
+
+
+def _p_values(results: AggregateResults) -> dict[str, float]:
+    """Return by verdict how probable a value as far from its margin is at it, as normal as the bootstrap's interval is wide."""
+    p_values = {}
+    for name, entry in results.methods.items():
+        success, time = entry.paired_vs_dense, entry.time_vs_dense
+        p_values[f"{name} success"] = _tail(success.diff + success.margin, *success.ci95)
+        limits = map(math.log, time.ci95)
+        p_values[f"{name} time"] = _tail(math.log(time.ratio / (1 + time.margin)), *limits)
+    return p_values
+
+
+def _tail(distance: float, low: float, high: float) -> float:
+    error = (high - low) / (2 * NormalDist().inv_cdf(0.975))
+    if not error:
+        return 0.0 if distance else 0.5
+    return NormalDist().cdf(-abs(distance) / error)
 
 
 def load_aggregate(path: str | os.PathLike) -> AggregateResults:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
-from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate
+from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate, num_verdicts
 from torchrl_sparse.evaluation.results.carried_noise import carried_noise_rows, load_carried_noise
 from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
 from torchrl_sparse.evaluation.results.comparisons import num_comparisons
@@ -195,7 +195,8 @@ def _table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
 
 def _aggregate(path: Path) -> dict[str, Table]:
     results = load_aggregate(path)
-    return {"methods": _table(", ".join(results.tasks), aggregate_rows(results))}
+    table = _table(", ".join(results.tasks), aggregate_rows(results))
+    return {"methods": replace(table, comparisons=num_verdicts(results))}
 
 
 def _acceleration(path: Path) -> dict[str, Table]:
