@@ -189,7 +189,7 @@ class Flops:
     Attributes:
         per_query: see `torchrl_sparse.blocks.mask`; with the planner's.
         ratio_to_dense: those over dense's.
-        executed: that the engine really does, mean over the timed queries; None in older files and of VLAs.
+        executed: that the engine really does, mean over queries of dense episodes; None in older files and of VLAs.
     """
 
     per_query: float
