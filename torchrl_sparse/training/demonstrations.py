@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from diffusers.training_utils import EMAModel
 from torch import Tensor, nn
 
 from torchrl_sparse.data.robomimic import Demonstrations
@@ -90,6 +89,8 @@ class DemonstrationTrainer(Trainer):
         train_rows: Tensor,
         val_rows: Tensor | None,
     ) -> None:
+        from diffusers.training_utils import EMAModel  # seconds, which only a training needs
+
         self.train_rows, self.val_rows = train_rows, val_rows
         self._ema = EMAModel(
             trained_parameters(module),

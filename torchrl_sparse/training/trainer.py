@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from diffusers.optimization import get_cosine_schedule_with_warmup
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -121,6 +120,10 @@ class Trainer(ABC):
 
     def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LRScheduler:
         """Return the learning rate from `step` on: a linear warm-up, then a cosine to zero."""
+        from diffusers.optimization import (
+            get_cosine_schedule_with_warmup,  # seconds, which only a training needs
+        )
+
         return get_cosine_schedule_with_warmup(
             optimizer, self.warmup_steps, self.total, last_epoch=self.step - 1
         )

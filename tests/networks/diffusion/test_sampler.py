@@ -30,6 +30,12 @@ def run(sampler, predict, noise):
     return torch.stack(samples)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 50, 100, 1000, 10_000])
+def test_the_schedule_of_noise_is_that_of_diffusers(steps):
+    ours = Sampler(num_train_timesteps=steps).alphas_cumprod
+    assert torch.equal(ours, DDPMScheduler(steps, beta_schedule="squaredcos_cap_v2").alphas_cumprod)
+
+
 @pytest.mark.parametrize(("steps", "spacing"), [(100, "leading"), (25, "leading"), (16, "leading"), (10, "trailing"),
                                                 (7, "trailing"), (10, "linspace"), (1, "leading")])  # fmt: skip
 def test_ddpm_equals_diffusers_with_its_variance_noise(steps, spacing):

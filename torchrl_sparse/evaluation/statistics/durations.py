@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level
 from torchrl_sparse.evaluation.statistics.overlap import Means, checked_pairs
@@ -109,7 +109,7 @@ def time_ratio(
     (1.0, 'non-inferior', [0.91, 1.09])
     """
     check_level(confidence)
-    means, z2 = Means.of(method, other, more), float(norm.ppf((1 + confidence) / 2)) ** 2
+    means, z2 = Means.of(method, other, more), float(ndtri((1 + confidence) / 2)) ** 2
     y, x, shared = means.method, means.other, z2 * means.other_variance
     own = means.own_variance + z2 * _one_seed(method, other, horizon) ** 2
     ci = _fieller(x * x - shared, x * y - means.slope * shared, y * y - z2 * own - means.slope**2 * shared)

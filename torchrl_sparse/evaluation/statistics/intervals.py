@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from scipy.optimize import brentq
-from scipy.stats import binomtest, norm
+from scipy.special import ndtri
 
 from torchrl_sparse.evaluation.statistics.overlap import Further, checked_pairs
 
@@ -79,8 +79,10 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     check_level(confidence)
     if n < 1 or not 0 <= k <= n:
         raise ValueError(f"a rate needs 0 <= k <= n and n >= 1, got k={k}, n={n}")
-    interval = binomtest(k, n).proportion_ci(confidence_level=confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    z = float(ndtri((1 + confidence) / 2))
+    centre, half = k + z**2 / 2, z * math.sqrt(k * (n - k) / n + z**2 / 4)
+    low, high = (centre - half) / (n + z**2), (centre + half) / (n + z**2)
+    return low if k else 0.0, high if k < n else 1.0  # which rounding would miss
 
 
 def tango_interval(
@@ -106,7 +108,7 @@ def tango_interval(
         raise ValueError(
             f"pairs need won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
         )
-    z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
+    z2 = float(ndtri((1 + confidence) / 2)) ** 2
     # Where the estimated variance is zero, the equation below also holds at the estimate itself, which is
     # no limit of the interval; its other roots have closed forms there.
     if further == _PAIRS_ALONE:
@@ -217,7 +219,7 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
     check_level(confidence)
     if not 0 < margin < 1:
         raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
-    z2 = float(norm.ppf((1 + confidence) / 2)) ** 2
+    z2 = float(ndtri((1 + confidence) / 2)) ** 2
     return math.floor(z2 * (1 - margin) / margin) + 1
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtr, stdtrit
 
 from torchrl_sparse.evaluation.statistics.overlap import Means
 
@@ -56,7 +56,7 @@ def difference_interval(
 
 
 def _half_width(variance: float, n: int, confidence: float) -> float:
-    return float(t.ppf((1 + confidence) / 2, n - 1)) * math.sqrt(variance)
+    return float(stdtrit(n - 1, (1 + confidence) / 2)) * math.sqrt(variance)
 
 
 def difference_z(method: ArrayLike, other: ArrayLike, bound: float, more: ArrayLike = ()) -> float:
@@ -72,5 +72,5 @@ def difference_z(method: ArrayLike, other: ArrayLike, bound: float, more: ArrayL
     if means.n < 2:
         return 0.0
     above, error = means.method - means.other - bound, math.sqrt(means.variance(1))
-    tail = t.sf(abs(above) / error, means.n - 1) if error > 0 else 0.0
-    return math.copysign(float(norm.isf(tail)), above)
+    tail = stdtr(means.n - 1, -abs(above) / error) if error > 0 else 0.0
+    return math.copysign(-float(ndtri(tail)), above)

@@ -26,7 +26,7 @@ from functools import cache, cached_property
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import norm
+from scipy.special import ndtr
 
 __all__ = ["Design"]
 
@@ -89,7 +89,7 @@ class Design:
         """Return the two-sided level of the intervals at a look; those of all looks hold together with 95 %."""
         if self.looks == 1:
             return 1 - _ERROR
-        return 1 - 2 * float(norm.sf(self.critical(episodes)))
+        return 1 - 2 * float(ndtr(-self.critical(episodes)))
 
     def decides(self, episodes: int, *statistics: float) -> bool:
         """Tell whether a method's verdict is reached at a look: non-inferior in every statistic, or inferior in one.
@@ -111,7 +111,7 @@ class Design:
             return 0.5
         z = min(z, _LARGEST_Z)
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
-        return max(_crossing(constant, self._times) / 2, float(norm.sf(z)))
+        return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))
 
     @property
     def _times(self) -> tuple[float, ...]:
@@ -133,6 +133,7 @@ def _crossing(constant: float, times: tuple[float, ...]) -> float:
     for time in times:
         limit = constant * time**_SHAPE
         here = limit * nodes
-        step = norm.pdf(here[:, None], before, math.sqrt(time - earlier))
+        spread = math.sqrt(time - earlier)
+        step = np.exp(-(((here[:, None] - before) / spread) ** 2) / 2) / (spread * math.sqrt(2 * math.pi))
         before, mass, earlier = here, limit * weights * (step @ mass), time
     return max(1 - float(mass.sum()), 0.0)
