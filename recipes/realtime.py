@@ -23,19 +23,20 @@ from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
-from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
+from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods, time_methods
 from torchrl_sparse.evaluation.benchmarks.late import evaluate_late
+from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.latency.queries import time_queries
+from torchrl_sparse.evaluation.results.build import Terms
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
     format_realtime,
     save_realtime,
 )
+from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import check_method
-from torchrl_sparse.methods.executor import execution_options
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
@@ -64,11 +65,10 @@ def main(config: DictConfig) -> None:
     )
     seeds = evaluation_seeds(config.split, config.seed, config.episodes)
     queries = record_queries(ChunkExecutor(policy), make_env, seeds[:1])
-    samples = {name: execution_options(name)["num_samples"] for name in methods}
-    latency = time_queries(
-        methods, queries, repeats=config.latency_repeats, threads=config.threads, samples=samples
-    )
+    latency = time_methods(methods, queries, repeats=config.latency_repeats, threads=config.threads)
 
+    horizon, margins = episode_horizon(make_env, seeds), (config.margin, config.time_margin)
+    terms = Terms(Design(len(seeds)), horizon, task.early_cut, *margins)
     shared = {name: config[name] for name in ("control_freq", "out", "num_envs", "workers", "backend")}
     settings = {name: config[name] for name in ("task", "horizon", "n_action_steps")}
     shared |= {"model": model, "settings": settings, "policy_device": config.device}
@@ -84,11 +84,12 @@ def main(config: DictConfig) -> None:
     results = build_realtime(
         runs,
         task=task.name,
+        split=config.split,
         seed=config.seed,
         control_freq=config.control_freq,
         n_action_steps=config.n_action_steps,
         machine=describe_machine(config.device, config.threads),
-        margin=config.margin,
+        terms=terms,
     )
     save_realtime(results, out / "realtime.json")
     plot_realtime(results, out / "realtime.png")

@@ -8,7 +8,7 @@ import pytest
 from tests.pinned.actions import is_kept, is_vla, policy_of
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.evaluation.results.schema import load_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
+from torchrl_sparse.evaluation.rollouts.episodes import read_episodes, read_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
 from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -24,29 +24,28 @@ def name(folder: Path) -> str:
     return folder.relative_to(ASSETS).as_posix()
 
 
-def identity(log: Path) -> dict:
-    with log.open(encoding="utf-8") as lines:
-        return json.loads(next(lines))["identity"]
+def logs(folder: Path) -> dict[str, Path]:
+    return {path.name.removesuffix(".jsonl.gz"): path for path in (folder / "episodes").iterdir()}
 
 
 def outcomes(log: Path) -> dict[int, bool]:
-    return {seed: episode.success for seed, episode in EpisodeLog(log, identity(log)).episodes.items()}
+    return {episode.seed: episode.success for episode in read_episodes(log)}
 
 
 @pytest.mark.parametrize("folder", [path for path in FOLDERS if path not in [*SEEING, *UNKEPT]], ids=name)
 def test_episodes_belong_to_the_policy_and_the_planners_beside_them(folder):
     planners = policy_of(folder)
     policy = DiffusionPolicy.from_pretrained(planners)
-    for log in (folder / "episodes").glob("*.jsonl"):
-        method = make_method(log.stem, policy, num_updates=10, planners=planners, calibration=pytest.fail)
-        published = identity(log)
-        assert published | method_identity(log.stem, method) == published, log
+    for name, log in logs(folder).items():
+        method = make_method(name, policy, num_updates=10, planners=planners, calibration=pytest.fail)
+        published = read_identity(log)
+        assert published | method_identity(name, method) == published, log
 
 
 @pytest.mark.parametrize("folder", UNKEPT, ids=name)
 def test_episodes_of_a_policy_that_is_not_kept_belong_to_one_which_is_not_the_kept_one(folder):
     kept = json.loads((policy_of(folder) / "bac.json").read_text(encoding="utf-8"))["policy"]
-    found = {identity(log)["policy"] for log in (folder / "episodes").glob("*.jsonl")}
+    found = {read_identity(log)["policy"] for log in logs(folder).values()}
     assert len(found) == 1
     assert kept not in found
 
@@ -55,29 +54,29 @@ def test_episodes_of_a_policy_that_is_not_kept_belong_to_one_which_is_not_the_ke
 def test_episodes_belong_to_the_policy_that_sees(folder):
     policy = VLAPolicy.from_pretrained(policy_of(folder))
     weights = tensors_fingerprint(policy.state_dict())
-    for log in (folder / "episodes").glob("*.jsonl"):
-        assert (identity(log)["policy"], identity(log)["method"]) == (weights, log.stem)
+    for name, log in logs(folder).items():
+        assert (read_identity(log)["policy"], read_identity(log)["method"]) == (weights, name)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=name)
 def test_tables_count_the_episodes(folder):
-    logs = {log.stem: outcomes(log) for log in (folder / "episodes").glob("*.jsonl")}
+    played = {name: outcomes(log) for name, log in logs(folder).items()}
     tabled = set()
     for path in sorted(folder.glob("results*.json")):
         results = load_results(path)
-        for name in results.methods.keys() & logs.keys():
+        for name in results.methods.keys() & played.keys():
             success, paired = results.methods[name].success, results.methods[name].paired_vs_dense
             seeds = range(results.first_seed, results.first_seed + success.n)
-            ours, dense = ([logs[method][seed] for seed in seeds] for method in (name, "dense"))
+            ours, dense = ([played[method][seed] for seed in seeds] for method in (name, "dense"))
             assert success.k == sum(ours), (path, name)
             if name != "dense":
                 known = range(
                     seeds.stop, results.first_seed + (getattr(results, "dense_episodes", None) or 0)
                 )
-                more = [logs["dense"][seed] for seed in known]
+                more = [played["dense"][seed] for seed in known]
                 difference = paired_difference(ours, dense, paired.margin, more=more)
                 assert paired.diff == pytest.approx(difference.diff)
                 if results.until_decided is None:  # else the interval is wider, for all the looks
                     assert paired.verdict == difference.verdict
             tabled.add(name)
-    assert tabled == logs.keys()
+    assert tabled == played.keys()

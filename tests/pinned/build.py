@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import make_controller, make_method
@@ -161,9 +160,7 @@ def vla_answer(actor: ChunkExecutor, query: TensorDictBase, last: TensorDictBase
 
 def episodes_of(log: Path) -> list[EpisodeResult]:
     """All episodes of a log, by seed."""
-    with log.open(encoding="utf-8") as lines:
-        identity = json.loads(next(lines))["identity"]
-    return [episode for _, episode in sorted(EpisodeLog(log, identity).episodes.items())]
+    return sorted(read_episodes(log), key=lambda episode: episode.seed)
 
 
 def results_of(episodes: dict[str, list[EpisodeResult]], like: Results) -> Results:

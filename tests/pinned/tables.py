@@ -87,7 +87,7 @@ def _sweep(path: Path) -> list[str]:
 
 def _episodes(folder: Path) -> list[str]:
     """Tables of the logs that are long enough, numbers to more digits, and all methods against ddim10 or dense."""
-    logs = {log.stem: build.episodes_of(log) for log in sorted(folder.glob("*.jsonl"))}
+    logs = {log.name.removesuffix(".jsonl.gz"): build.episodes_of(log) for log in sorted(folder.iterdir())}
     made = []
     for count in _COUNTS:
         episodes = {name: log[:count] for name, log in logs.items() if len(log) >= count}

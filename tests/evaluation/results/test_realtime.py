@@ -5,24 +5,30 @@ from PIL import Image
 
 from tests.evaluation.synthetic import MACHINE
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
+from torchrl_sparse.evaluation.results.build import Terms
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
     format_realtime,
     load_realtime,
+    num_late_comparisons,
+    realtime_rows,
     save_realtime,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.storage.json import to_plain, write_json
 
 
 def episodes(successes, n=20, first=0):
-    return [EpisodeResult(first + i, i < successes, 30, 4, 1e9, 0.0) for i in range(n)]
+    return [
+        EpisodeResult(first + i, i < successes, 30 if i < successes else 50, 4, 1e9, 0.0) for i in range(n)
+    ]
 
 
 def build(**runs):
-    options = {"task": "LiftMoving", "seed": 0, "control_freq": 20.0, "n_action_steps": 8, "margin": 0.05}
-    return build_realtime(runs, machine=MACHINE, **options)
+    options = {"task": "LiftMoving", "split": "test", "seed": 0, "control_freq": 20.0, "n_action_steps": 8}
+    return build_realtime(runs, machine=MACHINE, terms=Terms(Design(20), 50), **options)
 
 
 DENSE = RealtimeRun(0.145, {0: episodes(20), 1: episodes(18), 3: episodes(10)})
@@ -36,6 +42,46 @@ def test_own_points_pair_with_the_dense_policy_at_its_own_latency():
     diffs = [p.paired_vs_dense.diff for p in points["bac"]]
     assert diffs == pytest.approx([-1 / 20, 17 / 20 - 10 / 20, -2 / 20])
     assert [p.success.k for p in points["dense"]] == [20, 18, 10]
+
+
+def test_times_pair_like_successes():
+    results = build(dense=DENSE, bac=FAST)
+    dense, bac = (results.methods[name].points for name in ("dense", "bac"))
+    means = [point.restricted_mean_time for point in dense]
+    assert means == pytest.approx([30, 30 * 0.9 + 50 * 0.1, 40])
+    own = bac[1]
+    assert own.restricted_mean_time == pytest.approx(30 * 0.85 + 50 * 0.15)
+    assert own.time_vs_dense.ratio == pytest.approx(33 / 40)  # to dense three steps late
+    assert own.time_vs_dense.verdict == own.paired_vs_dense.verdict == "non-inferior"
+    assert [point.time_vs_dense.ratio for point in dense] == [1, 1, 1]
+    assert all(point.p_values is None for point in dense)
+    assert all(0 <= point.p_values.time <= 0.5 for point in bac)
+
+
+def test_verdicts_count_and_those_of_chance_are_marked():
+    results = build(dense=DENSE, bac=FAST)
+    assert num_late_comparisons(results) == 6
+    row = realtime_rows(results)[4]
+    assert (row["method"], row["delay, steps"], row["mean time, steps"]) == ("bac", "1", "33.0")
+    smallest = results.methods["bac"].points[1].p_values
+    assert row["verdict"] == "non-inferior" + ("" if smallest.success < 0.025 / 6 else "†")
+    many = build(dense=DENSE, bac=FAST, **{f"m{i}": FAST for i in range(40)})
+    assert all(row["verdict"] != "non-inferior" for row in realtime_rows(many))
+
+
+def test_a_file_without_times_is_read_and_shows_none(tmp_path):
+    content = to_plain(build(dense=DENSE, bac=FAST)) | {"realtime": 1, "split": None, "episode_horizon": None}
+    for method in content["methods"].values():
+        for point in method["points"]:
+            for name in ("restricted_mean_time", "time_vs_dense", "p_values"):
+                point.pop(name, None)  # dense has no p-values
+    old = load_realtime(write_json(tmp_path / "realtime.json", content))
+    assert num_late_comparisons(old) == 0
+    row = realtime_rows(old)[4]
+    assert (row["verdict"], row["mean time, steps"], row["time verdict"]) == ("non-inferior", "", "")
+    write_json(tmp_path / "realtime.json", content | {"realtime": 2})
+    with pytest.raises(ValueError, match=r"realtime.json: split: expected a value in version 2, got None"):
+        load_realtime(tmp_path / "realtime.json")
 
 
 def test_what_cannot_be_paired_is_refused():

@@ -1,3 +1,4 @@
+import gzip
 import json
 from dataclasses import asdict
 
@@ -7,6 +8,8 @@ from torchrl_sparse.evaluation.rollouts.episodes import (
     EpisodeLog,
     EpisodeResult,
     TokenTotals,
+    read_episodes,
+    read_identity,
     token_totals,
     totals,
 )
@@ -72,6 +75,60 @@ def test_another_identity_is_refused_and_the_file_left_alone(path):
     ):
         EpisodeLog(path, {"method": "bac", "policy": "xyz"})
     assert path.read_bytes() == before
+
+
+@pytest.fixture
+def packed(path):
+    """A compressed log of three episodes."""
+    log = EpisodeLog(path, {"method": "bac"})
+    for seed in range(3):
+        log.append(episode(seed))
+    packed = path.with_name("bac.jsonl.gz")
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    path.unlink()
+    return packed
+
+
+def test_a_compressed_log_is_read_where_it_lies(path, packed):
+    for asked in (path, packed):
+        assert [*read_episodes(asked)] == [episode(seed) for seed in range(3)]
+        assert read_identity(asked) == {"method": "bac"}
+    assert not path.exists()
+
+
+def test_a_compressed_log_is_gone_on_with(path, packed):
+    before = packed.read_bytes()
+    log = EpisodeLog(path, {"method": "bac"})
+    assert list(log.episodes) == [0, 1, 2]
+    log.append(episode(7))
+    assert [found.seed for found in read_episodes(path)] == [
+        0,
+        1,
+        2,
+        7,
+    ]  # not those of the compressed one any more
+    assert packed.read_bytes() == before
+    path.unlink()
+    with pytest.raises(ValueError, match=r"bac.jsonl: holds other episodes"):
+        EpisodeLog(path, {"method": "sag"})
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-9], lambda b: b[:40] + b"~~~~" + b[44:], lambda b: b"{" + b[1:]]
+)
+def test_a_damaged_compressed_log_is_named(path, packed, damage):
+    packed.write_bytes(damage(packed.read_bytes()))
+    for read in (lambda: [*read_episodes(path)], lambda: EpisodeLog(path, {"method": "bac"})):
+        with pytest.raises(
+            ValueError, match=r"bac.jsonl.gz: expected a whole compressed log, got one that is damaged"
+        ):
+            read()
+        assert not path.exists()
+
+
+def test_a_log_that_is_not_there_is_named(path):
+    with pytest.raises(FileNotFoundError, match=r"expected a log of episodes .*bac.jsonl, got none"):
+        next(read_episodes(path))
 
 
 def test_a_log_without_an_episode_is_anybodys(path):

@@ -20,6 +20,7 @@ from torchrl_sparse.evaluation.figures.plots import (
     plot_schedule,
     plot_similarity,
 )
+from torchrl_sparse.evaluation.latency.measure import Latency
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.schema import Results
@@ -29,7 +30,14 @@ from torchrl_sparse.methods.diffusion import MethodName, make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 
-__all__ = ["default_methods", "draw_methods", "make_methods", "measure_methods", "settle_rates"]
+__all__ = [
+    "default_methods",
+    "draw_methods",
+    "make_methods",
+    "measure_methods",
+    "settle_rates",
+    "time_methods",
+]
 
 _ALWAYS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 _SAME_COMPUTATION = {"dense_noise": "dense"}  # of other numbers: it takes as long, and is not timed again
@@ -72,6 +80,26 @@ def settle_rates(
             method.plan.rate = min(max(totals(episodes[name]).prune_rate, min(rates)), max(rates))
 
 
+def time_methods(
+    methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, repeats: int, threads: int
+) -> dict[str, Latency]:
+    """Time every method as it is asked, interleaved; what computes the same as another has its latency.
+
+    Args:
+        methods: name -> policy, ``"dense"`` among them.
+        queries: [Q] of dense episodes.
+        repeats: queries that are timed under each method.
+        threads: of PyTorch while timing.
+    """
+    samples = {name: MethodName.parse(name).samples for name in methods}
+    timed = {name: method for name, method in methods.items() if name not in _SAME_COMPUTATION}
+    with progress("latency", "round", repeats) as show:
+        latency = time_queries(
+            timed, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
+        )
+    return {name: latency[_SAME_COMPUTATION.get(name, name)] for name in methods}
+
+
 def measure_methods(
     methods: Mapping[str, DiffusionPolicy],
     episodes: Mapping[str, Sequence[EpisodeResult]],
@@ -89,22 +117,17 @@ def measure_methods(
         repeats: queries that are timed under each method.
         threads: of PyTorch while timing.
     """
-    samples = {name: MethodName.parse(name).samples for name in methods}
-    timed = {name: method for name, method in methods.items() if name not in _SAME_COMPUTATION}
-    with progress("latency", "round", repeats) as show:
-        latency = time_queries(
-            timed, queries, repeats=repeats, threads=threads, samples=samples, on_round=show
-        )
+    latency = time_methods(methods, queries, repeats=repeats, threads=threads)
     planning = time_planning(_adaptive(methods), queries, threads=threads)
     answers = {name: answer(method, queries) for name, method in methods.items()}
     return {
         name: MethodRun(
             episodes[name],
-            latency[_SAME_COMPUTATION.get(name, name)],
+            latency[name],
             error_to_dense(method, answers[name], queries),
             planning.get(name),
             MethodName.parse(name).every,
-            samples[name] * flops_executed(method, answers[name]),
+            MethodName.parse(name).samples * flops_executed(method, answers[name]),
         )
         for name, method in methods.items()
     }

@@ -21,7 +21,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
 from torchrl_sparse.evaluation.results.offline import agreement_rows, error_rows, load_offline
 from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
-from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_rows
+from torchrl_sparse.evaluation.results.realtime import load_realtime, num_late_comparisons, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, pair_rows, results_rows
 from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
@@ -141,7 +141,8 @@ def _more_of_times(results: Results, method: MethodEntry) -> Row:
 
 def _realtime(path: Path) -> dict[str, Table]:
     results = load_realtime(path)
-    return {"methods": _table(results.task, realtime_rows(results))}
+    table = _table(results.task, realtime_rows(results))
+    return {"methods": replace(table, comparisons=num_late_comparisons(results))}
 
 
 def _engine(path: Path) -> dict[str, Table]:

@@ -1,26 +1,34 @@
 """Success against latency in a world that does not wait: ``realtime.json`` and its table.
 
-A latency acts by the number of steps that the world makes in it, so points are kept by that.
+A latency acts by the number of steps that the world makes in it, so points are kept by that. Version 1 had neither times nor
+their verdicts, and is still read.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
 from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.evaluation.latency.measure import Machine
-from torchrl_sparse.evaluation.results.parts import Difference, Success
+from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
+from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference, require
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
-from torchrl_sparse.evaluation.results.text import count_text, difference_text, threads_text
+from torchrl_sparse.evaluation.results.text import (
+    count_text,
+    difference_text,
+    ratio_text,
+    threads_text,
+    verdict_text,
+)
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.statistics.intervals import paired_difference
+from torchrl_sparse.evaluation.statistics.multiplicity import holm
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -31,12 +39,13 @@ __all__ = [
     "build_realtime",
     "format_realtime",
     "load_realtime",
+    "num_late_comparisons",
     "realtime_note",
     "realtime_rows",
     "save_realtime",
 ]
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,10 @@ class RealtimePoint:
         success: of its episodes.
         paired_vs_dense: against the dense policy at its own latency where ``own``, else at the same latency.
         episode_length: mean, environment steps.
+        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon. With what follows None
+            in version 1.
+        time_vs_dense: its ratio to the dense policy's, compared like the success.
+        p_values: of both verdicts; None of dense.
     """
 
     delay_steps: int
@@ -56,6 +69,9 @@ class RealtimePoint:
     success: Success
     paired_vs_dense: Difference
     episode_length: float
+    restricted_mean_time: float | None = None
+    time_vs_dense: TimeDifference | None = None
+    p_values: PValues | None = None
 
 
 @dataclass(frozen=True)
@@ -68,15 +84,24 @@ class RealtimeMethod:
 
 @dataclass(frozen=True)
 class Realtime:
-    """The content of a ``realtime.json``, whose version is ``realtime``."""
+    """The content of a ``realtime.json``, whose version is ``realtime``; the last two are None in version 1."""
 
-    realtime: Literal[1]
+    realtime: Literal[1, 2]
     task: str
     seed: int
     control_freq: float
     n_action_steps: int
     machine: Machine
     methods: dict[str, RealtimeMethod]
+    split: Literal["development", "test"] | None = None
+    episode_horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.realtime == SCHEMA:
+            of_times = [point.time_vs_dense for method in self.methods.values() for point in method.points]
+            for name, value in {"split": self.split, "episode_horizon": self.episode_horizon}.items():
+                require(value is not None, name, "a value in version 2", value)
+            require(None not in of_times, "time_vs_dense", "a value in version 2", None)
 
 
 @dataclass(frozen=True)
@@ -95,11 +120,12 @@ def build_realtime(
     runs: Mapping[str, RealtimeRun],
     *,
     task: str,
+    split: Literal["development", "test"],
     seed: int,
     control_freq: float,
     n_action_steps: int,
     machine: Machine,
-    margin: float,
+    terms: Terms,
 ) -> Realtime:
     """Make the content of ``realtime.json``.
 
@@ -114,24 +140,31 @@ def build_realtime(
     for name, run in runs.items():
         own, points = run.own_delay(control_freq), []
         for steps, episodes in sorted(run.episodes.items()):
-            against = dense_own if steps == own else dense.episodes.get(steps)
+            against = dense_own if steps == own and name != DENSE else dense.episodes.get(steps)
             if against is None:
                 raise ValueError(f"{name}: expected episodes of {DENSE!r} at {steps} steps of delay too")
-            success, difference = _compare(name, episodes, against, margin)
-            length = totals(episodes).episode_length
-            points.append(RealtimePoint(steps, steps == own, success, difference, length))
+            points.append(
+                _point(name, steps, steps == own, compare_episodes(name, episodes, against, terms), episodes)
+            )
         methods[name] = RealtimeMethod(run.own_latency, tuple(points))
-    return Realtime(SCHEMA, task, seed, control_freq, n_action_steps, machine, methods)
+    return Realtime(
+        SCHEMA, task, seed, control_freq, n_action_steps, machine, methods, split, terms.episode_horizon
+    )
 
 
-def _compare(
-    name: str, episodes: Sequence[EpisodeResult], dense: Sequence[EpisodeResult], margin: float
-) -> tuple[Success, Difference]:
-    if [episode.seed for episode in episodes] != [episode.seed for episode in dense]:
-        raise ValueError(f"{name}: expected the seeds of {DENSE!r}, in their order, got others")
-    outcomes = [episode.success for episode in episodes]
-    paired = paired_difference(outcomes, [episode.success for episode in dense], margin)
-    return Success.of(outcomes), Difference.of(paired)
+def _point(
+    name: str, steps: int, own: bool, compared: Mapping[str, Any], episodes: Sequence[EpisodeResult]
+) -> RealtimePoint:
+    return RealtimePoint(
+        steps,
+        own,
+        Success.of([episode.success for episode in episodes]),
+        compared["paired_vs_dense"],
+        totals(episodes).episode_length,
+        compared["restricted_mean_time"],
+        compared["time_vs_dense"],
+        compared.get("p_values"),
+    )
 
 
 def save_realtime(results: Realtime, path: str | os.PathLike) -> Path:
@@ -149,25 +182,52 @@ def load_realtime(path: str | os.PathLike) -> Realtime:
     return read_json(path, Realtime)
 
 
+def num_late_comparisons(results: Realtime) -> int:
+    """Return the verdicts of the table, on success and on time of every point but dense's; 0 of version 1."""
+    points = [point for name, method in results.methods.items() for point in method.points if name != DENSE]
+    return 2 * len(points) if results.realtime == SCHEMA else 0
+
+
 def realtime_rows(results: Realtime) -> list[dict[str, str]]:
     """Return one row of text per method and delay."""
+    points = [(name, point) for name, method in results.methods.items() for point in method.points]
+    tested = {(name, point.delay_steps): point.p_values for name, point in points if point.p_values}
+    p_values = {(*key, what): getattr(p, what) for key, p in tested.items() for what in ("success", "time")}
+    lasting = holm(p_values, num_late_comparisons(results))
     return [
-        _row(name, method, point, results.control_freq)
-        for name, method in results.methods.items()
-        for point in method.points
+        _row(
+            name,
+            results,
+            point,
+            {what for what in ("success", "time") if (name, point.delay_steps, what) in lasting},
+        )
+        for name, point in points
     ]
 
 
-def _row(name: str, method: RealtimeMethod, point: RealtimePoint, control_freq: float) -> dict[str, str]:
-    own = f"{1e3 * method.own_latency_s:.3g} ms, its own" if point.own else ""
-    return {
+def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection[str]) -> dict[str, str]:
+    own = f"{1e3 * results.methods[name].own_latency_s:.3g} ms, its own" if point.own else ""
+    mean, baseline = point.restricted_mean_time, name == DENSE
+    survives = results.realtime != SCHEMA or "success" in lasting
+    row = {
         "method": name,
         "delay, steps": str(point.delay_steps),
-        "latency": own or f"{1e3 * point.delay_steps / control_freq:.0f} ms",
+        "latency": own or f"{1e3 * point.delay_steps / results.control_freq:.0f} ms",
         "success": count_text(point.success),
-        "vs dense, points": "" if name == DENSE else difference_text(point.paired_vs_dense),
+        "vs dense, points": "" if baseline else difference_text(point.paired_vs_dense),
+        "verdict": "baseline" if baseline else verdict_text(point.paired_vs_dense, survives),
+        "mean time, steps": "" if mean is None else f"{mean:.1f}",
+        "time vs dense": "",
+        "time verdict": "",
         "steps": f"{point.episode_length:.1f}",
     }
+    if baseline or point.time_vs_dense is None:
+        return row
+    time = {
+        "time vs dense": ratio_text(point.time_vs_dense),
+        "time verdict": verdict_text(point.time_vs_dense, "time" in lasting),
+    }
+    return row | time
 
 
 def format_realtime(results: Realtime) -> str:
@@ -181,6 +241,8 @@ def realtime_note(results: Realtime) -> str:
     every = f"a query every {results.n_action_steps} steps, or as soon as the last one is answered"
     return (
         f"{results.task}, {results.control_freq:g} Hz; {every}; the world goes on meanwhile. Success with Wilson's "
-        "95 % interval, difference to dense with Tango's: at a method's own latency to dense at dense's own, else at the "
-        f"same latency. Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, {machine.date[:10]}."
+        "95 % interval, difference to dense with Tango's, mean time to success (the horizon where there is none) with its "
+        "ratio to dense's: at a method's own latency to dense at dense's own, else at the same latency; "
+        f"{num_late_comparisons(results)} comparisons, of which † does not survive Holm's correction. "
+        f"Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, {machine.date[:10]}."
     )

@@ -72,10 +72,11 @@ def _kept_episodes(
     kept, lacking = {}, {}
     for name, method in old.methods.items():
         log = folder / f"{name}.jsonl"
-        if not log.is_file():
+        try:
+            found = [episode for episode in read_episodes(log) if episode.seed in seeds]
+        except FileNotFoundError:
             lacking[name] = f"got no {log}"
             continue
-        found = [episode for episode in read_episodes(log) if episode.seed in seeds]
         solved = sum(episode.success for episode in found)
         if (solved, len(found)) == (method.success.k, len(seeds)):
             kept[name] = found

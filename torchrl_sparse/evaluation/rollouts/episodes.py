@@ -1,16 +1,28 @@
 """The result of an evaluated episode, sums over several, and the log that survives a killed evaluation."""
 
+import gzip
 import json
 import os
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_sparse.runtime.disk import naming_full_disk
-from torchrl_sparse.storage.json import describe_differences, parse_json
+from torchrl_sparse.storage.atomic import atomic_path
+from torchrl_sparse.storage.json import MAX_BYTES, describe_differences, parse_json
 
-__all__ = ["EpisodeLog", "EpisodeResult", "TokenTotals", "Totals", "read_episodes", "token_totals", "totals"]
+__all__ = [
+    "EpisodeLog",
+    "EpisodeResult",
+    "TokenTotals",
+    "Totals",
+    "read_episodes",
+    "read_identity",
+    "token_totals",
+    "totals",
+]
 
 
 @dataclass(frozen=True)
@@ -129,7 +141,8 @@ class EpisodeLog:
 
     The first line names what was evaluated. Every episode is one line, without what is at its default, flushed to the disk
     before :meth:`append` returns.
-    A last line without its newline was torn by a kill: it is cut off on opening, and its seed runs again.
+    A last line without its newline was torn by a kill: it is cut off on opening, and its seed runs again. A log that lies there
+    compressed alone, as ``PATH.gz``, is unpacked and gone on with.
 
     Args:
         path: the file; it and its folder are made if missing.
@@ -153,6 +166,9 @@ class EpisodeLog:
         self.identity = dict(identity or {})
         self.episodes: dict[int, EpisodeResult] = {}
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path != (found := _lying(self.path)):
+            with atomic_path(self.path) as temporary:
+                temporary.write_bytes(b"".join(_lines(found)))
         header = asdict(_Header(1, self.identity))
         content = self.path.read_bytes() if self.path.exists() else b""
         if _line(header).encode().startswith(content):
@@ -214,16 +230,40 @@ def _told(episode: EpisodeResult) -> dict[str, Any]:
 
 
 def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
-    """Yield the episodes of a log, which stays as it is.
+    """Yield the episodes of a log, which stays as it is; of ``PATH.gz`` where there is no ``PATH``.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is neither.
         ValueError: naming file and line, if one is damaged.
     """
+    path = _lying(path)
+    lines = _lines(path)
+    next(lines, None)
+    for number, line in enumerate(lines, start=2):
+        yield parse_json(line, EpisodeResult, f"{path}:{number}")
+
+
+def read_identity(path: str | os.PathLike) -> dict[str, Any]:
+    """Return what the episodes of a log belong to, see `EpisodeLog`; errors are those of `read_episodes`."""
+    path = _lying(path)
+    return parse_json(next(_lines(path), b""), _Header, f"{path}:1").identity
+
+
+def _lying(path: str | os.PathLike) -> Path:
+    """Return where a log is: there, or compressed beside it."""
     path = Path(path)
+    packed = path.with_name(f"{path.name}.gz")
+    return packed if packed.is_file() and not path.exists() else path
+
+
+def _lines(path: Path) -> Iterator[bytes]:
     if not path.is_file():
         raise FileNotFoundError(f"expected a log of episodes {path}, got none")
-    with path.open(encoding="utf-8") as lines:
-        next(lines)
-        for number, line in enumerate(lines, start=2):
-            yield parse_json(line, EpisodeResult, f"{path}:{number}")
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        try:
+            while line := file.readline(MAX_BYTES + 1):
+                yield line
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise ValueError(
+                f"{path}: expected a whole compressed log, got one that is damaged: {error}"
+            ) from error
