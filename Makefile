@@ -10,10 +10,11 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
+# Python compiles what it imports; compiling all that is installed takes minutes, and most of it is never imported.
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[dev]"
 	touch $@
 
 demo: install

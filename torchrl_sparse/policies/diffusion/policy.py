@@ -161,7 +161,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """
         shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
-        policy.start, policy.source = start, self.source
+        policy.source = self.source
+        if start is not None:
+            policy.start = start
         policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy
