@@ -113,7 +113,7 @@ class Design:
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))
 
-    @property
+    @cached_property
     def _times(self) -> tuple[float, ...]:
         return tuple(self._time(episodes) for episodes in self.ends)
 
