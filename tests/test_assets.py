@@ -7,6 +7,8 @@ import pytest
 
 from tests.pinned.actions import is_kept, is_vla, policy_of
 from torchrl_sparse.blocks.planner import tensors_fingerprint
+from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.evaluation.results.realtime import load_realtime
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import read_episodes, read_identity
 from torchrl_sparse.evaluation.statistics.intervals import paired_difference
@@ -80,3 +82,37 @@ def test_tables_count_the_episodes(folder):
                     assert paired.verdict == difference.verdict
             tabled.add(name)
     assert tabled == played.keys()
+
+
+@pytest.mark.parametrize("path", sorted(ASSETS.rglob("realtime.json")), ids=name)
+def test_late_tables_count_the_late_episodes(path):
+    results = load_realtime(path)
+    policies = set()
+    for method, told in results.methods.items():
+        for point in told.points:
+            if not point.delay_steps:  # those of an ordinary table beside it
+                continue
+            log = next(path.parent.rglob(f"{method}_delay{point.delay_steps}.jsonl.gz"))
+            policies.add(read_identity(log)["policy"])
+            episodes = {episode.seed: episode for episode in read_episodes(log)}
+            played = [
+                episodes[seed] for seed in evaluation_seeds(results.split, results.seed, point.success.n)
+            ]
+            times = [episode.length if episode.success else results.episode_horizon for episode in played]
+            assert point.success.k == sum(episode.success for episode in played), log
+            assert point.restricted_mean_time == pytest.approx(sum(times) / len(times)), log
+    assert len(policies) == 1
+
+
+@pytest.mark.parametrize("path", sorted(ASSETS.rglob("realtime.json")), ids=name)
+def test_without_latency_tables_count_ordinary_episodes(path):
+    results = load_realtime(path)
+    for method, told in results.methods.items():
+        for point in (point for point in told.points if not point.delay_steps):
+            seeds = evaluation_seeds(results.split, results.seed, point.success.n)
+            logs = [
+                {episode.seed: episode.success for episode in read_episodes(log)}
+                for log in path.parent.rglob(f"episodes/{method}.jsonl.gz")
+            ]
+            counts = {sum(log[seed] for seed in seeds) for log in logs if log.keys() >= {*seeds}}
+            assert point.success.k in counts, method

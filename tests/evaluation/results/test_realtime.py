@@ -78,7 +78,8 @@ def test_a_file_without_times_is_read_and_shows_none(tmp_path):
     old = load_realtime(write_json(tmp_path / "realtime.json", content))
     assert num_late_comparisons(old) == 0
     row = realtime_rows(old)[4]
-    assert (row["verdict"], row["mean time, steps"], row["time verdict"]) == ("non-inferior", "", "")
+    assert row["steps"] == "33.0"
+    assert not {"verdict", "mean time, steps", "time verdict"} & row.keys()
     write_json(tmp_path / "realtime.json", content | {"realtime": 2})
     with pytest.raises(ValueError, match=r"realtime.json: split: expected a value in version 2, got None"):
         load_realtime(tmp_path / "realtime.json")

@@ -207,27 +207,22 @@ def realtime_rows(results: Realtime) -> list[dict[str, str]]:
 
 def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection[str]) -> dict[str, str]:
     own = f"{1e3 * results.methods[name].own_latency_s:.3g} ms, its own" if point.own else ""
-    mean, baseline = point.restricted_mean_time, name == DENSE
-    survives = results.realtime != SCHEMA or "success" in lasting
     row = {
         "method": name,
         "delay, steps": str(point.delay_steps),
         "latency": own or f"{1e3 * point.delay_steps / results.control_freq:.0f} ms",
         "success": count_text(point.success),
-        "vs dense, points": "" if baseline else difference_text(point.paired_vs_dense),
-        "verdict": "baseline" if baseline else verdict_text(point.paired_vs_dense, survives),
-        "mean time, steps": "" if mean is None else f"{mean:.1f}",
-        "time vs dense": "",
-        "time verdict": "",
-        "steps": f"{point.episode_length:.1f}",
+        "vs dense, points": "" if name == DENSE else difference_text(point.paired_vs_dense),
     }
-    if baseline or point.time_vs_dense is None:
-        return row
-    time = {
-        "time vs dense": ratio_text(point.time_vs_dense),
-        "time verdict": verdict_text(point.time_vs_dense, "time" in lasting),
-    }
-    return row | time
+    if results.realtime != SCHEMA:
+        return row | {"steps": f"{point.episode_length:.1f}"}
+    row["verdict"] = (
+        "baseline" if name == DENSE else verdict_text(point.paired_vs_dense, "success" in lasting)
+    )
+    row["mean time, steps"] = f"{point.restricted_mean_time:.1f}"
+    row["time vs dense"] = "" if name == DENSE else ratio_text(point.time_vs_dense)
+    row["time verdict"] = "" if name == DENSE else verdict_text(point.time_vs_dense, "time" in lasting)
+    return row
 
 
 def format_realtime(results: Realtime) -> str:
