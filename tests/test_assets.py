@@ -117,3 +117,17 @@ def test_without_latency_tables_count_ordinary_episodes(path):
             ]
             counts = {sum(log[seed] for seed in seeds) for log in logs if log.keys() >= {*seeds}}
             assert point.success.k in counts, method
+
+
+@pytest.mark.parametrize("path", sorted(ASSETS.glob("vla/libero/results_*.json")), ids=name)
+def test_the_walk_through_libero_counts_its_episodes(path):
+    results = load_results(path)
+    for method, told in results.methods.items():
+        episodes = [*read_episodes(path.parent / results.task / f"{method}.jsonl")]
+        seeds = evaluation_seeds(results.split, results.seed, told.success.n)
+        assert sorted(episode.seed for episode in episodes) == [*seeds]
+        assert told.success.k == sum(episode.success for episode in episodes)
+        assert told.episode_length == sum(episode.length for episode in episodes) / len(episodes)
+        assert told.flops.per_query == pytest.approx(
+            sum(episode.flops_total for episode in episodes) / sum(episode.queries for episode in episodes)
+        )
