@@ -101,16 +101,15 @@ def test_a_compressed_log_is_gone_on_with(path, packed):
     log = EpisodeLog(path, {"method": "bac"})
     assert list(log.episodes) == [0, 1, 2]
     log.append(episode(7))
-    assert [found.seed for found in read_episodes(path)] == [
-        0,
-        1,
-        2,
-        7,
-    ]  # not those of the compressed one any more
+    seeds = [found.seed for found in read_episodes(path)]
+    assert seeds == [0, 1, 2, 7]  # not those of the compressed one any more
     assert packed.read_bytes() == before
-    path.unlink()
+
+
+def test_a_compressed_log_of_other_episodes_is_refused_and_left_packed(path, packed):
     with pytest.raises(ValueError, match=r"bac.jsonl: holds other episodes"):
         EpisodeLog(path, {"method": "sag"})
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(

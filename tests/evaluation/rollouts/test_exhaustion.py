@@ -1,5 +1,6 @@
 """Small episode logs that ask for much: each is read or refused within the limits of `tests.limits`."""
 
+import gzip
 import json
 from dataclasses import asdict
 
@@ -51,3 +52,14 @@ def write(tmp_path):
 def test_a_log_is_read_or_refused(write, text, message):
     found = check_limits(EpisodeLog, write(text))
     assert found is None if message is None else message in found
+
+
+@pytest.mark.parametrize("line", [b"0" * 1_000_000, b"{}\n" * 300_000], ids=["one line", "many"])
+def test_a_compressed_log_that_unfolds_into_more_is_refused(tmp_path, line):
+    packed = tmp_path / "dense.jsonl.gz"
+    with gzip.open(packed, "wb") as file:
+        for _ in range(1000):
+            file.write(line)
+    assert packed.stat().st_size < SMALL_FILE
+    assert "expected at most" in check_limits(EpisodeLog, tmp_path / "dense.jsonl")
+    assert not (tmp_path / "dense.jsonl").exists()

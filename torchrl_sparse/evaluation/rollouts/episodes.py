@@ -5,9 +5,10 @@ import json
 import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.storage.atomic import atomic_path
@@ -166,11 +167,9 @@ class EpisodeLog:
         self.identity = dict(identity or {})
         self.episodes: dict[int, EpisodeResult] = {}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path != (found := _lying(self.path)):
-            with atomic_path(self.path) as temporary:
-                temporary.write_bytes(b"".join(_lines(found)))
         header = asdict(_Header(1, self.identity))
-        content = self.path.read_bytes() if self.path.exists() else b""
+        lying = _lying(self.path)
+        content = _content(lying)
         if _line(header).encode().startswith(content):
             # A new log, or one killed while its header was written.
             self.path.write_bytes(b"")
@@ -188,7 +187,11 @@ class EpisodeLog:
         for number, line in enumerate(lines, start=2):
             episode = parse_json(line, EpisodeResult, f"{self.path}:{number}")
             self.episodes.setdefault(episode.seed, episode)
-        os.truncate(self.path, len(whole))
+        if lying != self.path:
+            with atomic_path(self.path) as temporary:
+                temporary.write_bytes(whole)
+        else:
+            os.truncate(self.path, len(whole))
 
     def append(self, episode: EpisodeResult) -> None:
         """Write one episode through to the disk.
@@ -256,13 +259,30 @@ def _lying(path: str | os.PathLike) -> Path:
     return packed if packed.is_file() and not path.exists() else path
 
 
+def _content(path: Path) -> bytes:
+    """Return what a log holds, nothing if there is none; of a compressed one no more than a file may hold."""
+    if path.suffix != ".gz":
+        return path.read_bytes() if path.exists() else b""
+    with _opened(path) as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"{path}: expected at most {MAX_BYTES} bytes unpacked, got more")
+    return content
+
+
 def _lines(path: Path) -> Iterator[bytes]:
     if not path.is_file():
         raise FileNotFoundError(f"expected a log of episodes {path}, got none")
+    with _opened(path) as file:
+        while line := file.readline(MAX_BYTES + 1):
+            yield line
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
         try:
-            while line := file.readline(MAX_BYTES + 1):
-                yield line
+            yield file
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise ValueError(
                 f"{path}: expected a whole compressed log, got one that is damaged: {error}"
