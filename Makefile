@@ -10,7 +10,7 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
-# Python compiles what it imports; compiling all that is installed takes minutes, and most of it is never imported.
+# Python compiles what it imports; most of what is installed is never imported.
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+from scipy.stats import binomtest
 
 from torchrl_sparse.evaluation.statistics.intervals import (
     episodes_needed,
@@ -19,6 +20,13 @@ from torchrl_sparse.evaluation.statistics.intervals import (
 )
 def test_wilson_published_examples(k, n, low, high):
     assert wilson_interval(k, n) == pytest.approx((low, high), abs=6e-5)
+
+
+@pytest.mark.parametrize("n", [1, 7, 1300])
+def test_wilson_is_that_of_scipy(n):
+    for k in {0, 1, n // 3, n}:
+        expected = binomtest(k, n).proportion_ci(confidence_level=0.9, method="wilson")
+        assert wilson_interval(k, n, 0.9) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 def test_wilson_is_never_empty_and_mirrors():

@@ -46,6 +46,7 @@ __all__ = [
 ]
 
 SCHEMA = 2
+_COLUMNS = ("verdict", "mean time, steps", "time vs dense", "time verdict", "correlation")
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class RealtimePoint:
             in version 1.
         time_vs_dense: its ratio to the dense policy's, compared like the success.
         p_values: of both verdicts; None of dense.
+        correlation_with_dense: of its times with those that it is compared with; None also where either never differs.
     """
 
     delay_steps: int
@@ -72,6 +74,7 @@ class RealtimePoint:
     restricted_mean_time: float | None = None
     time_vs_dense: TimeDifference | None = None
     p_values: PValues | None = None
+    correlation_with_dense: float | None = None
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,7 @@ def _point(
         compared["restricted_mean_time"],
         compared["time_vs_dense"],
         compared.get("p_values"),
+        compared["correlation_with_dense"],
     )
 
 
@@ -216,13 +220,20 @@ def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection
     }
     if results.realtime != SCHEMA:
         return row | {"steps": f"{point.episode_length:.1f}"}
-    row["verdict"] = (
-        "baseline" if name == DENSE else verdict_text(point.paired_vs_dense, "success" in lasting)
+    mean = f"{point.restricted_mean_time:.1f}"
+    told = ("baseline", mean, "", "", "") if name == DENSE else _told(point, mean, lasting)
+    return row | dict(zip(_COLUMNS, told, strict=True))
+
+
+def _told(point: RealtimePoint, mean: str, lasting: Collection[str]) -> tuple[str, ...]:
+    correlation = point.correlation_with_dense
+    return (
+        verdict_text(point.paired_vs_dense, "success" in lasting),
+        mean,
+        ratio_text(point.time_vs_dense),
+        verdict_text(point.time_vs_dense, "time" in lasting),
+        "" if correlation is None else f"{correlation:.2f}",
     )
-    row["mean time, steps"] = f"{point.restricted_mean_time:.1f}"
-    row["time vs dense"] = "" if name == DENSE else ratio_text(point.time_vs_dense)
-    row["time verdict"] = "" if name == DENSE else verdict_text(point.time_vs_dense, "time" in lasting)
-    return row
 
 
 def format_realtime(results: Realtime) -> str:
@@ -236,8 +247,16 @@ def realtime_note(results: Realtime) -> str:
     every = f"a query every {results.n_action_steps} steps, or as soon as the last one is answered"
     return (
         f"{results.task}, {results.control_freq:g} Hz; {every}; the world goes on meanwhile. Success with Wilson's "
-        "95 % interval, difference to dense with Tango's, mean time to success (the horizon where there is none) with its "
-        "ratio to dense's: at a method's own latency to dense at dense's own, else at the same latency; "
-        f"{num_late_comparisons(results)} comparisons, of which † does not survive Holm's correction. "
-        f"Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, {machine.date[:10]}."
+        "95 % interval, difference to dense with Tango's: at a method's own latency to dense at dense's own, else at the "
+        f"same latency. {_times_note(results)}Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, "
+        f"{machine.date[:10]}."
+    )
+
+
+def _times_note(results: Realtime) -> str:
+    if results.realtime != SCHEMA:
+        return ""
+    return (
+        f"Mean time to success, {results.episode_horizon} steps where there is none, is compared likewise. "
+        f"{num_late_comparisons(results)} comparisons; † marks a verdict that does not survive Holm's correction for them. "
     )
