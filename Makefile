@@ -10,11 +10,10 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
-# Python compiles what it imports; most of what is installed is never imported.
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --no-compile --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $@
 
 demo: install
