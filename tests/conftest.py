@@ -1,10 +1,12 @@
 """Ctrl-C as in a terminal for every run of the tests; where workers run, as a parameter of tests."""
 
 import gc
+import multiprocessing
 import signal
 
 import pytest
 
+from tests import forked  # noqa: F401  says what the server of `forked_workers` imports
 from torchrl_sparse.runtime.backends import backend_runtime
 
 
@@ -33,3 +35,15 @@ def backend(request):
     if request.param == "ray":
         request.getfixturevalue("ray_cluster")
     return request.param
+
+
+@pytest.fixture
+def forked_workers():
+    """TorchRL's worker processes as copies of one that has imported everything, where a test is of what they do once they run.
+
+    By default they are spawned, and each then imports PyTorch and TorchRL anew, five seconds of a core.
+    """
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)

@@ -50,6 +50,7 @@ def run(make_env, **kwargs):
     return rollout_episodes(FakeActor(), make_env, SEEDS, **kwargs)
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")
 @pytest.mark.parametrize(("workers", "num_envs"), [(1, 3), (2, 2)])
 def test_workers_find_what_this_process_finds(backend, workers, num_envs):
@@ -79,6 +80,7 @@ class ListeningActor(FakeActor):
         return super().forward(tensordict).set(keys.FLOPS, torch.tensor(told)[:, None])
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_words_reach_the_actor_in_every_worker(backend):
     episodes = rollout_episodes(ListeningActor(), SpeakingEnv, SEEDS, workers=2, num_envs=2, backend=backend)
     assert [episode.flops_total for episode in episodes] == [
@@ -87,6 +89,7 @@ def test_words_reach_the_actor_in_every_worker(backend):
     assert episodes == rollout_episodes(ListeningActor(), SpeakingEnv, SEEDS)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, backend):
     log, make_env = tmp_path / "episodes.jsonl", partial(MortalEnv, folder=tmp_path)
     said = {"process": r"exit code -9.*episodes are run anew", "ray": r"a Ray worker died: .*are run anew"}
@@ -154,6 +157,7 @@ class BrokenEnv(FakeEnv):
         raise ArithmeticError("no step")
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_what_a_worker_raises_while_it_starts_is_raised_and_not_tried_again(backend):
     kind = ArithmeticError if backend == "process" else sys.modules["ray"].exceptions.RayActorError
@@ -191,6 +195,7 @@ def test_workers_that_keep_dying_end_the_run():
     assert started == [[3, 8]] * 3
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_robosuite_gives_the_same_in_two_workers(backend):
     from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, make_env
 
