@@ -101,6 +101,7 @@ def test_collector_of_a_batch_of_environments():
         check(batch[row], seed)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_multi_sync_collector():
     collector = MultiSyncCollector(
         [partial(env, 3), partial(env, 4)],

@@ -155,6 +155,7 @@ def test_history_repeats_the_first_state_then_slides():
     assert td["is_init"].squeeze(-1).tolist() == [True, False, False, False]
 
 
+@pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
 def test_batched_environments_equal_single_ones(batched):
     env = batched(2, [partial(make_env, "Lift", action_mode="delta", seeds=[seed]) for seed in (8, 9)])

@@ -63,7 +63,7 @@ def test_tokens_are_pruned_by_history_and_speed(env):
     assert steps[keys.KEPT][HORIZON] == 2 * PER_CAMERA  # the next episode knows nothing either
 
 
-@pytest.mark.usefixtures("env")  # skips without a GL library
+@pytest.mark.usefixtures("env", "forked_workers")  # the first skips without a GL library
 def test_processes_collect_the_same_episodes():
     workers, frames = [partial(rendered, seed) for seed in (0, 1)], 2 * HORIZON
     collector = MultiSyncCollector(
