@@ -15,7 +15,7 @@ $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[dev]"
-	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # a package may hold files for a later Python
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib torchrl_sparse || true  # a package may hold files for a later Python
 	touch $@
 
 demo: install
