@@ -10,12 +10,12 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
-# Compiled on every core, which pip does on one; not at all would cost more, as often as a process imports torch.
+# Of what is installed a tenth is ever imported: Python compiles that when it first is, if it may write what it compiled.
+unexport PYTHONDONTWRITEBYTECODE
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[dev]"
-	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib torchrl_sparse || true  # a package may hold files for a later Python
 	touch $@
 
 demo: install
