@@ -6,6 +6,7 @@ from PIL import Image
 from tests.evaluation.synthetic import MACHINE
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.results.build import Terms
+from torchrl_sparse.evaluation.results.late_pairs import late_pair_rows
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
@@ -15,7 +16,7 @@ from torchrl_sparse.evaluation.results.realtime import (
     realtime_rows,
     save_realtime,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.storage.json import to_plain, write_json
 
@@ -66,6 +67,27 @@ def test_verdicts_count_and_those_of_chance_are_marked():
     assert (row["verdict"], row["time verdict"]) == ("non-inferior", "non-inferior")
     many = build(dense=DENSE, bac=FAST, **{f"m{i}": FAST for i in range(40)})
     assert all(row["verdict"] != "non-inferior" for row in realtime_rows(many))
+
+
+def test_late_points_are_compared_from_their_logs_wherever_those_lie(tmp_path):
+    path = save_realtime(build(dense=DENSE, bac=FAST), tmp_path / "realtime.json")
+    for log, played in {
+        tmp_path / "episodes" / "bac_delay1.jsonl": episodes(17, n=21, first=210_000),  # one of no point
+        tmp_path / "dense_delay3.jsonl": episodes(10, first=210_000),
+    }.items():
+        for episode in played:
+            EpisodeLog(log).append(episode)
+    (row,) = late_pair_rows(path, [("bac +1", "dense +3")])
+    own = realtime_rows(load_realtime(path))[4]
+    assert row["success"] == "17 : 10"
+    assert (row["difference, points"], row["time ratio"]) == (own["vs dense, points"], own["time vs dense"])
+    with pytest.raises(ValueError, match=r"pairs: expected two of dense \+1, .*, got bac \+0"):
+        late_pair_rows(path, [("bac +0", "dense +3")])
+    with pytest.raises(FileNotFoundError, match="bac_delay3"):
+        late_pair_rows(path, [("bac +3", "dense +3")])
+    path.write_text(path.read_text().replace('"realtime": 2', '"realtime": 1'))
+    with pytest.raises(ValueError, match="version 2, to compare pairs, got 1"):
+        late_pair_rows(path, [("bac +1", "dense +3")])
 
 
 def test_a_file_without_times_is_read_and_shows_none(tmp_path):

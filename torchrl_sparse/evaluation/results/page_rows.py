@@ -18,6 +18,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
     image_part_rows,
     load_engine_results,
 )
+from torchrl_sparse.evaluation.results.late_pairs import late_pair_rows
 from torchrl_sparse.evaluation.results.offline import agreement_rows, error_rows, load_offline
 from torchrl_sparse.evaluation.results.offline_agreement import load_agreement, together_rows
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
@@ -70,7 +71,8 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
             ``query*.json``, ``vla_latency*.json``, ``offline_agreement*.json``, ``offline_errors*.json``,
             ``carried_noise*.json`` or ``stopping*.json``.
         which: of the tables of the file, where it has several.
-        pairs: of methods to compare, from the episodes beside a ``results*.json``, instead of its rows.
+        pairs: of methods to compare, from the episodes beside a ``results*.json`` or those of a ``realtime*.json``, instead of
+            its rows.
 
     Raises:
         FileNotFoundError: if the file is not there.
@@ -165,6 +167,8 @@ def _vla(path: Path) -> dict[str, Table]:
 
 
 def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
+    if path.name.startswith("realtime"):
+        return _table(load_realtime(path).task, late_pair_rows(path, pairs))
     results = load_results(path)
     episodes = _episodes(path, results, {name for pair in pairs for name in pair})
     return _table(results.subject, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))

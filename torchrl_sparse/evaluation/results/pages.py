@@ -17,7 +17,8 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
   ``methods``, ``parts`` or ``products`` of a ``vla_latency.json``, ``success`` or ``time`` of an ``offline_agreement.json``, or
   ``headline`` or ``budgets`` of a ``results*.json`` with times, see `choices`, or its ``ways``, ``completed`` (parts of
   the task) or ``scores``, from the ``episodes/`` beside it.
-- ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it.
+- ``pairs="sag : bac | sag : ddim10"``: differences between methods of a ``results*.json``, from the ``episodes/`` beside it;
+  ``pairs="sag +1 : dense_noise +3"``: of a ``realtime*.json``, the first one step late and the second three.
 - Several files make one table that begins with a column ``task``; ``tasks="Lift | Can"`` gives other names, one per task.
 - ``policies="seed 0 | seed 1"`` tells several policies of one task apart: a name for each file, instead of the task's.
   Files of one policy have the same name.
@@ -182,7 +183,8 @@ def _rows(directive: _Directive, tables: Sequence[Table], root: Path) -> list[Ro
 def _family(tables: Sequence[Table], rows: Sequence[Row]) -> str:
     """Say how many verdicts are given together, below a table that shows any."""
     if "against" in rows[0]:
-        return f"{sum(len(table.rows) for table in tables)} pairs, not corrected for their number."
+        late = " `+1` is one step late." if " +" in rows[0]["against"] else ""
+        return f"{sum(len(table.rows) for table in tables)} pairs, not corrected for their number.{late}"
     numbers = [str(table.comparisons) for table in tables if table.comparisons]
     if not numbers or not {"verdict", "time verdict"} & set(rows[0]):
         return ""

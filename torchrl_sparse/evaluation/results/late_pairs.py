@@ -1,0 +1,63 @@
+"""Methods of a ``realtime.json`` against each other, each as late as it is: what its comparisons with dense leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.evaluation.results.build import Terms, compare_pair
+from torchrl_sparse.evaluation.results.parts import require
+from torchrl_sparse.evaluation.results.realtime import SCHEMA, Realtime, RealtimePoint, load_realtime
+from torchrl_sparse.evaluation.results.report import comparison_rows
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
+from torchrl_sparse.evaluation.statistics.sequential import Design
+
+__all__ = ["late_pair_rows"]
+
+
+def late_pair_rows(path: Path, pairs: Sequence[tuple[str, str]]) -> list[dict[str, str]]:
+    """Compare points of a ``realtime.json`` by success and time, from the logs in its folder or below it.
+
+    Args:
+        path: of the file.
+        pairs: of points, the first against the second. ``"ddim10 +1"`` is the method ddim10 one step late; one that is not
+            late at all has an ordinary log, and is compared in a ``results.json``.
+
+    Returns:
+        For each pair a row, column -> text.
+
+    Raises:
+        FileNotFoundError: if the file or a log is not there.
+        ValueError: if the file is of version 1, which keeps no horizon, or has no such late point.
+    """
+    results = load_realtime(path)
+    require(results.realtime == SCHEMA, "realtime", f"version {SCHEMA}, to compare pairs", results.realtime)
+    points = dict(_late(results))
+    if unknown := [point for pair in pairs for point in pair if point not in points]:
+        raise ValueError(f"pairs: expected two of {', '.join(points)}, got {', '.join(unknown)}")
+    played = {name: _episodes(path.parent, name, results, points) for pair in pairs for name in pair}
+    first = points[pairs[0][0]]
+    terms = Terms(
+        Design(first.success.n),
+        results.episode_horizon,
+        margin=first.paired_vs_dense.margin,
+        time_margin=first.time_vs_dense.margin,
+    )
+    return comparison_rows(
+        [compare_pair(ours, played[ours], other, played[other], terms) for ours, other in pairs]
+    )
+
+
+def _late(results: Realtime) -> Iterable[tuple[str, RealtimePoint]]:
+    for name, method in results.methods.items():
+        yield from ((f"{name} +{point.delay_steps}", point) for point in method.points if point.delay_steps)
+
+
+def _episodes(
+    folder: Path, name: str, results: Realtime, points: Mapping[str, RealtimePoint]
+) -> list[EpisodeResult]:
+    stem = name.replace(" +", "_delay")
+    log = next(folder.rglob(f"{stem}.jsonl*"), folder / f"{stem}.jsonl")
+    seeds = evaluation_seeds(results.split, results.seed, points[name].success.n)
+    return [episode for episode in read_episodes(log) if episode.seed in seeds]
