@@ -10,7 +10,7 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
-# Of what is installed a tenth is ever imported: Python compiles that when it first is, if it may write what it compiled.
+# Of what is installed the tests import a quarter: Python compiles that when it first does, if it may write.
 unexport PYTHONDONTWRITEBYTECODE
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
