@@ -1,4 +1,4 @@
-"""Ctrl-C as in a terminal for every run of the tests; where workers run, as a parameter of tests."""
+"""Ctrl-C as in a terminal for every run of the tests; where and how workers start, as parameters of tests."""
 
 import gc
 import multiprocessing

@@ -30,6 +30,10 @@ def late_pair_rows(path: Path, pairs: Sequence[tuple[str, str]]) -> list[dict[st
     Raises:
         FileNotFoundError: if the file or a log is not there.
         ValueError: if the file is of version 1, which keeps no horizon, or has no such late point.
+
+    >>> (row,) = late_pair_rows(Path("assets/lift/realtime.json"), [("ddim10 +1", "dense_noise +3")])
+    >>> row["success"], row["difference, points"]
+    ('100 : 89', '+11.0 [+6.3, +18.6]')
     """
     results = load_realtime(path)
     require(results.realtime == SCHEMA, "realtime", f"version {SCHEMA}, to compare pairs", results.realtime)
