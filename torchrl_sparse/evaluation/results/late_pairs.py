@@ -62,6 +62,6 @@ def _episodes(
     folder: Path, name: str, results: Realtime, points: Mapping[str, RealtimePoint]
 ) -> list[EpisodeResult]:
     stem = name.replace(" +", "_delay")
-    log = next(folder.rglob(f"{stem}.jsonl*"), folder / f"{stem}.jsonl")
+    log = min(folder.rglob(f"{stem}.jsonl*"), default=folder / f"{stem}.jsonl")
     seeds = evaluation_seeds(results.split, results.seed, points[name].success.n)
     return [episode for episode in read_episodes(log) if episode.seed in seeds]
