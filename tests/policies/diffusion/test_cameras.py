@@ -160,6 +160,17 @@ def test_cameras_round_where_the_engine_does(make_image_policy):
 
 
 @needs_packing
+def test_what_is_rounded_is_multiplied_on_any_processor(monkeypatch):
+    vision, frames = make_vision(), make_frames(3, 2)
+    with torch.no_grad():
+        exact, here = vision(frames), pack_vision(vision, frames=2, bf16=True)(frames)
+        monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+        without = pack_vision(vision, frames=2, bf16=True)(frames)
+    assert 0 < (without - exact).abs().mean() < 0.03 * exact.abs().mean()
+    torch.testing.assert_close(without, here, atol=0.015, rtol=0)
+
+
+@needs_packing
 def test_methods_of_one_policy_share_what_is_packed(make_image_policy):
     policy = make_image_policy()
     other = policy.with_noise(3)

@@ -2,7 +2,8 @@
 
 A few frames are little work for 22 million weights, and PyTorch lays each convolution's weights out anew in every call. Here
 that is done when the encoder is packed, and activations stay in the order that those weights are for (channels last). They can
-also be rounded to bfloat16, weights and activations, which changes the features and is faster still.
+also be rounded to bfloat16, weights and activations, which changes the features and is faster still where the processor
+multiplies bfloat16.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def pack_vision(vision: VisionEncoder, frames: int, *, bf16: bool = False) -> Vi
     Args:
         vision: one that `can_pack_vision`.
         frames: of each camera at a time that the weights are laid out for; any other number serves too.
-        bf16: whether the layers before the keypoints round weights and activations to bfloat16.
+        bf16: whether the layers before the keypoints round weights and activations to bfloat16; where the processor cannot
+            multiply these, they are multiplied as float32.
 
     Examples:
         >>> vision = VisionEncoder(["image"], width=16).eval()
@@ -62,17 +64,21 @@ class _PackedConvolution(nn.Module):
     def __init__(self, convolution: nn.Conv2d) -> None:
         super().__init__()
         self._convolution: nn.Conv2d | None = convolution
-        self._bias, self._dtype = convolution.bias, convolution.weight.dtype
+        self._dtype = convolution.weight.dtype
+        # oneDNN refuses to multiply bfloat16 where the processor has no instructions that it takes for that.
+        multiplies = self._dtype != torch.bfloat16 or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        self._multiplied = self._dtype if multiplies else torch.float32
+        self._bias = None if convolution.bias is None else convolution.bias.to(self._multiplied)
         sizes = convolution.padding, convolution.stride, convolution.dilation
         self._sizes = (*map(list, sizes), convolution.groups)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = x.to(self._dtype, memory_format=torch.channels_last)
+        x = x.to(self._dtype).to(self._multiplied, memory_format=torch.channels_last)
         if self._convolution is not None:
-            weight = self._convolution.weight.detach()
+            weight = self._convolution.weight.detach().to(self._multiplied)
             self._weight = torch.ops.mkldnn._reorder_convolution_weight(weight, *self._sizes, list(x.shape))
             self._convolution = None
         # "none": no activation behind it, a norm comes first
         return torch.ops.mkldnn._convolution_pointwise(
             x, self._weight, self._bias, *self._sizes, "none", [], ""
-        )
+        ).to(self._dtype)
