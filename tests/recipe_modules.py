@@ -28,10 +28,16 @@ def run(recipe, *options, expect=0):
     """Run a recipe as a program, and return what it printed; in a process that has imported before what recipes import."""
     with tempfile.TemporaryDirectory() as folder:
         printed = [Path(folder, name) for name in ("stdout", "stderr")]
-        process = FORKED.Process(target=_play, args=(recipe, options, printed))
-        process.start()
+        process = started(recipe, *options, printed=printed)
         process.join()
         return _checked(process.exitcode, "".join(path.read_text() for path in printed), expect)
+
+
+def started(recipe, *options, printed=(os.devnull, os.devnull)):
+    """Start a recipe as such a process and return that; what it prints goes into the two files."""
+    process = FORKED.Process(target=_play, args=(recipe, options, printed))
+    process.start()
+    return process
 
 
 def run_alone(recipe, *options, expect=0, environment=ENVIRONMENT):

@@ -149,10 +149,11 @@ def test_image_policies_go_the_same_way(work, demos):
 def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     out = work / "benchmark"
     options = (
-        "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7", f"methods=[{','.join(METHODS)}]",
-        "episodes=2", "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", "logger=wandb", f"out={out}",
+        "task=lift", f"policy={policy}", f"planners={schedules}", "num_updates=7",
+        "num_envs=2", "horizon=16", "latency_repeats=2", "probe_episodes=1", f"out={out}",
     )  # fmt: skip
-    output = run("benchmark", *options)
+    named = f"methods=[{','.join(METHODS)}]"
+    output = run("benchmark", *options, named, "episodes=2", "logger=wandb")
     results = load_results(out / "results.json")
     assert tuple(results.methods) == METHODS
     assert results.dense.success.n == 2
@@ -173,12 +174,14 @@ def test_benchmark_leaves_a_table_pictures_and_videos(work, policy, schedules):
     assert logged == {".png", ".json", *(Path(video).suffix for video in videos)}
 
     logs = {file.name: file.read_bytes() for file in (out / "episodes").iterdir()}
-    by_default = [option for option in options if not option.startswith("methods=")]
-    found = f"methods: {', '.join([*METHODS, 'bac_ddpm4'])}"  # which is a schedule beside the others
-    assert found in run("benchmark", *by_default, "methods=null", "episodes=3", "videos=[]", "logger=null")
+    run("benchmark", *options, "methods=[dense,bac]", "episodes=3", "videos=[]")
     assert load_results(out / "results.json").dense.success.n == 3
     for name, log in logs.items():  # a longer run reads the episodes of a shorter one instead of running them
-        assert (out / "episodes" / name).read_bytes().startswith(log)
+        again = (out / "episodes" / name).read_bytes()
+        assert again.startswith(log)
+        assert (again != log) == (name in ("dense.jsonl", "bac.jsonl"))
+    found = f"methods: {', '.join([*METHODS, 'bac_ddpm4'])}"  # which is a schedule beside the others
+    assert found in run("benchmark", *options, "methods=null", "videos=[magic]", expect=2)
 
 
 def test_realtime_leaves_a_curve_per_method(work, demos, policy):

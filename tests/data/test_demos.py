@@ -1,20 +1,17 @@
 """Collecting demonstrations: layout, labels, and survival of a kill at any moment."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
 
+from tests.forked import FORKED
+from tests.recipe_modules import run, started
 from torchrl_sparse import keys
-from torchrl_sparse.data import demos
+from torchrl_sparse.data import demo_workers, demos
 from torchrl_sparse.data.demonstrate import demonstrate
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.hdf5_writer import Episode
@@ -23,7 +20,6 @@ from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.rotations import pose_to_absolute
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "collect_demos.py"
 THREE = Collection("Lift", episodes=3, seed=50)
 
 
@@ -147,19 +143,17 @@ def test_an_episode_is_fixed_by_its_seed_alone(collected, env):
 
 def test_kill_9_and_run_again_gives_the_same_bytes(collected, tmp_path):
     path = tmp_path / "lift.h5"
-    command = [sys.executable, RECIPE, "task=Lift", "episodes=3", "seed=50", f"out={path}"]
-    environment = {**os.environ, "PYTHONPATH": str(RECIPE.parents[1]), "OMP_NUM_THREADS": "1"}
-    running = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    options = ("task=Lift", "episodes=3", "seed=50", f"out={path}")
+    running = started("collect_demos", *options)
     first = tmp_path / "lift.h5.parts" / "0000000050.h5"
     deadline = time.monotonic() + 120
-    while not first.exists() and time.monotonic() < deadline and running.poll() is None:
+    while not first.exists() and time.monotonic() < deadline and running.is_alive():
         time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    running.wait()
+    running.kill()
+    running.join()
     assert first.exists()
     assert not path.exists()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
-    assert "successes/attempts 3/3" in done.stdout
+    assert "successes/attempts 3/3" in run("collect_demos", *options)
     assert first.parent.exists() is False
     assert path.read_bytes() == collected[0].read_bytes()
 
@@ -278,6 +272,7 @@ def test_out_of_range_options_are_named(tmp_path, field, value):
 def test_two_workers_make_the_same_file(collected, tmp_path, backend, monkeypatch):
     path, summary = collected
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(demo_workers, "get_context", lambda _: FORKED)  # how they start is tested beside them
     assert collect("two.h5", THREE, workers=2, backend=backend) == summary
     assert (tmp_path / "two.h5").read_bytes() == path.read_bytes()
 

@@ -238,7 +238,7 @@ def test_a_ready_made_environment_is_made_anew_where_it_is_sent():
 @pytest.mark.parametrize(
     ("task", "mode"), [("Lift", "delta"), ("LiftMoving", "absolute"), ("TwoArmTransport", "delta")]
 )
-def test_what_substeps_are_spared_changes_no_bit_of_an_episode(task, mode):
+def test_what_resets_and_substeps_are_spared_changes_no_bit_of_an_episode(task, mode):
     spared, usual = (RobosuiteEnv(task, action_mode=mode, seeds=[7]) for _ in range(2))
     for name in ("_update_observables", "_load_robots"):
         delattr(usual.sim_env, name)  # back to the class's own, with which every substep does all
@@ -247,6 +247,8 @@ def test_what_substeps_are_spared_changes_no_bit_of_an_episode(task, mode):
     actions = [spared.action_spec.rand() for _ in range(12)]
     for one, other in zip(*(steps_of(env, actions) for env in (spared, usual)), strict=True):
         assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True))
+    compiled = [env.sim_env.robots[0].robot_model.mujoco_model is not None for env in (spared, usual)]
+    assert compiled == [False, True]
     spared.close()
     usual.close()
 

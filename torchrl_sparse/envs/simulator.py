@@ -5,15 +5,21 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import threading
 import types
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from torchrl_sparse.envs.tasks import RobosuiteTask
+
+_LOADING = (
+    threading.Lock()
+)  # what is spared one thread's simulator is a class's, and another's may end in between
 
 
 def import_robosuite():
@@ -48,20 +54,30 @@ def make_simulator(
     """
     robosuite = import_robosuite()
     task.register()
-    sim_env = robosuite.make(
-        task.name,
-        robots=["Panda"] * task.arms,
-        controller_configs=controller_config(absolute),
-        has_renderer=False,
-        has_offscreen_renderer=False,
-        use_camera_obs=False,
-        ignore_done=True,
-        reward_shaping=reward_shaping,
-        control_freq=control_freq,
-    )
+    with _robots_uncompiled():
+        sim_env = robosuite.make(
+            task.name,
+            robots=["Panda"] * task.arms,
+            controller_configs=controller_config(absolute),
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            ignore_done=True,
+            reward_shaping=reward_shaping,
+            control_freq=control_freq,
+        )
     _observe_when_asked(sim_env)
     _command_arms_alone(sim_env)
     return sim_env
+
+
+@contextmanager
+def _robots_uncompiled() -> Iterator[None]:
+    """Spare the simulator a model of each robot on its own, which it compiles whenever it loads robots and never reads."""
+    from robosuite.models.robots.robot_model import RobotModel
+
+    with _LOADING, patch.object(RobotModel, "set_mujoco_model", lambda *_: None):
+        yield
 
 
 def _observe_when_asked(sim_env: Any) -> None:
@@ -85,7 +101,8 @@ def _command_arms_alone(sim_env: Any) -> None:
     load, act = sim_env._load_robots, sim_env._pre_action
 
     def load_robots() -> None:  # at each reset, but for one to a state that was saved
-        load()
+        with _robots_uncompiled():
+            load()
         take_over()
 
     def take_over() -> None:

@@ -13,7 +13,7 @@ from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.evaluation.statistics.stopping import Population, claim_rates, pair_errors, savings
 
 CAN, LIFT = Population(0.87, 0.0, 104), Population(0.9975, 0.0, 29)
-DESIGN, TRIALS = Design(1300, looks=30), 2000
+DESIGN, TRIALS = Design(1300, looks=30), 1000
 
 
 @pytest.mark.parametrize(
