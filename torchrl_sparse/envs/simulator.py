@@ -17,9 +17,8 @@ import numpy as np
 
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
-_LOADING = (
-    threading.Lock()
-)  # what is spared one thread's simulator is a class's, and another's may end in between
+# One thread loads robots at a time: a method of their class is replaced meanwhile, and another would put back the replacement.
+_LOADING = threading.Lock()
 
 
 def import_robosuite():
