@@ -16,6 +16,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from recipes.studies.looking.following import episode_rows, planned_queries
 from torchrl_sparse.blocks.recall import RecallSchedule
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
@@ -24,7 +25,6 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.evaluation.statistics.looking import episode_rows, planned_queries
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import describe_differences, write_json

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from torchrl_sparse.evaluation.results.pages import find_pages
+from recipes.studies.pages.pages import find_pages
 
 ROOT = Path(__file__).parents[1]
 PAGES = {str(page.relative_to(ROOT)): page for page in find_pages(ROOT)}
@@ -21,8 +21,8 @@ def snippets(text):
 def commands(text):
     """Recipe and arguments of every command that runs one, with lines joined that end in a backslash."""
     for line in text.replace("\\\n", " ").split("\n"):
-        for match in re.finditer(r"python recipes/(\w+)\.py([^;`#]*)", line):
-            yield match[1], re.findall(r'"[^"]*"|[^\s"]+', match[2])
+        for match in re.finditer(r"python (?:recipes/(\w+)\.py|-m recipes\.(studies\.\w+))([^;`#]*)", line):
+            yield match[1] or match[2], re.findall(r'"[^"]*"|[^\s"]+', match[3])
 
 
 def links(text):

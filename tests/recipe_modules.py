@@ -17,8 +17,20 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true"}
 
 
+def script(recipe):
+    """Return the program of a recipe, or of a study named ``studies.NAME``."""
+    folder, _, study = recipe.rpartition(".")
+    return RECIPES / folder / study / "__main__.py" if folder else RECIPES / f"{recipe}.py"
+
+
+def options_file(recipe):
+    """Return the yaml of its options."""
+    path = script(recipe)
+    return path.with_name(f"{recipe.rpartition('.')[2]}.yaml")
+
+
 def load_recipe(name):
-    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, script(name))
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -42,7 +54,9 @@ def started(recipe, *options, printed=(os.devnull, os.devnull)):
 
 def run_alone(recipe, *options, expect=0, environment=ENVIRONMENT):
     """The same in an interpreter of its own."""
-    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *options]
+    path = script(recipe)
+    program = [str(path)] if path.parent == RECIPES else ["-m", f"recipes.{recipe}"]
+    command = [sys.executable, *program, *options]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     return _checked(done.returncode, done.stdout + done.stderr, expect)
 
@@ -53,9 +67,9 @@ def _play(recipe, options, printed):
     os.environ.update(ENVIRONMENT)
     multiprocessing.set_start_method(None, force=True)  # not that of the server
     torch.set_num_threads(1)
-    path = str(RECIPES / f"{recipe}.py")
+    path = str(script(recipe))
     sys.argv = [path, *options]
-    sys.path.insert(0, str(RECIPES))
+    sys.path[:0] = [str(RECIPES), str(RECIPES.parent)]
     runpy.run_path(path, run_name="__main__")
 
 

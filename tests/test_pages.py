@@ -10,12 +10,13 @@ import pytest
 import yaml
 from importlinter.api import read_configuration
 
+from recipes.studies.pages.pages import write_pages
 from tests.pages import PAGES, ROOT, anchors, commands, links, snippets, tables
+from tests.recipe_modules import options_file
 from tests.storage.published import openvla
 from tests.storage.published.checkpoints import LowDimPolicy, write_checkpoint
 from torchrl_sparse.blocks.engine import ENGINES
 from torchrl_sparse.envs.tasks import TASKS, find_task
-from torchrl_sparse.evaluation.results.pages import write_pages
 from torchrl_sparse.methods import METHODS, TOKEN_METHODS
 
 TABLES = {"METHODS": METHODS, "TOKEN_METHODS": TOKEN_METHODS, "TASKS": TASKS, "ENGINES": ENGINES}
@@ -30,7 +31,7 @@ def test_readme_is_short():
 
 def test_tables_on_pages_are_those_of_their_json():
     differ = write_pages(ROOT, dry=True)
-    assert not differ, f"python recipes/pages.py writes them: {', '.join(map(str, differ))}"
+    assert not differ, f"python -m recipes.studies.pages writes them: {', '.join(map(str, differ))}"
 
 
 @pytest.mark.parametrize("page", [name for name in PAGES if name.endswith("README.md")])
@@ -58,7 +59,7 @@ def test_links_lead_somewhere(page):
 @every_page
 def test_commands_name_recipes_and_their_options(page):
     for recipe, arguments in commands(PAGES[page].read_text()):
-        options = yaml.safe_load((ROOT / "recipes" / f"{recipe}.yaml").read_text())
+        options = yaml.safe_load(options_file(recipe).read_text())
         keys = [argument.strip('"').partition("=")[0] for argument in arguments if "=" in argument]
         for key in keys:
             assert key[0] in "+$" or _takes(options, key.split(".")), f"{recipe}: {key}"

@@ -19,7 +19,6 @@ from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation import load_results
-from torchrl_sparse.evaluation.results.offline import load_offline
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 
 METHODS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
@@ -42,10 +41,6 @@ def test_a_policy_is_evaluated(work, policy):
     assert "task: expected one that tells its ways, got 'Lift', which does not" in refused
 
 
-def load_tried(folder):
-    return json.loads((folder / "tried.json").read_text())["chains"]
-
-
 def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedules):
     options = (f"policy={policy}", f"demos={demos}")
     search = ("num_inference_steps=2", "strides=[20]", "targets.share=0.1")
@@ -56,19 +51,6 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert f"{path.stem}, error" in output
     assert "logsnr: [91, 41], error" in output
     assert [found["spacings"][name]["timesteps"] for name in ("leading", "logsnr")] == [[50, 0], [91, 41]]
-    chains = ("samplers=[ddim2,ddpm2_logsnr]", "draws=3", "targets.share=0.1", f"out={work}/noise")
-    assert "ddim2: correlation" in run("carried_noise", *options, *chains)
-    assert {path.suffix for path in (work / "noise").iterdir()} == {".json", ".png"}
-    search = ("lengths=[3]", "targets.share=0.1", "draws=3", "search.population=2", "random_masks=1")
-    searched = (*options, *search, f"out={work}/searched")
-    assert "searched.json: ddpm_" in run("search_schedule", *searched, "search.generations=1")
-    tried = load_tried(work / "searched")
-    output = run("search_schedule", *searched, "search.generations=2")
-    assert f"planners={work}/searched methods=[dense,searched]" in output
-    assert load_tried(work / "searched")[: len(tried)] == tried
-    assert CacheSchedule.from_pretrained(work / "searched" / "searched.json").num_inference_steps == 3
-    refused = run("search_schedule", *searched, "search.generations=2", "budget=1", expect=2)
-    assert "tried.json: made with other settings: budget is 1 here and 2 there" in refused
     # Chains that end at timestep 0: this policy has learned too little to end anywhere else.
     methods = ["dense", "ddpm4", "ddim4_eta0.5", "uniform2_ddpm4", "bac_ddpm4"]
     run(
@@ -80,22 +62,6 @@ def test_few_steps_are_found_and_benchmarked_by_name(work, demos, policy, schedu
     assert made["ddpm4"].flops.ratio_to_dense == made["ddim4_eta0.5"].flops.ratio_to_dense == 0.04
     assert 0.02 < made["bac_ddpm4"].flops.ratio_to_dense < 0.04
     assert made["uniform2_ddpm4"].flops.ratio_to_dense == pytest.approx(0.03, abs=0.002)
-    table = (f"results=[{work}/few/results.json]", f"planners={schedules}", "draws=3", "targets.share=0.1")
-    output = run("offline_errors", *options, *table, f"out={work}/offline")
-    assert "results.json, 4 methods: success" in output
-    assert {path.suffix for path in (work / "offline").iterdir()} == {".json", ".png"}
-    assert [*load_offline(work / "offline" / "offline_errors_Lift.json").errors] == methods
-    aggregate = f"aggregate=[{work}/offline/offline_errors_Lift.json]"
-    assert "few, 4 |" in run("offline_errors", aggregate, f"out={work}/together")
-    assert {path.suffix for path in (work / "together").iterdir()} == {".json", ".png"}
-    refused = run(
-        "offline_errors", *options, "results=[assets/can/weaker/results.json]", f"out={work}/no", expect=2
-    )
-    assert (
-        "results: assets/can/weaker/results.json: expected a table of Lift, got one of PickPlaceCan"
-        in refused
-    )
-    assert not (work / "no").exists()
 
 
 def test_a_policy_drives_and_is_trained_on_with_what_it_was_taught(work, demos, policy):
@@ -212,23 +178,6 @@ def test_pruners_are_trained_and_benchmarked_by_name(work, demos, policy, schedu
         "train_pruner", *training, f"out={work}/sag", "train.rate_range=[0.3,0.7]"
     )
     assert iio.imread(work / "sag" / "curves.png").std() > 5
-    looked = run(
-        "looking",
-        f"policy={policy}",
-        f"pruner={work}/sag/pruner",
-        "episodes=2",
-        "samples=2",
-        "oracle.attempts=2",
-        "oracle.draws=3",
-        f"out={work}/looking",
-    )
-    assert "own_minus_mean: " in looked
-    assert "query minus all: " in looked
-    refused = run("looking", f"policy={policy}", "oracle.attempts=1", f"out={work}/no", expect=2)
-    assert "oracle.attempts: expected 0 without a pruner, got 1" in refused
-    assert "reuse of own: cosine similarity" in looked
-    for name in ("looking_Lift.png", "reuse_sources_Lift.png"):
-        assert iio.imread(work / "looking" / name).std() > 5
     output = run(
         "train_pruner",
         "method=l2c",

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm, ttest_1samp, ttest_rel
 
+from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.synthetic import MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.benchmarks.rounds import play_rounds
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.acceleration import Played
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores

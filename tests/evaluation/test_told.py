@@ -2,10 +2,10 @@
 
 import pytest
 
+from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
 from torchrl_sparse.evaluation.results.completed import completed_rows
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.ways import way_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult

@@ -28,7 +28,6 @@ from .results import (
     format_table as format_table,
     load_results as load_results,
     save_results as save_results,
-    write_pages as write_pages,
 )
 from .rollouts import (
     EpisodeLog as EpisodeLog,

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, ask, episodes_of, fixed_times
 from torchrl_sparse import Sampler, Uniform
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.training.pruner.config import PrunerConfig
 

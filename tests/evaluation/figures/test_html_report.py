@@ -13,8 +13,8 @@ from tests.evaluation.results.test_realtime import DENSE, FAST, build
 from tests.recipe_modules import run
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
-from torchrl_sparse.evaluation.results.page_rows import KINDS, read_tables
 from torchrl_sparse.evaluation.results.realtime import save_realtime
+from torchrl_sparse.evaluation.results.result_files import READERS, read_tables
 from torchrl_sparse.evaluation.results.schema import save_results
 
 ASSETS = Path(__file__).parents[3] / "assets"
@@ -113,8 +113,6 @@ def test_pictures_belong_to_the_nearest_run(runs, tmp_path):
 
 def test_files_that_nothing_is_drawn_of_show_all_their_tables(tmp_path):
     names = ["engine/engine_images", "engine/query_quiet", "vla_smollm2/vla_latency", "statistics/aggregate"]
-    names += [f"statistics/{name}" for name in ("stopping", "carried_noise_Lift", "offline_agreement")]
-    names += ["statistics/offline_errors_Lift"]
     for name in names:
         copyfile(ASSETS / f"{name}.json", tmp_path / f"{Path(name).name}.json")
     assert write_report(tmp_path, tmp_path / "report.html") == {}
@@ -126,7 +124,7 @@ def test_files_that_nothing_is_drawn_of_show_all_their_tables(tmp_path):
 
 
 def test_every_file_of_results_that_is_shipped_can_be_shown():
-    shipped = [path for path in ASSETS.rglob("*.json") if path.name.startswith(KINDS)]
+    shipped = [path for path in ASSETS.rglob("*.json") if path.name.startswith((*READERS,))]
     assert {path.name.startswith("query") for path in shipped} == {True, False}
     for path in shipped:
         assert all(table.rows for table in read_tables(path).values()), path

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from recipes.studies.pages.page_rows import read_table
 from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, Sampler
 from torchrl_sparse.blocks.engine import native_available
@@ -24,7 +25,6 @@ from torchrl_sparse.evaluation.latency.profile import (
     tail,
     thread_seconds,
 )
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.query_report import QueryProfile
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer

@@ -8,6 +8,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from recipes.studies.pages.page_rows import read_table
 from tests.recipe_modules import RECIPES, load_recipe, run
 from torchrl_sparse.blocks.engine import TorchEngine, native_available
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
@@ -21,7 +22,6 @@ from torchrl_sparse.evaluation.results.engine_report import (
     load_engine_results,
     shape_results,
 )
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 ASSETS = RECIPES.parent / "assets"

@@ -3,10 +3,10 @@
 import pytest
 from PIL import Image
 
+from recipes.studies.pages.late_pairs import late_pair_rows
 from tests.evaluation.synthetic import MACHINE
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.results.build import Terms
-from torchrl_sparse.evaluation.results.late_pairs import late_pair_rows
 from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,

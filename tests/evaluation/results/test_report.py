@@ -3,10 +3,10 @@ from dataclasses import replace
 
 import pytest
 
+from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
-from torchrl_sparse.evaluation.results.page_rows import read_table
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
     Difference,

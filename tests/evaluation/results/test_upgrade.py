@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from recipes.studies.pages.pages import write_tables
 from tests.evaluation.synthetic import VERSION_1, make_results, make_runs
 from torchrl_sparse.evaluation.results.aggregate import (
     AggregateResults,
@@ -14,7 +15,6 @@ from torchrl_sparse.evaluation.results.aggregate import (
     save_aggregate,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
-from torchrl_sparse.evaluation.results.pages import write_tables
 from torchrl_sparse.evaluation.results.parts import Difference, TimeDifference
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from recipes.studies.simulate_stopping.simulation import Population
 from torchrl_sparse.evaluation.statistics.durations import (
     allowed_steps,
     correlation,
@@ -13,7 +14,6 @@ from torchrl_sparse.evaluation.statistics.durations import (
     time_verdict,
     time_z,
 )
-from torchrl_sparse.evaluation.statistics.stopping import Population
 
 CAN, LIFT = Population(0.87, 0.0, 104), Population(0.9975, 0.0, 29)
 POPULATIONS = {

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from torchrl_sparse.evaluation.results.stopping import load_stopping, simulate_stopping
+from recipes.studies.simulate_stopping.results import load_stopping, simulate_stopping
+from recipes.studies.simulate_stopping.simulation import Population, claim_rates, pair_errors, savings
 from torchrl_sparse.evaluation.statistics import sequential
 from torchrl_sparse.evaluation.statistics.durations import time_z
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, tango_z
 from torchrl_sparse.evaluation.statistics.sequential import Design
-from torchrl_sparse.evaluation.statistics.stopping import Population, claim_rates, pair_errors, savings
 
 CAN, LIFT = Population(0.87, 0.0, 104), Population(0.9975, 0.0, 29)
 DESIGN, TRIALS = Design(1300, looks=30), 1000

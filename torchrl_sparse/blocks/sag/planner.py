@@ -10,7 +10,7 @@ mask of a query before its first denoising step (Section 3.2 of the paper)::
 ``z`` does not depend on the observation: in evaluation mode it is computed once and kept, already multiplied by
 its half of the first MLP layer, so that a query costs the rest of the MLP alone. Pruned blocks reuse the latest
 output of their type ("one-for-all") in the paper and their own here by default: of the policies here, an output is
-nearly that of the same block one step before and little alike that of another layer (`recipes/looking.py` draws both). That
+nearly that of the same block one step before and little alike that of another layer (the study `looking` draws both). That
 is so on long chains; on three steps the paper's rule does better (``assets/README.md``).
 The paper does not publish sizes; those here keep the pruner below 0.3 % of
 the dense FLOPs. :mod:`torchrl_sparse.training.pruner.trainer` trains it.

@@ -23,9 +23,9 @@ from torchrl_sparse.evaluation.results.acceleration import (
     acceleration_rows,
     load_acceleration,
 )
-from torchrl_sparse.evaluation.results.page_rows import KINDS, Row, read_tables
 from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, realtime_note, realtime_rows
 from torchrl_sparse.evaluation.results.report import results_note, results_rows
+from torchrl_sparse.evaluation.results.result_files import READERS, Row, read_tables
 from torchrl_sparse.evaluation.results.schema import AnyResults, Results, load_results
 from torchrl_sparse.evaluation.results.tables import LEFT, select_columns
 from torchrl_sparse.storage.atomic import atomic_path
@@ -123,9 +123,9 @@ def find_runs(root: str | os.PathLike) -> list[Path]:
     Raises:
         FileNotFoundError: if there is none.
     """
-    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith(KINDS))
+    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith((*READERS,)))
     if not found:
-        others = (kind for kind in KINDS if kind not in _DRAWN)
+        others = (kind for kind in READERS if kind not in _DRAWN)
         raise FileNotFoundError(
             f"{root}: expected {' or '.join(f'{kind}.json' for kind in (*_DRAWN, *others))} in it or below it, got none"
         )

@@ -3,7 +3,6 @@ from .build import (
     Terms as Terms,
     build_results as build_results,
 )
-from .pages import write_pages as write_pages
 from .parts import PolicyShape as PolicyShape
 from .report import (
     format_pairs as format_pairs,

@@ -3,7 +3,7 @@
 A policy's answer is a distribution, of which a query shows one draw. Errors of single answers reward a chain that averages over
 several good ones; the energy score does not: it is least, in the mean, for answers that are distributed as what was
 demonstrated (Gneiting and Raftery, "Strictly Proper Scoring Rules, Prediction, and Estimation", JASA 2007, Eq. 21).
-Which of these numbers says how episodes will go is measured by ``recipes/offline_errors.py``.
+Which of these numbers says how episodes will go is measured by the study ``offline_errors``.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ that of a fixed number of episodes.
 STEP (arXiv:2503.10966), the anchor of sequential comparisons of policies, spends its error over a known cap too, for unpaired
 successes and the null of no difference; here episodes are paired, the null is a margin, and times are judged beside successes.
 N-SCORE (arXiv:2603.13616) bets on bounded scores and holds without a cap and without the normal approximation; a cap that is
-known makes the limits here closer. How the approximation holds with 30 looks is simulated (`recipes/simulate_stopping.py`).
+known makes the limits here closer. How the approximation holds with 30 looks is simulated (the study `simulate_stopping`).
 
 Dense may be played further than the methods that are compared with it, which makes their intervals closer
 (:mod:`torchrl_sparse.evaluation.statistics.overlap`). How far is part of the design: a number that followed from what was seen

@@ -1,0 +1,21 @@
+"""Write every table of results on the pages anew, from the committed JSON that it shows.
+
+python -m recipes.studies.pages
+"""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from recipes.studies.pages.pages import write_pages
+from torchrl_sparse.cli.recipe import recipe
+
+
+@recipe("pages", out=None)
+def main(config: DictConfig) -> None:
+    changed = write_pages(config.root)
+    print("\n".join(map(str, changed)) or "every table is as its JSON says")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""Rows of text from any file of results, the studies' too, with every column that a page may ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from recipes.studies.carried_noise.results import carried_noise_rows, load_carried_noise
+from recipes.studies.offline_errors.agreement import load_agreement, together_rows
+from recipes.studies.offline_errors.results import agreement_rows, error_rows, load_offline
+from recipes.studies.pages.late_pairs import late_pair_rows
+from recipes.studies.simulate_stopping.results import load_stopping, stopping_rows
+from torchrl_sparse.evaluation.results.completed import completed_rows, told_completed
+from torchrl_sparse.evaluation.results.realtime import load_realtime
+from torchrl_sparse.evaluation.results.report import pair_rows
+from torchrl_sparse.evaluation.results.result_files import READERS, Table, make_table, read_tables
+from torchrl_sparse.evaluation.results.schema import AnyResults, load_results
+from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
+from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
+
+__all__ = ["read_table"]
+
+
+def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, str]] = ()) -> Table:
+    """Read a file of results, whose kind its name begins with.
+
+    Args:
+        path: ``results*.json``, ``acceleration*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``,
+            ``query*.json``, ``vla_latency*.json``, ``offline_agreement*.json``, ``offline_errors*.json``,
+            ``carried_noise*.json`` or ``stopping*.json``.
+        which: of the tables of the file, where it has several.
+        pairs: of methods to compare, from the episodes beside a ``results*.json`` or those of a ``realtime*.json``, instead of
+            its rows.
+
+    Raises:
+        FileNotFoundError: if the file is not there.
+        ValueError: if its name is of no kind, the file is of no use, or it has no such table.
+    """
+    if not path.name.startswith((*_READERS,)):
+        names = ", ".join(f"{kind}*.json" for kind in _READERS)
+        raise ValueError(f"expected a file {names}, got {path.name}")
+    if pairs:
+        return _pairs(path, pairs)
+    if which in _OF_EPISODES:
+        return _told(path, which)
+    tables = read_tables(path, _READERS)
+    name = which or next(iter(tables))
+    if name not in tables:
+        raise ValueError(f"rows: expected one of {', '.join(tables)}, got {name!r}")
+    return tables[name]
+
+
+def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
+    if path.name.startswith("realtime"):
+        return make_table(load_realtime(path).task, late_pair_rows(path, pairs))
+    results = load_results(path)
+    episodes = _episodes(path, results, {name for pair in pairs for name in pair})
+    return make_table(results.subject, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
+
+
+def _told(path: Path, which: str) -> Table:
+    tell, rows, expected = _OF_EPISODES[which]
+    results = load_results(path)
+    told = tell(_episodes(path, results, results.methods))
+    if not told:
+        raise ValueError(f"rows: expected episodes of {results.task} {expected}, got none")
+    return make_table(results.subject, rows(told, results))
+
+
+def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
+    """Read the episodes of methods that are of these results, of each as many as they say; a log may have more."""
+    found = {}
+    for name in names:
+        seeds = range(results.first_seed, results.first_seed + results.methods[name].success.n)
+        log = read_episodes(path.parent / "episodes" / f"{name}.jsonl")
+        found[name] = [episode for episode in log if episode.seed in seeds]
+    return found
+
+
+def _agreement(path: Path) -> dict[str, Table]:
+    agreement = load_agreement(path)
+    return {
+        name: make_table(", ".join(agreement.methods), rows)
+        for name, rows in together_rows(agreement).items()
+    }
+
+
+def _offline(path: Path) -> dict[str, Table]:
+    results = load_offline(path)
+    rows = {"methods": error_rows(results), "agreement": agreement_rows(results)}
+    return {name: make_table(results.task, of_one) for name, of_one in rows.items()}
+
+
+def _carried_noise(path: Path) -> dict[str, Table]:
+    results = load_carried_noise(path)
+    return {"samplers": make_table(results.task, carried_noise_rows(results))}
+
+
+def _stopping(path: Path) -> dict[str, Table]:
+    results = load_stopping(path)
+    return {
+        name: make_table(f"{results.trials} trials", rows) for name, rows in stopping_rows(results).items()
+    }
+
+
+_OF_EPISODES: dict[str, tuple[Callable, Callable, str]] = {
+    "completed": (told_completed, lambda told, _: completed_rows(told), "that count its parts"),
+    "ways": (told_ways, lambda told, _: way_rows(told), "that tell their ways"),
+    "scores": (
+        told_scores,
+        lambda told, results: score_rows(told, results.dense.paired_vs_dense.margin),
+        "with scores",
+    ),
+}
+_READERS = READERS | {
+    "offline_agreement": _agreement,
+    "offline_errors": _offline,
+    "carried_noise": _carried_noise,
+    "stopping": _stopping,
+}

@@ -1,0 +1,37 @@
+"""Simulate benchmarks that stop when they are decided: how often they claim what is not so, and how many episodes they save.
+
+python -m recipes.studies.simulate_stopping out=assets/statistics
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from recipes.studies.simulate_stopping.figure import plot_stopping
+from recipes.studies.simulate_stopping.results import save_stopping, simulate_stopping
+from torchrl_sparse.cli.recipe import recipe
+
+
+@recipe("simulate_stopping")
+def main(config: DictConfig) -> None:
+    design = config.max_episodes, config.looks
+    results = simulate_stopping(*design, config.trials, config.seed, config.dense_episodes)
+    out = Path(config.out)
+    save_stopping(results, out / "stopping.json")
+    plot_stopping(results, out / "stopping.png")
+    for case in results.type_one:
+        print(f"{case.task}, {case.margin}: {100 * case.rate:.1f} % claimed at the margin")
+    for case in results.savings:
+        saved, decided = 100 * case.savings.saved, 100 * (case.savings.non_inferior + case.savings.inferior)
+        print(
+            f"{case.task}, {100 * case.difference:+.0f} points: {saved:.0f} % saved, {decided:.0f} % decided"
+        )
+    for pair in results.pairs:
+        at = f"{pair.task}, both {100 * pair.difference:+.0f} points"
+        print(f"{at}: {pair.success:.1%} of equal methods seem to differ in success, {pair.time:.1%} in time")
+
+
+if __name__ == "__main__":
+    main()
