@@ -11,20 +11,28 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 from omegaconf import DictConfig
 
-from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.recipe import check_command, recipe
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.sweep_files import (
+    find_program,
+    parameter_sets,
+    read_sweep,
+    trial_command,
+)
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
     ServedSweep,
-    find_program,
+    Trial,
     merge_trials,
-    read_sweep,
     run_trial,
     write_trials,
 )
@@ -36,13 +44,15 @@ RECIPES = Path(__file__).parent
 
 @recipe("sweep", out=None)
 def main(config: DictConfig) -> None:
-    settings = read_sweep(find_sweep(config.sweep))
-    out = Path(config.out).resolve()
+    file = find_sweep(config.sweep)
+    settings, out = read_sweep(file), Path(config.out).resolve()
     os.environ["SWEEP_OUT"] = str(out)
+    check_trials(file, settings)
     os.environ["PATH"] = (
         f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # `python` is this one
     )
     if config.mode == "online":
+        check_served(file, settings, config.project)
         run_online(settings, out, config)
         return
     with lock_output(out) as lock:
@@ -62,6 +72,42 @@ def find_sweep(name: str) -> Path:
     return path
 
 
+def check_trials(file: Path, settings: Mapping[str, Any]) -> None:
+    """Read every trial's command line as its recipe will, before the first one runs.
+
+    Raises:
+        ValueError: naming file, trial and option.
+    """
+    program = find_program(settings["program"])
+    with patch.dict(os.environ, WANDB_RUN_ID="trial"):  # which options may refer to
+        _check_trials(file, settings, program)
+
+
+def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> None:
+    for parameters in parameter_sets(settings):
+        words = trial_command(settings, parameters)
+        options = words[words.index(str(program)) + 1 :] if str(program) in words else []
+        try:
+            check_command(program, options)
+        except ValueError as error:
+            raise ValueError(f"{file}: trial {Trial('', dict(parameters)).label}: {error}") from error
+
+
+def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
+    """Refuse what W&B's own agent hands to a trial in words that Hydra does not read, or to another project."""
+    for name, entry in settings["parameters"].items():
+        values = (
+            [entry.get("value"), *entry.get("values", ())] if "value" in entry else entry.get("values", ())
+        )
+        if "parameters" in entry or any(value is None or isinstance(value, dict) for value in values):
+            raise ValueError(
+                f"{file}: {name}: expected numbers, words or lists with mode=online, whose agent writes null and mappings "
+                f"as Hydra does not read them, got {entry!r}"
+            )
+    if settings.get("project", project) != project:
+        raise ValueError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
+
+
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     """Create the sweep, unless an earlier call did, and run its trials here."""
     import wandb
@@ -69,11 +115,16 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
     path, made_for = out / "sweep.json", {"project": config.project, "sweep": sweep}
     if not path.exists():
         program = {"program": str(find_program(sweep["program"]))}
-        write_json(path, ServedSweep(wandb.sweep(sweep | program, project=config.project), made_for))
+        write_json(
+            path,
+            ServedSweep(
+                wandb.sweep(sweep | program, entity=sweep.get("entity"), project=config.project), made_for
+            ),
+        )
     note = read_json(path, ServedSweep)
     if differing := describe_differences(note.made_for, made_for):
         raise ValueError(f"out: {path} is of another sweep: {differing}; choose another out or move it away")
-    wandb.agent(note.sweep_id, project=config.project, count=config.count)
+    wandb.agent(note.sweep_id, entity=sweep.get("entity"), project=config.project, count=config.count)
 
 
 def summarise(sweep: LocalSweep) -> None:

@@ -127,7 +127,7 @@ def test_every_recipe_that_asks_a_policy_takes_a_device_and_refuses_a_missing_on
 
 def test_a_sweep_on_a_server_is_taken_up_by_itself_alone(fail, monkeypatch, tmp_path):
     created, joined = [], []
-    monkeypatch.setattr("wandb.sweep", lambda settings, project: created.append(settings) or "id1")
+    monkeypatch.setattr("wandb.sweep", lambda settings, project, entity: created.append(settings) or "id1")
     monkeypatch.setattr("wandb.agent", lambda sweep_id, **_: joined.append(sweep_id))
     options = "mode=online", f"out={tmp_path}/out"
     for _ in range(2):

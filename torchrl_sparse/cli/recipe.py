@@ -22,7 +22,7 @@ from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 
-__all__ = ["benchmark_command", "recipe"]
+__all__ = ["benchmark_command", "check_command", "recipe"]
 
 _FULL = "HYDRA_FULL_ERROR"
 _MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException, RunFailed)
@@ -68,6 +68,27 @@ def benchmark_command(task: str, policy: str, planners: str | Path, methods: Seq
     """
     names = ",".join(["dense", *methods])
     return f"next: torchrl-sparse benchmark task={task} policy={policy} planners={planners} methods=[{names}]"
+
+
+def check_command(program: Path, words: Sequence[str]) -> None:
+    """Read and check the options of another recipe's command line as that recipe would, without running it.
+
+    Args:
+        program: path of the recipe; a program without a yaml of options beside it is none, and nothing is checked.
+        words: of the command line, after the program.
+
+    Raises:
+        ValueError: in one line, for the first word that the recipe would refuse.
+    """
+    options = program.resolve().with_suffix(".yaml")
+    if not options.is_file():
+        return
+    try:
+        with hydra.initialize_config_dir(str(options.parent), version_base=None):
+            config = hydra.compose(options.stem, overrides=list(words))
+        check_options(options.stem, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except (ValueError, HydraException, OmegaConfBaseException) as error:
+        raise ValueError(_one_line(error)) from error
 
 
 def _help(purpose: str, options: Path) -> str:

@@ -79,13 +79,16 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     if parts > MAX_PARTS:  # of an empty list, two bytes, Python makes sixty
         raise ValueError(f"{where}: expected at most {MAX_PARTS} lists and objects, got {parts}")
     try:
-        from_json(data, allow_inf_nan=False)  # also where a field may hold anything
+        read = from_json(data, allow_inf_nan=False)  # also where a field may hold anything
     except ValueError as error:
         raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
     try:
-        return _adapter(kind).validate_json(b"[%b]" % data)[0]
+        made = _adapter(kind).validate_json(b"[%b]" % data)[0]
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+    if _names_numbers(kind):
+        _check_numbers(read, to_plain(made), where)
+    return made
 
 
 def check_plain(value: Any, kind: type[T], where: str) -> T:
@@ -102,9 +105,12 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     from pydantic import ValidationError
 
     try:
-        return _adapter(kind).validate_python((value,))[0]
+        made = _adapter(kind).validate_python((value,))[0]
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+    if _names_numbers(kind):
+        _check_numbers(value, to_plain(made), where)
+    return made
 
 
 def write_json(path: str | os.PathLike, value: Any) -> Path:
@@ -174,6 +180,36 @@ def _adapter(kind: Any) -> Any:
     # Of a dataclass alone pydantic takes no configuration; within a tuple the dataclass, and those in it, follow the tuple's.
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return TypeAdapter(tuple[kind], config=config)
+
+
+@cache
+def _names_numbers(kind: Any) -> bool:
+    """Tell whether a `Literal` of numbers is among the types that ``kind`` is made of."""
+    parts = [_adapter(kind).core_schema]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, dict) and part.get("type") == "literal":
+            if any(isinstance(value, int) for value in part["expected"]):
+                return True
+        elif isinstance(part, (dict, list, tuple)):
+            parts.extend(part.values() if isinstance(part, dict) else part)
+    return False
+
+
+def _check_numbers(read: Any, made: Any, where: str) -> None:
+    """Refuse ``true`` and ``1.0`` where a `Literal` names 1: they are equal, which is all that pydantic asks of those."""
+    if isinstance(made, dict) and isinstance(read, Mapping):
+        for key in made.keys() & read.keys():
+            _check_numbers(read[key], made[key], f"{where}: {key}" if ": " not in where else f"{where}.{key}")
+    elif isinstance(made, list) and isinstance(read, (list, tuple)):
+        for index, pair in enumerate(zip(read, made, strict=False)):
+            _check_numbers(*pair, f"{where}.{index}" if ": " in where else f"{where}: {index}")
+    elif (
+        isinstance(made, (bool, int))
+        and isinstance(read, (bool, int, float))
+        and type(read) is not type(made)
+    ):
+        raise ValueError(f"{where}: expected {made!r}, got {read!r}")
 
 
 def _check_size(size: int, where: str) -> None:

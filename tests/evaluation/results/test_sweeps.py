@@ -8,13 +8,8 @@ import yaml
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, evaluation_seeds
 from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.results.sweeps import (
-    LocalSweep,
-    Trial,
-    merge_trials,
-    read_sweep,
-    trial_command,
-)
+from torchrl_sparse.evaluation.results.sweep_files import read_sweep, trial_command
+from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 
 SWEEPS = sorted((Path(__file__).parents[3] / "recipes" / "sweeps").glob("*.yaml"))
@@ -38,7 +33,7 @@ def test_shipped_sweeps_are_of_wandbs_schema_and_have_eight_trials_in_any_folder
     sweep = LocalSweep(read_sweep(path), tmp_path / path.stem)
     seen = set()
     while trial := sweep.next_trial():
-        command = trial_command(sweep.config, trial)
+        command = trial_command(sweep.config, trial.parameters)
         assert command[:2] == ["/usr/bin/env", "python"]
         assert Path(command[2]).is_file()
         assert not any(word.startswith("${") for word in command)

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
+import numpy as np
 
 from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, load_results
+from torchrl_sparse.evaluation.results.sweep_files import sweep_engine, trial_command
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.atomic import atomic_path
@@ -23,16 +24,14 @@ __all__ = [
     "LocalSweep",
     "ServedSweep",
     "Trial",
-    "find_program",
     "merge_trials",
-    "read_sweep",
     "run_trial",
-    "trial_command",
     "write_trials",
 ]
 
 
-_METHODS = ("grid", "random", "bayes")
+_DEBUGGING = ("HYDRA_FULL_ERROR",)
+"""Variables of the sweep's own process that are none of its trials'."""
 
 
 @dataclass(frozen=True)
@@ -65,61 +64,24 @@ class ServedSweep:
     made_for: dict[str, Any]
 
 
-def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
-    """Read an ordinary sweep yaml and check it against wandb's own schema.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ImportError: without the ``sweeps`` package.
-        ValueError: if wandb would refuse it, or its trials would see test seeds; the message names the file and says why.
-    """
-    try:
-        config = yaml.safe_load(Path(path).read_bytes())
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of bytes that are no text, and of depth
-        reason = " ".join(str(error).split()) or "one that is too deep"
-        raise ValueError(f"{path}: expected a wandb sweep, got {reason}") from error
-    if not isinstance(config, dict):
-        raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
-    _check_entries(path, config)
-    check = _engine().config.cfg.schema_violations_from_proposed_config
-    try:
-        violations = check(config)
-    except ValueError as error:
-        violations = [str(error)]
-    if violations:
-        raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
-    split = config["parameters"].get("split", {})
-    if "split=test" in config.get("command", []) or "test" in [split.get("value"), *split.get("values", [])]:
-        raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
-    return config
-
-
-def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
-    """Refuse entries that a trial is made from and that are of no use, by name, which wandb's own messages lack."""
-    kinds = {"program": str, "method": str, "parameters": dict, "command": list}
-    for name, kind in kinds.items():
-        if not isinstance(config.get(name), kind):
-            raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
-    if config["method"] not in _METHODS:
-        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
-
-
 class LocalSweep:
     """The trials of a sweep in a folder. Chosen parameters are on disk before their trial begins, so a kill loses none.
 
     Args:
         config: the sweep.
         out: the folder; an earlier one of the same sweep is resumed, another of which no trial finished is forgotten.
-        count: trials in all; None runs until the engine has no more, as a grid does.
+        count: trials in all, of which there are no more than the sweep's ``run_cap``; None runs until the engine has no more,
+            as a grid does.
 
     Raises:
         ValueError: if the folder holds another sweep, or a search without end has no ``count``.
     """
 
     def __init__(self, config: Mapping[str, Any], out: str | os.PathLike, count: int | None = None) -> None:
-        self.config, self.out, self.count = dict(config), Path(out), count
+        caps = [cap for cap in (count, config.get("run_cap")) if cap is not None]
+        self.config, self.out, self.count = dict(config), Path(out), min(caps, default=None)
         self.trials: list[Trial] = []
-        if count is None and config["method"] != "grid":
+        if self.count is None and config["method"] != "grid":
             raise ValueError(f"count: expected a number of trials for method {config['method']!r}, got None")
         if self._file.exists():
             found = read_json(self._file, SavedSweep)
@@ -145,10 +107,10 @@ class LocalSweep:
                 return trial
         if self.count is not None and len(self.trials) >= self.count:
             return None
-        chosen = _engine().next_run(self.config, [self._as_run(trial) for trial in self.trials])
+        chosen = sweep_engine().next_run(self.config, [self._as_run(trial) for trial in self.trials])
         if chosen is None:
             return None
-        values = {name: entry["value"] for name, entry in chosen.config.items()}
+        values = {name: _plain(entry["value"]) for name, entry in chosen.config.items()}
         self.trials.append(Trial(f"{self.out.name}-{secrets.token_hex(4)}", values))
         self._save()
         return self.trials[-1]
@@ -172,7 +134,7 @@ class LocalSweep:
         write_json(self._file, SavedSweep(self.config, tuple(self.trials)))
 
     def _as_run(self, trial: Trial) -> Any:
-        engine, metrics = _engine(), trial_metrics(load_results(self.results_file(trial)))
+        engine, metrics = sweep_engine(), trial_metrics(load_results(self.results_file(trial)))
         return engine.SweepRun(
             name=trial.id,
             config={name: {"value": value} for name, value in trial.parameters.items()},
@@ -182,36 +144,6 @@ class LocalSweep:
         )
 
 
-def trial_command(config: Mapping[str, Any], trial: Trial) -> list[str]:
-    """Return the command line of a trial, as wandb's agent would run it."""
-    from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
-
-    arguments = create_sweep_command_args({"args": {k: {"value": v} for k, v in trial.parameters.items()}})
-    macros = {
-        "program": [str(find_program(config["program"]))],
-        "interpreter": ["python"],
-        "env": ["/usr/bin/env"],
-        **arguments,
-    }
-    return [
-        str(word)
-        for chunk in create_sweep_command(list(config["command"]))
-        for word in macros.get(chunk[2:-1] if chunk.startswith("${") else "", [chunk])
-    ]
-
-
-def find_program(name: str) -> Path:
-    """Return the path of a sweep's program: from here or, for ours, where the recipes lie, so that any folder will do.
-
-    >>> find_program("recipes/benchmark.py").name
-    'benchmark.py'
-    """
-    package = Path(__file__).parents[2]
-    # a wheel has the recipes in the package, a repository beside it
-    folders = Path(), package, package.parent
-    return next((folder / name for folder in folders if (folder / name).is_file()), Path(name))
-
-
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     """Run a trial to its end, as one offline run of wandb.
 
@@ -219,12 +151,13 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
         RunFailed: if its command fails.
         FileNotFoundError: if it left no results.
     """
-    environment = os.environ | {
+    inherited = {name: value for name, value in os.environ.items() if name not in _DEBUGGING}
+    environment = inherited | {
         "WANDB_MODE": "offline",
         "WANDB_RUN_ID": trial.id,
         "WANDB_RUN_GROUP": sweep.out.name,
     }
-    command = trial_command(sweep.config, trial)
+    command = trial_command(sweep.config, trial.parameters)
     code = subprocess.run(command, env=environment, pass_fds=[lock]).returncode
     if code:
         raise RunFailed(f"trial {trial.label}: expected exit code 0, got {code} from {' '.join(command)}")
@@ -268,12 +201,8 @@ def merge_trials(trials: Sequence[tuple[Trial, AnyResults]]) -> AnyResults:
     return replace(first, methods={DENSE: first.dense, **tested})
 
 
-def _engine() -> Any:
-    try:
-        import sweeps
-        import sweeps.config.cfg
-    except ImportError as error:
-        raise ImportError(
-            "a sweep without a server needs wandb's engine: pip install 'torchrl-sparse[sweeps]'"
-        ) from error
-    return sweeps
+def _plain(value: Any) -> Any:
+    """Return a draw of the engine as JSON has it: some of its distributions draw numbers of numpy."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return value.item() if isinstance(value, np.generic) else value

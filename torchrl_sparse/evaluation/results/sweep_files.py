@@ -1,0 +1,180 @@
+"""An ordinary wandb sweep file: what of it is honoured, and the command line that a trial's parameters make."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+__all__ = ["find_program", "hydra_word", "parameter_sets", "read_sweep", "sweep_engine", "trial_command"]
+
+_METHODS = ("grid", "random", "bayes")
+_HONOURED = (
+    "program", "method", "metric", "parameters", "command", "run_cap", "name", "description", "project", "entity",
+)  # fmt: skip
+_NOT_HONOURED = {
+    "early_terminate": "no early_terminate: a trial reports once, at its end, so nothing can be stopped",
+    "controller": "no controller: trials are chosen on this machine (mode=offline) or on W&B's server (mode=online)",
+}
+DEFAULT_COMMAND = (
+    "${env}", "python", "${program}", "${args_no_hyphens}", "split=development", "seed=50000", "logger=wandb",
+    "out=${oc.env:SWEEP_OUT}/${oc.env:WANDB_RUN_ID}", "dense_log=${oc.env:SWEEP_OUT}/dense.jsonl",
+)  # fmt: skip
+"""Command of a file that names none: wandb's own has hyphens, which Hydra refuses, and no folder of a trial's own."""
+
+
+def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
+    """Read an ordinary sweep yaml and check it against wandb's own schema.
+
+    A file without ``command`` gets `DEFAULT_COMMAND`.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ImportError: without the ``sweeps`` package.
+        ValueError: if wandb would refuse it, an entry would not be honoured, or its trials would see test seeds; the message
+            names file and entry.
+    """
+    try:
+        config = yaml.safe_load(Path(path).read_bytes())
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of bytes that are no text, and of depth
+        reason = " ".join(str(error).split()) or "one that is too deep"
+        raise ValueError(f"{path}: expected a wandb sweep, got {reason}") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
+    set_here = {f"{name}=" for name in config.get("parameters") or ()}
+    default = [word for word in DEFAULT_COMMAND if not word.startswith(tuple(set_here))]
+    config = {"command": default} | config
+    _check_entries(path, config)
+    check = sweep_engine().config.cfg.schema_violations_from_proposed_config
+    try:
+        violations = check(config)
+    except ValueError as error:
+        violations = [str(error)]
+    if violations:
+        raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
+    split = config["parameters"].get("split", {})
+    if "split=test" in config["command"] or "test" in [split.get("value"), *split.get("values", [])]:
+        raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
+    return config
+
+
+def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
+    """Refuse, by name, entries that are not honoured, and those that a trial is made from and that are of no use."""
+    for name, value in config.items():
+        if name not in _HONOURED:
+            expected = _NOT_HONOURED.get(name, f"some of {', '.join(_HONOURED)}")
+            raise ValueError(f"{path}: {name}: expected {expected}, got {value!r}")
+    kinds = {"program": str, "method": str, "parameters": dict, "command": list}
+    for name, kind in kinds.items():
+        if not isinstance(config.get(name), kind):
+            raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
+    if config["method"] not in _METHODS:
+        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
+
+
+def parameter_sets(config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the parameters that trials may have: all of a grid; else each value, or end of a range, beside others' first.
+
+    Args:
+        config: a sweep, see `read_sweep`.
+    """
+    values = {name: _values(entry) for name, entry in config["parameters"].items()}
+    if config["method"] == "grid":
+        yield from (dict(zip(values, chosen, strict=True)) for chosen in product(*values.values()))
+        return
+    first = {name: of_one[0] for name, of_one in values.items()}
+    yield from (first | {name: value} for name, of_one in values.items() for value in of_one)
+
+
+def _values(entry: Mapping[str, Any]) -> list[Any]:
+    if "parameters" in entry:
+        inner = {name: _values(nested) for name, nested in entry["parameters"].items()}
+        return [dict(zip(inner, chosen, strict=True)) for chosen in product(*inner.values())]
+    if "value" in entry:
+        return [entry["value"]]
+    if "values" in entry:
+        return list(entry["values"])
+    from sweeps.params import HyperParameter
+
+    parameter = HyperParameter("draw", dict(entry))
+    return [np.asarray(parameter.ppf(quantile)).item() for quantile in (0.001, 0.999)]
+
+
+def trial_command(config: Mapping[str, Any], parameters: Mapping[str, Any]) -> list[str]:
+    """Return the command line of a trial, as wandb's agent would run it.
+
+    Where that writes a value as Hydra does not read it (``None``, mappings), this writes what Hydra reads, see `hydra_word`.
+    """
+    from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
+
+    arguments = create_sweep_command_args({"args": {k: {"value": v} for k, v in parameters.items()}})
+    words = [f"{name}={hydra_word(value)}" for name, value in parameters.items()]
+    read_by_hydra = {
+        "args_no_hyphens": words,
+        "args_append_hydra": [f"+{word}" for word in words],
+        "args_override_hydra": [f"++{word}" for word in words],
+    }
+    macros = {
+        "program": [str(find_program(config["program"]))],
+        "interpreter": ["python"],
+        "env": ["/usr/bin/env"],
+        **arguments,
+        **read_by_hydra,
+    }
+    return [
+        str(word)
+        for chunk in create_sweep_command(list(config["command"]))
+        for word in macros.get(chunk[2:-1] if chunk.startswith("${") else "", [chunk])
+    ]
+
+
+def hydra_word(value: Any) -> str:
+    """Write a parameter as Hydra reads it on a command line. Text is left as it is: it may be a list, or a reference.
+
+    >>> hydra_word(None), hydra_word(True), hydra_word("[dense,bac]")
+    ('null', 'true', '[dense,bac]')
+    >>> hydra_word({"kind": "ddim", "timesteps": [87, 20]})
+    "{kind: 'ddim', timesteps: [87, 20]}"
+    """
+    return value if isinstance(value, str) else _written(value)
+
+
+def _written(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{name}: {_written(entry)}' for name, entry in value.items())}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_written, value))}]"
+    return "'" + value.replace("'", r"\'") + "'" if isinstance(value, str) else str(value)
+
+
+def find_program(name: str) -> Path:
+    """Return the path of a sweep's program: from here or, for ours, where the recipes lie, so that any folder will do.
+
+    >>> find_program("recipes/benchmark.py").name
+    'benchmark.py'
+    """
+    package = Path(__file__).parents[2]
+    # a wheel has the recipes in the package, a repository beside it
+    folders = Path(), package, package.parent
+    return next((folder / name for folder in folders if (folder / name).is_file()), Path(name))
+
+
+def sweep_engine() -> Any:
+    """Return wandb's own engine, the package ``sweeps``."""
+    try:
+        import sweeps
+        import sweeps.config.cfg
+    except ImportError as error:
+        raise ImportError(
+            "a sweep without a server needs wandb's engine: pip install 'torchrl-sparse[sweeps]'"
+        ) from error
+    return sweeps
