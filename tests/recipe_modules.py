@@ -19,14 +19,14 @@ ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WA
 
 def script(recipe):
     """Return the program of a recipe, or of a study named ``studies.NAME``."""
-    folder, _, study = recipe.rpartition(".")
-    return RECIPES / folder / study / "__main__.py" if folder else RECIPES / f"{recipe}.py"
+    if str(recipe).startswith("studies."):
+        return RECIPES / "studies" / recipe.removeprefix("studies.") / "__main__.py"
+    return RECIPES / f"{recipe}.py"
 
 
 def options_file(recipe):
     """Return the yaml of its options."""
-    path = script(recipe)
-    return path.with_name(f"{recipe.rpartition('.')[2]}.yaml")
+    return script(recipe).with_name(f"{recipe.removeprefix('studies.')}.yaml")
 
 
 def load_recipe(name):

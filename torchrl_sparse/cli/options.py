@@ -53,9 +53,7 @@ OPTIONS: dict[str, Any] = {
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,
-    "results": Words,
     **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending", "budgets"), list[Word]),
-    "root": Word,
     "title": str,
     "sweep": Word,
     "project": Word,
@@ -93,15 +91,10 @@ OPTIONS: dict[str, Any] = {
     "draws": Annotated[int, Field(ge=3)],
     "sampler": Section | None,
     "profile_query.sampler": Word,
-    **dict.fromkeys(
-        ("base", "equal_to", "calibrate_bac.sampler", "looking.sampler", "looking.pruner"), Word | None
-    ),
-    **dict.fromkeys(("candidates", "search", "oracle"), Section),
+    **dict.fromkeys(("base", "equal_to", "calibrate_bac.sampler"), Word | None),
+    **dict.fromkeys(("candidates",), Section),
     **dict.fromkeys(("accelerate_policy.candidates.samplers", "searched", "cached", "rounded"), list[Word]),
-    **dict.fromkeys(("updates", "intervals", "lengths"), list[Count]),
-    "played": Literal["pruned", "dense"],
-    "fitness": Literal["energy_score", "error"],
-    "search_schedule.cost": Literal["seconds", "flops"],
+    **dict.fromkeys(("updates", "intervals"), list[Count]),
     "specprune": Section,
     "options": Section,
     "alpha": Positive,
@@ -114,9 +107,9 @@ OPTIONS: dict[str, Any] = {
     "episodes": Count,
     "split": Literal["development", "test"],
     "accelerate_policy.episodes": Whole,
-    **dict.fromkeys(("finalists", "windows", "population", "generations", "random_masks"), Count),
+    **dict.fromkeys(("finalists", "windows"), Count),
     "until": Literal["episodes", "decided"],
-    **dict.fromkeys(("max_episodes", "looks", "trials", "eval_episodes", "probe_episodes"), Count),
+    **dict.fromkeys(("max_episodes", "looks", "eval_episodes", "probe_episodes"), Count),
     "dense_episodes": Count | None,
     "seed": Whole,
     "evaluate_policy.seed": Whole | None,
@@ -134,9 +127,8 @@ OPTIONS: dict[str, Any] = {
     "keep_failures": bool,
     "mixing": Annotated[float, Field(ge=0, le=1)],
     # what is measured, and how
-    **dict.fromkeys(("margin", "time_margin", "held_out"), Between),
+    **dict.fromkeys(("margin", "time_margin"), Between),
     "budget_ms": Positive | None,
-    "budget": Positive,
     "latency_repeats": Count,
     "repeats": Count,
     **dict.fromkeys(("quick", "compile", "instruction_sets", "calibrated"), bool),
@@ -242,12 +234,13 @@ OmegaConf.register_new_resolver(
 )
 
 
-def check_options(recipe: str, options: Mapping[str, Any]) -> None:
+def check_options(recipe: str, options: Mapping[str, Any], table: Mapping[str, Any] = OPTIONS) -> None:
     """Raise ValueError, ``key: expected …, got …``, for the first option that is not as `OPTIONS` says.
 
     Args:
         recipe: name of the recipe.
         options: its options, nested as in its yaml.
+        table: option -> type, as `OPTIONS`.
 
     >>> check_options("benchmark", {"task": "lift", "episodes": 0})
     Traceback (most recent call last):
@@ -255,7 +248,7 @@ def check_options(recipe: str, options: Mapping[str, Any]) -> None:
     ValueError: episodes: expected greater than or equal to 1, got 0
     """
     for key, value in _leaves(recipe, options):
-        kind = _lookup(recipe, key)
+        kind = _lookup(recipe, key, table)
         if kind is None:
             raise ValueError(f"{key}: expected no such option, got {value!r}")
         check_plain(value, kind, key)
@@ -269,9 +262,9 @@ def _leaves(recipe: str, options: Mapping[str, Any], prefix: str = "") -> Iterat
             yield from _leaves(recipe, value, f"{key}.")
 
 
-def _lookup(recipe: str, key: str) -> Any:
+def _lookup(recipe: str, key: str, table: Mapping[str, Any]) -> Any:
     word = key.rpartition(".")[2]
-    return OPTIONS.get(f"{recipe}.{key}", OPTIONS.get(word))
+    return table.get(f"{recipe}.{key}", table.get(word))
 
 
 def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> None:

@@ -6,19 +6,19 @@ import gc
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import hydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.cli.options import OPTIONS, check_options
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 
@@ -28,7 +28,12 @@ _FULL = "HYDRA_FULL_ERROR"
 _MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException, RunFailed)
 
 
-def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Callable:
+def recipe(
+    name: str,
+    *,
+    out: Literal["folder", "file"] | None = "folder",
+    options: Mapping[str, Any] | None = None,
+) -> Callable:
     """Make a function of its options a recipe: a program whose options are those in ``name.yaml`` beside its file.
 
     A mistake (`ValueError`, `OSError`, `ImportError`, or one that Hydra finds) or `RunFailed` ends it with exit code 2 and one
@@ -38,7 +43,9 @@ def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Ca
     Args:
         name: of the recipe.
         out: what the option ``out`` names; None if the recipe has none, or locks it itself.
+        options: option -> type, of options that no recipe of the library has, as a study's own.
     """
+    table = OPTIONS | dict(options or {})
 
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         folder = Path(inspect.getfile(main)).resolve().parent
@@ -51,7 +58,9 @@ def recipe(name: str, *, out: Literal["folder", "file"] | None = "folder") -> Ca
             gc.freeze()  # robosuite collects garbage whenever a simulator closes, and what was imported never is any
             with _one_line_errors():
                 for config in _read_options(folder, name):
-                    check_options(name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+                    check_options(
+                        name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True), table
+                    )
                     with lock_output(config.out, is_file=out == "file") if out else nullcontext():
                         main(config)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 import torch
 from omegaconf import DictConfig
@@ -22,6 +23,7 @@ from recipes.studies.looking.following import looking
 from recipes.studies.looking.oracle import oracle
 from recipes.studies.looking.reuse_sources import reuse_sources
 from torchrl_sparse.blocks.sag.planner import SAGPruner
+from torchrl_sparse.cli.options import Section, Whole, Word
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
@@ -33,8 +35,17 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import published_shape
 
+OPTIONS = {
+    "looking.sampler": Word | None,
+    "looking.pruner": Word | None,
+    "played": Literal["pruned", "dense"],
+    "oracle": Section,
+    "oracle.attempts": Whole,
+}
+"""Options that no recipe of the library has -> type."""
 
-@recipe("looking")
+
+@recipe("looking", options=OPTIONS)
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

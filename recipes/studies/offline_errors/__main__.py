@@ -29,6 +29,7 @@ from recipes.studies.offline_errors.results import (
     outcomes,
     save_offline,
 )
+from torchrl_sparse.cli.options import Word, Words
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
@@ -41,8 +42,11 @@ from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
+OPTIONS = {"results": Words, "aggregate": list[Word]}
+"""Options that no recipe of the library has -> type."""
 
-@recipe("offline_errors")
+
+@recipe("offline_errors", options=OPTIONS)
 def main(config: DictConfig) -> None:
     if config.aggregate:
         put_together(config.aggregate, Path(config.out))

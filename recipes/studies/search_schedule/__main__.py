@@ -11,11 +11,13 @@ from __future__ import annotations
 from dataclasses import asdict
 from math import ceil
 from pathlib import Path
+from typing import Literal
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from torchrl_sparse.cli.options import Between, Count, Positive, Section
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate.schedules import (
@@ -38,7 +40,21 @@ from torchrl_sparse.training.pruner.loss import block_weights
 NAME = "searched"
 
 
-@recipe("search_schedule")
+OPTIONS = {
+    "held_out": Between,
+    "lengths": list[Count],
+    "budget": Positive,
+    "cost": Literal["seconds", "flops"],
+    "fitness": Literal["energy_score", "error"],
+    "search": Section,
+    "population": Count,
+    "generations": Count,
+    "random_masks": Count,
+}
+"""Options that no recipe of the library has -> type."""
+
+
+@recipe("search_schedule", options=OPTIONS)
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

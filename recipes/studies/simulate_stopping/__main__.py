@@ -11,10 +11,14 @@ from omegaconf import DictConfig
 
 from recipes.studies.simulate_stopping.figure import plot_stopping
 from recipes.studies.simulate_stopping.results import save_stopping, simulate_stopping
+from torchrl_sparse.cli.options import Count
 from torchrl_sparse.cli.recipe import recipe
 
+OPTIONS = {"max_episodes": Count, "looks": Count, "trials": Count}
+"""Options that no recipe of the library has -> type."""
 
-@recipe("simulate_stopping")
+
+@recipe("simulate_stopping", options=OPTIONS)
 def main(config: DictConfig) -> None:
     design = config.max_episodes, config.looks
     results = simulate_stopping(*design, config.trials, config.seed, config.dense_episodes)
