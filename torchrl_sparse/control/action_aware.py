@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import COUNT, FLAG, Entry
 from torchrl_sparse.control.chunk_executor import action_at
 from torchrl_sparse.storage.json import parse_json
 
@@ -214,6 +215,10 @@ class ActionAwareController(TensorDictModuleBase):
         self.in_keys = [keys.IS_INIT, *source, keys.FINE, keys.CONTROL_STEP]
         self.out_keys = [keys.FINE, keys.REPLAN, budget_key, keys.CONTROL_STEP]
         self._budget_key = budget_key
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        return {keys.FINE: FLAG, keys.CONTROL_STEP: COUNT}
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

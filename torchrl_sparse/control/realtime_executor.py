@@ -13,11 +13,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import COUNT, Entry
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 from torchrl_sparse.rotations import quaternion_to_rot6d
@@ -82,6 +83,13 @@ class RealtimeExecutor(ChunkExecutor):
     @property
     def out_keys(self):
         return [*super().out_keys, keys.DELAY, keys.MEANWHILE]
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        meanwhile = {} if chunk is None else {keys.MEANWHILE: chunk}
+        return {**super().carried(chunk), keys.DELAY: COUNT, **meanwhile}
+
+    def _carried_keys(self) -> list[NestedKey]:
+        return [*super()._carried_keys(), keys.DELAY, keys.MEANWHILE]
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         awaited = self._age(tensordict) + 1 < self._delay(tensordict)
