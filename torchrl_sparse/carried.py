@@ -89,8 +89,8 @@ def refuse(key: NestedKey, lost: Tensor) -> None:
     if lost.any():
         raise ValueError(
             f"{key}: expected what the step before left, since 'is_init' is False, got none in {int(lost.sum())} of "
-            f"{lost.numel()} rows: the environment drops it; add TransformedEnv(env, actor.make_tensordict_primer()), or "
-            "auto_register_policy_transforms=True to the collector"
+            f"{lost.numel()} rows: the environment drops it; wrap it, TransformedEnv(env, actor.make_tensordict_primer()), "
+            "or have the collector do so, auto_register_policy_transforms=True"
         )
 
 

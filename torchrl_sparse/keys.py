@@ -4,6 +4,10 @@ Names that TorchRL's own vision-language-action schema (`torchrl.data.vla`) alre
 batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps,
 N the visual tokens.
 
+What a step leaves to the next in keys, a `ChunkExecutor` declares to the environment: by ``make_tensordict_primer``, which
+collectors append with ``auto_register_policy_transforms=True``. For TorchRL's `ParallelEnv` hands back the keys of its spec
+alone. Others that an actor writes may be dropped; they are then 0 until the next query.
+
 ================================  =====================  ===========================================================
 constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================

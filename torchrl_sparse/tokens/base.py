@@ -13,7 +13,8 @@
 environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
 `begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
 in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a query,
-such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key; it is missing at the first query of all, and
+such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key, and `TokenPruner.carried` says what it looks
+like to an environment; it is missing or 0 at the first query of all, and
 rows with ``"is_init"`` start afresh.
 """
 
