@@ -35,10 +35,11 @@ __all__ = [
 
 
 class Entry(NamedTuple):
-    """What one environment has under a key."""
+    """What one environment has under a key, and what where an episode begins."""
 
     shape: tuple[int, ...]
     dtype: torch.dtype = torch.float32
+    begin: float = 0.0
 
 
 COUNT, FLAG = Entry((1,), torch.int64), Entry((1,), torch.bool)
@@ -60,15 +61,16 @@ def carried_entries(module: nn.Module, chunk: Entry | None) -> dict[NestedKey, E
 
 
 def make_primer(entries: Mapping[NestedKey, Entry]) -> TensorDictPrimer:
-    """Return the transform that gives keys their place in a spec, of any batch size; they are 0 where an episode begins."""
+    """Return the transform that gives keys their place in a spec, of environments of any batch size."""
     from torchrl.data import Categorical, Composite, Unbounded  # which a robot's loop does without
     from torchrl.envs import TensorDictPrimer
 
     specs = Composite()
-    for key, (shape, dtype) in entries.items():
+    for key, (shape, dtype, _) in entries.items():
         truth = dtype == torch.bool
         specs[key] = Categorical(2, shape, dtype=dtype) if truth else Unbounded(shape, dtype=dtype)
-    return TensorDictPrimer(specs, expand_specs=True)
+    begin = {key: entry.begin for key, entry in entries.items()}
+    return TensorDictPrimer(specs, default_value=begin, expand_specs=True)
 
 
 def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going_on: Tensor) -> None:

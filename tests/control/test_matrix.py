@@ -26,7 +26,7 @@ MAKERS = [partial(make_count_env, seeds) for seeds in SEEDS]
 BATCH, BATCHES = 22, 2  # 11 steps of each environment: no multiple of a chunk
 BY_RULE = {"chunks": expected_chunks, "realtime": expected_realtime, "ensemble": expected_ensemble}
 SENT = ("chunks", "realtime", "recall", "tokens")  # through collectors that start processes for each of them
-ALIVE = []  # collectors, which close their environment as they are forgotten, also when they were told not to
+ALIVE = []  # collectors, which close their environment as they are forgotten, even if told not to
 COMPARED = [keys.EPISODE_SEED, keys.EPISODE_STEP, keys.ACTION, keys.QUERIED]
 OPTIONS = {"frames_per_batch": BATCH, "auto_register_policy_transforms": True}
 
@@ -88,6 +88,7 @@ def test_collector_of_a_batch_of_environments(env, name):
 def test_rollout(env, name):
     actor = EXECUTORS[name]()
     primed = TransformedEnv(env, actor.make_tensordict_primer())
+    ALIVE.append(primed)
     steps = primed.rollout(BATCH, actor, break_when_any_done=False)
     assert check(name, steps) == {0, 1, 2, 3}
 

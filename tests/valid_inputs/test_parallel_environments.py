@@ -5,13 +5,13 @@ from functools import partial
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import step_mdp
 
-from tests.counting import SEEDS, counting_policy, make_count_env
+from tests.counting import EXECUTORS, SEEDS, counting_policy, make_count_env
 from torchrl_sparse import ActionAwareController, ChunkExecutor, keys
 
-ALIVE = []  # collectors, which close their environment as they are forgotten, also when they were told not to
+ALIVE = []  # collectors, which close their environment as they are forgotten, even if told not to
 DROPPED = (
     r"\('control', '{}'\): expected what the step before left.*none in {} of 2 rows.*make_tensordict_primer"
 )
@@ -61,10 +61,32 @@ def test_what_a_controller_carries_is_missed_too():
         actor(td)
 
 
-def test_rows_that_begin_need_nothing(env):
-    """Right: an episode begins without state, whatever the other rows have."""
+@pytest.mark.parametrize("name", ["chunks", "realtime", "tokens"])
+def test_an_actor_that_takes_over_in_mid_episode_asks_at_once(name):
+    """Right: no step of its own was before, so nothing is lost (`init_random_frames` of TorchRL's collectors)."""
+    env, actor = make_count_env([2]), EXECUTORS[name]()
+    options = {"frames_per_batch": 7, "total_frames": 14, "auto_register_policy_transforms": True}
+    collector = Collector(env, actor, init_random_frames=7, **options)
+    _, steps = (data.clone() for data in collector)
+    collector.shutdown()
+    assert steps[keys.EPISODE_STEP].flatten()[0] == 7
+    assert steps[keys.QUERIED].flatten()[0]
+    if name == "chunks":
+        assert steps[keys.ACTION].flatten().tolist() == [70, 71, 72, 0, 1, 2, 3]
+    if name == "realtime":  # holds until its first answer is there
+        assert steps[keys.ACTION].flatten().tolist() == [-3, -3, 72, -3, -3, 2, 3]
+
+
+def test_a_loop_that_keeps_the_specs_keys_alone_keeps_the_state():
+    """Right: what is in the spec is in ``("next", ...)``; without a primer it is gone, which is an error."""
     actor = ChunkExecutor(counting_policy(4), 4)
-    primed = TransformedEnv(env, actor.make_tensordict_primer())
-    begun = actor(primed.reset())
-    assert begun[keys.QUERIED].all()
-    assert begun[keys.AGE].eq(0).all()
+    bare, primed = make_count_env([0]), make_count_env([0])
+    primed.append_transform(actor.make_tensordict_primer((4, 1)))
+    td, played = primed.reset(), []
+    for _ in range(6):
+        td = primed.step(actor(td))
+        played.append(td[keys.ACTION].item())
+        td = step_mdp(td, keep_other=False)
+    assert played == [0, 1, 2, 3, 40, 41]
+    with pytest.raises(ValueError, match=DROPPED.format("age", 1).replace("2 rows", "1 rows")):
+        actor(step_mdp(bare.step(actor(bare.reset())), keep_other=False))

@@ -272,6 +272,6 @@ class ActionAwareController(TensorDictModuleBase):
                 f"{keys.CHUNK}: on='commanded' expects delta actions, {_DELTA_DIM} numbers per arm, got "
                 f"{chunk.shape[-1]}; use on='measured'"
             )
-        age = keys.recall(tensordict, keys.AGE, (1,), 0)
+        age = keys.recall(tensordict, keys.AGE, (1,), 0).clamp(min=0)
         used_up = age + 1 >= (self.chunk_steps or chunk.shape[-2])
         return action_at(chunk, age).unflatten(-1, (-1, _DELTA_DIM))[..., :6], used_up

@@ -28,11 +28,8 @@ from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
-_HANDED_OVER = (
-    keys.LAST_CHUNK,
-    keys.ELAPSED,
-    keys.DELAY,
-)  # to policies that read them; no environment writes them
+# To policies that read them; no environment writes them.
+_HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 
 
 class ChunkExecutor(TensorDictModuleBase):
@@ -104,13 +101,8 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def out_keys(self):
-        own = [
-            keys.ACTION,
-            keys.AGE,
-            keys.UNTIL_QUERY,
-            keys.QUERIED,
-            *([keys.CHOSEN] if self.selector is not None else ()),
-        ]
+        chosen = [keys.CHOSEN] if self.selector is not None else []
+        own = [keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
         return _unique(
             [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
         )
@@ -153,20 +145,24 @@ class ChunkExecutor(TensorDictModuleBase):
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
         """Return what the executor itself carries, see :mod:`torchrl_sparse.carried`."""
-        return {keys.AGE: COUNT, keys.QUERIED: FLAG, **({} if chunk is None else {keys.CHUNK: chunk})}
+        age = COUNT._replace(begin=-1)
+        return {keys.AGE: age, keys.QUERIED: FLAG, **({} if chunk is None else {keys.CHUNK: chunk})}
 
     def _carried_keys(self) -> list[NestedKey]:
         controlled = [] if self.controller is None else carried_keys(self.controller)
-        return [keys.AGE, keys.QUERIED, keys.CHUNK, *controlled, *carried_keys(self.policy)]
+        return [keys.QUERIED, keys.CHUNK, *controlled, *carried_keys(self.policy)]
 
     def _check_carried(self, tensordict: TensorDictBase) -> None:
         """Raise ValueError where an environment dropped what the step before left, or hands zeros back in its place."""
         going_on = ~keys.read(tensordict, keys.IS_INIT)
         if not going_on.any():
             return
+        check_carried(tensordict, [keys.AGE], going_on)
+        age = self._age(tensordict)
+        going_on = going_on & (age >= 0)  # another policy may have begun the episode
         check_carried(tensordict, self._carried_keys(), going_on)
         asked = keys.recall(tensordict, keys.QUERIED, (1,), False)
-        refuse(keys.AGE, going_on & ~asked & (self._age(tensordict) == 0))
+        refuse(keys.AGE, going_on & ~asked & (age == 0))
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode of `act`: the next observation is its first.
@@ -204,8 +200,12 @@ class ChunkExecutor(TensorDictModuleBase):
         return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
-        return keys.recall(tensordict, keys.AGE, (1,), self.n_action_steps)
+        """Return i64 [*B, 1]: position in the chunk of the action served last; -1 where there is no chunk yet."""
+        return keys.recall(tensordict, keys.AGE, (1,), -1)
+
+    def _begins(self, tensordict: TensorDictBase) -> Tensor:
+        """Return bool [*B, 1]: samples without a chunk of this episode."""
+        return keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) < 0)
 
     def _until_query(self, age: Tensor) -> Tensor:
         """Return i64 [*B, 1]: steps from the next observation to the next query at the earliest."""
@@ -214,7 +214,7 @@ class ChunkExecutor(TensorDictModuleBase):
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """Return bool [*B, 1]: samples without an action to serve."""
-        due = keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
+        due = self._begins(tensordict) | (self._age(tensordict) + 1 >= self.n_action_steps)
         replan = tensordict.get(keys.REPLAN, None)
         return due if replan is None else due | replan
 
@@ -237,16 +237,16 @@ class ChunkExecutor(TensorDictModuleBase):
 
     def _complete(self, tensordict: TensorDictBase) -> None:
         """Write zeros for what an environment did not hand back of the last answer, so that each step has the same keys."""
-        for key, (shape, dtype) in self._written.items():
+        for key, entry in self._written.items():
             if tensordict.get(key, None) is None:
-                tensordict.set(key, keys.recall(tensordict, key, shape, 0, dtype))
+                tensordict.set(key, keys.recall(tensordict, key, entry.shape, 0, entry.dtype))
 
     def _request(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return all that the policy reads, with the last chunk if it asks for that."""
         wanted = [*self.policy.in_keys, *(self.selector.in_keys if self.selector is not None else ())]
         request = tensordict.select(*wanted, strict=False)
         if keys.ELAPSED in wanted:
-            elapsed = keys.recall(tensordict, keys.AGE, (1,), -1) + 1
+            elapsed = self._age(tensordict) + 1
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
         if keys.LAST_CHUNK in wanted:
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))

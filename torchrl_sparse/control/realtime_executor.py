@@ -93,10 +93,10 @@ class RealtimeExecutor(ChunkExecutor):
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         awaited = self._age(tensordict) + 1 < self._delay(tensordict)
-        return keys.read(tensordict, keys.IS_INIT) | (super()._due(tensordict) & ~awaited)
+        return self._begins(tensordict) | (super()._due(tensordict) & ~awaited)
 
     def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
-        before = tensordict.select(keys.CHUNK, keys.AGE, strict=False)
+        before = tensordict.select(keys.IS_INIT, keys.CHUNK, keys.AGE, strict=False)
         super()._query(tensordict, due)
         tensordict.set(keys.DELAY, torch.where(due, self._new_delay(tensordict), self._delay(tensordict)))
         meanwhile = self._play_on(tensordict, before)
@@ -127,7 +127,7 @@ class RealtimeExecutor(ChunkExecutor):
         old = keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0)
         left = shift_chunk(old, self._age(before) + 1, chunk.shape[-2])
         hold = self.hold(tensordict.select(*self.hold.in_keys)).get(keys.HOLD)
-        return torch.where(tensordict.get(keys.IS_INIT)[..., None], hold[..., None, :], left)
+        return torch.where(self._begins(before)[..., None], hold[..., None, :], left)
 
     def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
         there = age >= self._delay(tensordict)
