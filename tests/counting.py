@@ -111,10 +111,10 @@ def sampling_policy():
 def diffusion_policy(**parts):
     torch.manual_seed(0)
     network = TransformerForDiffusion(
-        input_dim=1, output_dim=1, horizon=8, n_obs_steps=2, cond_dim=2, n_layer=2, n_emb=16
+        input_dim=1, output_dim=1, horizon=8, n_obs_steps=2, cond_dim=2, n_layer=1, n_emb=16
     )
     normalizer = Normalizer(torch.full((2,), 0.1), torch.zeros(2), torch.ones(1), torch.zeros(1))
-    policy = DiffusionPolicy(network, normalizer, sampler=Sampler("ddpm", 4), engine="reference")
+    policy = DiffusionPolicy(network, normalizer, sampler=Sampler("ddpm", 3), engine="reference")
     for name, part in parts.items():
         setattr(policy, name, part)
     return policy

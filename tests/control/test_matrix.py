@@ -3,7 +3,6 @@
 Episodes have different lengths, so that environments are reset one by one, and batches end within chunks.
 """
 
-import importlib.util
 from functools import cache, partial
 
 import pytest
@@ -106,19 +105,9 @@ def test_collectors_of_processes(kind, name):
     collect(name, kind(MAKERS, EXECUTORS[name](), total_frames=-1, **OPTIONS))
 
 
-@pytest.fixture(scope="module")
-def ray():
-    if importlib.util.find_spec("ray") is None:
-        pytest.skip("ray is not installed")
-    import ray
-
-    ray.init(num_cpus=2, include_dashboard=False)
-    yield ray
-    ray.shutdown()
-
-
+@pytest.mark.usefixtures("ray_cluster")  # skips without Ray
 @pytest.mark.parametrize("name", SENT)
-def test_ray_collector(ray, name):
+def test_ray_collector(name):
     from torchrl.collectors.distributed import RayCollector
 
     collector = RayCollector(
