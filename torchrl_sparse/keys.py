@@ -4,6 +4,10 @@ Names that TorchRL's own vision-language-action schema (`torchrl.data.vla`) alre
 batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps,
 N the visual tokens.
 
+What a step leaves to the next in keys, a `ChunkExecutor` declares to the environment: by ``make_tensordict_primer``, which
+collectors append with ``auto_register_policy_transforms=True``. For TorchRL's `ParallelEnv` hands back the keys of its spec
+alone. Others that an actor writes may be dropped; they are then 0 until the next query.
+
 ================================  =====================  ===========================================================
 constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================
@@ -49,7 +53,8 @@ constant                          shape, dtype           meaning
 ``REPLAN``                        bool [*B, 1]           a controller asks for a new query now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
-``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query
+``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query, -1
+                                                         before an episode's first
 ``UNTIL_QUERY``                   i64 [*B, 1]            steps from the next observation to the next query at the earliest; 0
                                                          where the next observation may be asked about
 ``QUERIED``                       bool [*B, 1]           this step called the policy

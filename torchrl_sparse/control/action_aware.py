@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import COUNT, FLAG, Entry
 from torchrl_sparse.control.chunk_executor import action_at
 from torchrl_sparse.storage.json import parse_json
 
@@ -215,6 +216,10 @@ class ActionAwareController(TensorDictModuleBase):
         self.out_keys = [keys.FINE, keys.REPLAN, budget_key, keys.CONTROL_STEP]
         self._budget_key = budget_key
 
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        return {keys.FINE: FLAG, keys.CONTROL_STEP: COUNT}
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         init = keys.read(tensordict, keys.IS_INIT)
@@ -267,6 +272,6 @@ class ActionAwareController(TensorDictModuleBase):
                 f"{keys.CHUNK}: on='commanded' expects delta actions, {_DELTA_DIM} numbers per arm, got "
                 f"{chunk.shape[-1]}; use on='measured'"
             )
-        age = keys.recall(tensordict, keys.AGE, (1,), 0)
+        age = keys.recall(tensordict, keys.AGE, (1,), 0).clamp(min=0)
         used_up = age + 1 >= (self.chunk_steps or chunk.shape[-2])
         return action_at(chunk, age).unflatten(-1, (-1, _DELTA_DIM))[..., :6], used_up

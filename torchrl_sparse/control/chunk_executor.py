@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import (
+    COUNT,
+    FLAG,
+    Entry,
+    carried_entries,
+    carried_keys,
+    check_carried,
+    make_primer,
+    refuse,
+)
 from torchrl_sparse.control.plain import PlainLoop
 from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 
-_HANDED_OVER = (
-    keys.LAST_CHUNK,
-    keys.ELAPSED,
-    keys.DELAY,
-)  # to policies that read them; no environment writes them
+if TYPE_CHECKING:
+    from torchrl.envs import TensorDictPrimer
+
+# To policies that read them; no environment writes them.
+_HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 
 
 class ChunkExecutor(TensorDictModuleBase):
@@ -30,8 +41,9 @@ class ChunkExecutor(TensorDictModuleBase):
     zero on served steps. A policy that reads ``("control", "last_chunk")`` and ``("control", "elapsed")`` is handed the chunk
     of the query before and the steps since, 0 where an episode begins.
 
-    All state is in keys, so it follows the environment through any collector. Without TorchRL around it, `reset` and `act` are
-    a robot's loop; the state of that one episode is kept here.
+    All state is in keys, so it follows the environment through any collector that gives them a place in its spec:
+    ``auto_register_policy_transforms=True`` does, or `make_tensordict_primer` by hand. Without TorchRL around it, `reset` and
+    `act` are a robot's loop; the state of that one episode is kept here.
 
     Args:
         policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
@@ -43,7 +55,7 @@ class ChunkExecutor(TensorDictModuleBase):
             :mod:`torchrl_sparse.control.selectors`; with ``num_samples`` above 1, and only then.
 
     Raises:
-        ValueError: if a chunk is shorter than ``n_action_steps``.
+        ValueError: if a chunk is shorter than ``n_action_steps``, or the environment drops what a step leaves to the next.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -75,6 +87,7 @@ class ChunkExecutor(TensorDictModuleBase):
         self.n_action_steps = n_action_steps
         self.controller, self.num_samples, self.selector = controller, num_samples, selector
         self._plain: PlainLoop | None = None
+        self._written: dict[NestedKey, Entry] = {}  # what the policy writes for one environment
 
     @property
     def in_keys(self):
@@ -88,30 +101,68 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def out_keys(self):
-        own = [
-            keys.ACTION,
-            keys.AGE,
-            keys.UNTIL_QUERY,
-            keys.QUERIED,
-            *([keys.CHOSEN] if self.selector is not None else ()),
-        ]
+        chosen = [keys.CHOSEN] if self.selector is not None else []
+        own = [keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
         return _unique(
             [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
         )
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_carried(tensordict)
         if self.controller is not None:
             tensordict = self.controller(tensordict)
         due = self._due(tensordict)
         if due.any():
             self._query(tensordict, due)
+        else:
+            self._complete(tensordict)
         self._clear_costs(tensordict, ~due)
         age = torch.where(due, 0, self._age(tensordict) + 1)
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.UNTIL_QUERY, self._until_query(age))
         tensordict.set(keys.QUERIED, due)
         return tensordict.set(keys.ACTION, self._serve(tensordict, age))
+
+    def make_tensordict_primer(self, chunk_shape: tuple[int, int] | None = None) -> TensorDictPrimer:
+        """Return the transform that gives all that this actor carries from step to step its place in an environment's spec.
+
+        Collectors find and append it by themselves with ``auto_register_policy_transforms=True``.
+
+        Args:
+            chunk_shape: (n, A) of a chunk, where the policy has no ``chunk_shape``, as the library's own do. Where nobody says
+                it, the chunk is left out; it then follows any environment but a bare `ParallelEnv` or one within it.
+
+        Examples:
+            >>> from tensordict.nn import TensorDictModule
+            >>> from torchrl_sparse import DiffusionPolicy
+            >>> actor = ChunkExecutor(DiffusionPolicy.from_pretrained("assets/lift"))
+            >>> sorted(actor.make_tensordict_primer().primers.keys(True, True))
+            [('control', 'age'), ('control', 'queried'), ('vla_action', 'chunk')]
+        """
+        shape = getattr(self.policy, "chunk_shape", None) if chunk_shape is None else chunk_shape
+        return make_primer(carried_entries(self, None if shape is None else Entry(tuple(shape))))
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what the executor itself carries, see :mod:`torchrl_sparse.carried`."""
+        age = COUNT._replace(begin=-1)
+        return {keys.AGE: age, keys.QUERIED: FLAG, **({} if chunk is None else {keys.CHUNK: chunk})}
+
+    def _carried_keys(self) -> list[NestedKey]:
+        controlled = [] if self.controller is None else carried_keys(self.controller)
+        return [keys.QUERIED, keys.CHUNK, *controlled, *carried_keys(self.policy)]
+
+    def _check_carried(self, tensordict: TensorDictBase) -> None:
+        """Raise ValueError where an environment dropped what the step before left, or hands zeros back in its place."""
+        going_on = ~keys.read(tensordict, keys.IS_INIT)
+        if not going_on.any():
+            return
+        check_carried(tensordict, [keys.AGE], going_on)
+        age = self._age(tensordict)
+        going_on = going_on & (age >= 0)  # another policy may have begun the episode
+        check_carried(tensordict, self._carried_keys(), going_on)
+        asked = keys.recall(tensordict, keys.QUERIED, (1,), False)
+        refuse(keys.AGE, going_on & ~asked & (age == 0))
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode of `act`: the next observation is its first.
@@ -149,8 +200,12 @@ class ChunkExecutor(TensorDictModuleBase):
         return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: position in the chunk of the action served last; past the end where there is no chunk yet."""
-        return keys.recall(tensordict, keys.AGE, (1,), self.n_action_steps)
+        """Return i64 [*B, 1]: position in the chunk of the action served last; -1 where there is no chunk yet."""
+        return keys.recall(tensordict, keys.AGE, (1,), -1)
+
+    def _begins(self, tensordict: TensorDictBase) -> Tensor:
+        """Return bool [*B, 1]: samples without a chunk of this episode."""
+        return keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) < 0)
 
     def _until_query(self, age: Tensor) -> Tensor:
         """Return i64 [*B, 1]: steps from the next observation to the next query at the earliest."""
@@ -159,7 +214,7 @@ class ChunkExecutor(TensorDictModuleBase):
 
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         """Return bool [*B, 1]: samples without an action to serve."""
-        due = keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) + 1 >= self.n_action_steps)
+        due = self._begins(tensordict) | (self._age(tensordict) + 1 >= self.n_action_steps)
         replan = tensordict.get(keys.REPLAN, None)
         return due if replan is None else due | replan
 
@@ -176,15 +231,22 @@ class ChunkExecutor(TensorDictModuleBase):
         for key in (*self.policy.out_keys, *([keys.CHOSEN] if self.selector is not None else ())):
             value = answer.get(key)
             shape = value.shape[1:]
+            self._written[key] = Entry(tuple(shape), value.dtype)
             whole = keys.recall(tensordict, key, shape, 0, value.dtype).reshape(-1, *shape)
             tensordict.set(key, whole.index_copy(0, index, value).reshape(*batch, *shape))
+
+    def _complete(self, tensordict: TensorDictBase) -> None:
+        """Write zeros for what an environment did not hand back of the last answer, so that each step has the same keys."""
+        for key, entry in self._written.items():
+            if tensordict.get(key, None) is None:
+                tensordict.set(key, keys.recall(tensordict, key, entry.shape, 0, entry.dtype))
 
     def _request(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return all that the policy reads, with the last chunk if it asks for that."""
         wanted = [*self.policy.in_keys, *(self.selector.in_keys if self.selector is not None else ())]
         request = tensordict.select(*wanted, strict=False)
         if keys.ELAPSED in wanted:
-            elapsed = keys.recall(tensordict, keys.AGE, (1,), -1) + 1
+            elapsed = self._age(tensordict) + 1
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))
         if keys.LAST_CHUNK in wanted:
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
@@ -219,7 +281,8 @@ class ChunkExecutor(TensorDictModuleBase):
     def _clear_costs(self, tensordict: TensorDictBase, served: Tensor) -> None:
         for key in (keys.FLOPS, keys.LATENCY):
             if key in self.policy.out_keys:
-                tensordict.set(key, tensordict.get(key).masked_fill(served, 0.0))
+                spent = keys.recall(tensordict, key, (1,), 0.0)
+                tensordict.set(key, spent.masked_fill(served, 0.0))
 
 
 def action_at(chunk: Tensor, age: Tensor) -> Tensor:

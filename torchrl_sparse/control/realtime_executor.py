@@ -13,11 +13,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import COUNT, Entry
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 from torchrl_sparse.rotations import quaternion_to_rot6d
@@ -83,12 +84,19 @@ class RealtimeExecutor(ChunkExecutor):
     def out_keys(self):
         return [*super().out_keys, keys.DELAY, keys.MEANWHILE]
 
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        meanwhile = {} if chunk is None else {keys.MEANWHILE: chunk}
+        return {**super().carried(chunk), keys.DELAY: COUNT, **meanwhile}
+
+    def _carried_keys(self) -> list[NestedKey]:
+        return [*super()._carried_keys(), keys.DELAY, keys.MEANWHILE]
+
     def _due(self, tensordict: TensorDictBase) -> Tensor:
         awaited = self._age(tensordict) + 1 < self._delay(tensordict)
-        return keys.read(tensordict, keys.IS_INIT) | (super()._due(tensordict) & ~awaited)
+        return self._begins(tensordict) | (super()._due(tensordict) & ~awaited)
 
     def _query(self, tensordict: TensorDictBase, due: Tensor) -> None:
-        before = tensordict.select(keys.CHUNK, keys.AGE, strict=False)
+        before = tensordict.select(keys.IS_INIT, keys.CHUNK, keys.AGE, strict=False)
         super()._query(tensordict, due)
         tensordict.set(keys.DELAY, torch.where(due, self._new_delay(tensordict), self._delay(tensordict)))
         meanwhile = self._play_on(tensordict, before)
@@ -119,7 +127,7 @@ class RealtimeExecutor(ChunkExecutor):
         old = keys.recall(before, keys.CHUNK, chunk.shape[-2:], 0.0)
         left = shift_chunk(old, self._age(before) + 1, chunk.shape[-2])
         hold = self.hold(tensordict.select(*self.hold.in_keys)).get(keys.HOLD)
-        return torch.where(tensordict.get(keys.IS_INIT)[..., None], hold[..., None, :], left)
+        return torch.where(self._begins(before)[..., None], hold[..., None, :], left)
 
     def _serve(self, tensordict: TensorDictBase, age: Tensor) -> Tensor:
         there = age >= self._delay(tensordict)

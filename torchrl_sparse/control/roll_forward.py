@@ -139,6 +139,11 @@ class RollForward(TensorDictModuleBase):
         self.in_keys = list(dict.fromkeys([*policy.in_keys, keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY]))
         self.out_keys = list(policy.out_keys)
 
+    @property
+    def chunk_shape(self) -> tuple[int, int] | None:
+        """(n, A) of a chunk, None if the policy does not say."""
+        return getattr(self.policy, "chunk_shape", None)
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         elapsed = keys.recall(tensordict, keys.ELAPSED, (1,), 0)

@@ -19,11 +19,12 @@ from __future__ import annotations
 import math
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import Entry
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 
 __all__ = ["TemporalEnsemble"]
@@ -62,6 +63,15 @@ class TemporalEnsemble(TensorDictModuleBase):
         self.policy, self.coeff = policy, coeff
         self.in_keys = list(dict.fromkeys([*policy.in_keys, keys.LAST_CHUNK, keys.ELAPSED, keys.ENSEMBLED]))
         self.out_keys = [*policy.out_keys, keys.ENSEMBLED]
+
+    @property
+    def chunk_shape(self) -> tuple[int, int] | None:
+        """(n, A) of a chunk, None if the policy does not say."""
+        return getattr(self.policy, "chunk_shape", None)
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        return {} if chunk is None else {keys.ENSEMBLED: Entry(chunk.shape[:1], torch.int64)}
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -13,14 +13,18 @@
 environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
 `begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
 in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a query,
-such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key; it is missing at the first query of all, and
+such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key, and `TokenPruner.carried` says what it looks
+like to an environment; it is missing or 0 at the first query of all, and
 rows with ``"is_init"`` start afresh.
 """
 
 from __future__ import annotations
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 
+from torchrl_sparse import keys
+from torchrl_sparse.carried import Entry
 from torchrl_sparse.networks.vla.hooks import LayerHooks, VisualSpec
 
 __all__ = ["TokenPruner"]
@@ -32,6 +36,7 @@ class TokenPruner(LayerHooks):
     Attributes:
         in_keys: what `begin` reads beside what the policy reads; keys that the environment lacks are left out.
         out_keys: what `end` leaves in its TensorDict for the environment; all of them, at every query.
+        look_back: queries that its images reach back.
 
     Examples:
         >>> class KeepHalf(TokenPruner):
@@ -49,13 +54,31 @@ class TokenPruner(LayerHooks):
 
     in_keys: list[NestedKey] = []
     out_keys: list[NestedKey] = []
+    look_back: int = 1
 
     def bind(self, spec: VisualSpec) -> None:
-        """Take note of the model that the pruner is assigned to.
+        """Take note of the model that the pruner is assigned to: one that carries keys keeps it as ``self.spec``.
 
         Raises:
             ValueError: if the pruner does not fit it, for instance a budget larger than its tokens.
         """
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`; a pruner adds keys of its own.
+
+        These are images and scores of the last query. What it leaves out follows any environment but a bare `ParallelEnv`.
+        """
+        both = set(self.in_keys) & set(self.out_keys)
+        if not both:
+            return {}
+        spec = self.spec
+        frames = (len(spec.cameras), 3, spec.image_size, spec.image_size)
+        known = {
+            keys.TOKEN_FRAMES: Entry(frames, torch.uint8),
+            keys.TOKEN_PAST_FRAMES: Entry((self.look_back - 1, *frames), torch.uint8),
+            keys.TOKEN_SCORE: Entry((spec.num_visual,)),
+        }
+        return {key: entry for key, entry in known.items() if key in both}
 
     def begin(self, td: TensorDictBase) -> None:
         """Prepare a query before the decoder runs, from its inputs in ``td`` [B]."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import Entry
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 
@@ -42,6 +43,9 @@ class DenseFirst(TokenPruner):
                 f"inner: expected a pruner that skips no layers, got one that skips {sorted(skipped)}"
             )
         self.inner.bind(spec)
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        return self.inner.carried(chunk)
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return self.inner.layers_scored(num_layers)

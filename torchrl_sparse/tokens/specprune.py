@@ -205,7 +205,8 @@ class SpecPrune(TokenPruner):
             check_share(name, getattr(self.options, name))
         if not (self.options.carry or self.options.changed or self.options.local):
             raise ValueError("expected one of carry, changed and local, got none of them: nothing would stay")
-        past = past_frame_keys(self.options.look_back)
+        self.look_back = self.options.look_back
+        past = past_frame_keys(self.look_back)
         self.in_keys = [*FRAME_KEYS, *past, keys.TOKEN_BUDGET]
         self.in_keys += [keys.FINE] if self.options.static_share else []
         self.in_keys += [keys.TOKEN_SCORE] if self.options.carry else []

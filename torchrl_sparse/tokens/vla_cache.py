@@ -14,10 +14,11 @@ the actions, not what it saves: FLOPs and time are those of a decoder that reuse
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import Entry
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
@@ -110,6 +111,9 @@ class VLACachePruner(TokenPruner):
     def bind(self, spec: VisualSpec) -> None:
         self.spec = spec
         self._task_layer = round(_TASK_LAYER * spec.num_layers / _DEPTH)
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        return {**super().carried(chunk), REUSE_SHARE: Entry((self.spec.num_layers,))}
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return set(range(num_layers))

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import torch
+from tensordict import NestedKey
 
+from torchrl_sparse import keys
+from torchrl_sparse.carried import COUNT, Entry, carried_keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 
 __all__ = ["PolicySizes"]
 
@@ -15,6 +19,9 @@ class PolicySizes:
 
     network: TransformerForDiffusion
     sampler: Sampler
+    vision: VisionEncoder | None
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
 
     @property
     def device(self) -> torch.device:
@@ -40,3 +47,20 @@ class PolicySizes:
     def horizon(self) -> int:
         """Actions that the network denoises, H; a chunk leaves out those before the present step."""
         return self.network.horizon
+
+    @property
+    def chunk_shape(self) -> tuple[int, int]:
+        """(n, A) of a chunk."""
+        return self.horizon - self.n_obs_steps + 1, self.network.input_dim
+
+    def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
+        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        network, vision = self.network, self.vision
+        memory = (self.num_inference_steps, self.num_blocks, self.horizon, network.n_emb)
+        frames = (self.n_obs_steps, 0 if vision is None else vision.feature_dim)
+        known = {
+            keys.QUERY: COUNT,
+            keys.FEATURES: Entry(memory, network.pos_emb.dtype),
+            keys.FRAME_FEATURES: Entry(frames),
+        }
+        return {key: known[key] for key in carried_keys(self) if key in known}

@@ -22,6 +22,7 @@ from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, WordTokenizer
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
+from torchrl_sparse.policies.vla.sizes import VLASizes
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft, read_openvla_oft
 from torchrl_sparse.storage.vla import StoredVLA, VLASource, read_vla, write_vla
@@ -30,7 +31,7 @@ from torchrl_sparse.tokens.base import TokenPruner
 __all__ = ["VLAPolicy"]
 
 
-class VLAPolicy(VLAWrapperBase):
+class VLAPolicy(VLASizes, VLAWrapperBase):
     """A vision-language-action policy of the OpenVLA-OFT architecture (arXiv:2502.19645).
 
     Reads the images of ``config.cameras``, u8 [*B, 3, image_size, image_size], upright; ``("observation", "state")``, f32
@@ -93,16 +94,6 @@ class VLAPolicy(VLAWrapperBase):
         self.pruner, self.source, self.base = None, VLASource(), None
         self.eval()
 
-    # -- the shape of a query ------------------------------------------------------------------------------------------
-
-    n_obs_steps = 1
-    num_inference_steps = 1
-
-    @property
-    def horizon(self) -> int:
-        """Actions of a chunk."""
-        return self.network.config.chunk_size
-
     # -- the pruner ----------------------------------------------------------------------------------------------------
 
     @property
@@ -135,8 +126,12 @@ class VLAPolicy(VLAWrapperBase):
         super()._update_keys()
         pruner = getattr(self, "_pruner", None)
         wrist = self.tensor_keys.wrist_image
-        reads = [*([] if wrist is None else [wrist]), keys.KEEP_MASK, *(pruner.in_keys if pruner else ())]
-        writes = [keys.TOKEN_DEPTH, keys.KEPT, *(pruner.out_keys if pruner else ())]
+        read, written = (pruner.in_keys, pruner.out_keys) if pruner else ((), ())
+        masked = (
+            [] if keys.KEEP_MASK in written else [keys.KEEP_MASK]
+        )  # a pruner's own mask is new at every query
+        reads = [*([] if wrist is None else [wrist]), *masked, *read]
+        writes = [keys.TOKEN_DEPTH, keys.KEPT, *written]
         self.in_keys = list(dict.fromkeys([*self.in_keys, *reads]))
         self.out_keys = list(dict.fromkeys([*self.out_keys, *writes, keys.FLOPS, keys.LATENCY]))
 

@@ -1,0 +1,104 @@
+"""State that a module leaves in the TensorDict for its own next call, and its place in an environment's spec.
+
+A key is *carried* if it is in a module's ``in_keys`` and in its ``out_keys``. An environment need not hand back what it does
+not know: TorchRL's `ParallelEnv` hands back the keys of its spec alone. So a module says what one environment's entries are::
+
+    def carried(self, chunk):  # chunk: the entry of ("vla_action", "chunk"), None where nobody knows its shape
+        return {("control", "step"): Entry((1,), torch.int64)}
+
+and `ChunkExecutor.make_tensordict_primer` makes of all of them the transform that declares them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from torchrl.envs import TensorDictPrimer
+
+__all__ = [
+    "COUNT",
+    "FLAG",
+    "Entry",
+    "carried_entries",
+    "carried_keys",
+    "check_carried",
+    "make_primer",
+    "refuse",
+]
+
+
+class Entry(NamedTuple):
+    """What one environment has under a key, and what where an episode begins."""
+
+    shape: tuple[int, ...]
+    dtype: torch.dtype = torch.float32
+    begin: float = 0.0
+
+
+COUNT, FLAG = Entry((1,), torch.int64), Entry((1,), torch.bool)
+
+
+def carried_keys(module: TensorDictModuleBase) -> list[NestedKey]:
+    """Return the keys that ``module`` leaves to itself."""
+    written = {unravel_key(key) for key in module.out_keys}
+    return [key for key in map(unravel_key, module.in_keys) if key in written]
+
+
+def carried_entries(module: nn.Module, chunk: Entry | None) -> dict[NestedKey, Entry]:
+    """Return what ``module`` and its parts say of the keys that they leave to themselves."""
+    found: dict[NestedKey, Entry] = {}
+    for part in module.modules():
+        if callable(tell := getattr(part, "carried", None)):
+            found.update(tell(chunk))
+    return found
+
+
+def make_primer(entries: Mapping[NestedKey, Entry]) -> TensorDictPrimer:
+    """Return the transform that gives keys their place in a spec, of environments of any batch size."""
+    from torchrl.data import Categorical, Composite, Unbounded  # which a robot's loop does without
+    from torchrl.envs import TensorDictPrimer
+
+    specs = Composite()
+    for key, (shape, dtype, _) in entries.items():
+        truth = dtype == torch.bool
+        specs[key] = Categorical(2, shape, dtype=dtype) if truth else Unbounded(shape, dtype=dtype)
+    begin = {key: entry.begin for key, entry in entries.items()}
+    return TensorDictPrimer(specs, default_value=begin, expand_specs=True)
+
+
+def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going_on: Tensor) -> None:
+    """Raise ValueError if a row in mid-episode lacks what the step before left.
+
+    Args:
+        tensordict: [*B].
+        wanted: carried keys.
+        going_on: bool [*B, 1], the rows in mid-episode.
+    """
+    for key in wanted:
+        if tensordict.get(key, None) is None:
+            refuse(key, _lacks(tensordict, key) & going_on)
+
+
+def refuse(key: NestedKey, lost: Tensor) -> None:
+    """Raise ValueError if the rows ``lost``, bool [*B, 1], are any: the environment dropped ``key``."""
+    if lost.any():
+        raise ValueError(
+            f"{key}: expected what the step before left, since 'is_init' is False, got none in {int(lost.sum())} of "
+            f"{lost.numel()} rows: the environment drops it; wrap it, TransformedEnv(env, actor.make_tensordict_primer()), "
+            "or have the collector do so, auto_register_policy_transforms=True"
+        )
+
+
+def _lacks(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return bool [*B, 1], the rows without an entry; an asynchronous collector stacks rows of different keys."""
+    if isinstance(rows := getattr(tensordict, "tensordicts", None), list):
+        return torch.stack([_lacks(row, key) for row in rows], tensordict.stack_dim)
+    missing = tensordict.get(key, None) is None
+    return torch.full((*tensordict.batch_size, 1), missing, device=tensordict.device)
