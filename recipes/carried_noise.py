@@ -14,13 +14,13 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.figures.carried_noise import plot_carried_noise
 from torchrl_sparse.evaluation.results.carried_noise import CarriedNoiseResults, save_carried_noise
 from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 

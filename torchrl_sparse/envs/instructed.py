@@ -8,7 +8,8 @@ from functools import partial
 
 from torchrl.envs import EnvBase
 
-from torchrl_sparse.envs.for_policy import camera_options, named_task
+from torchrl_sparse.envs.contract import named_task
+from torchrl_sparse.envs.for_policy import camera_options
 from torchrl_sparse.envs.libero import SUITES, require_libero
 from torchrl_sparse.envs.libero_suite import make_suite_env
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask

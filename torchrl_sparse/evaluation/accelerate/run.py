@@ -92,7 +92,7 @@ def accelerate(
 
     Examples:
         >>> from torchrl_sparse.envs.for_policy import diffusion_env
-        >>> from torchrl_sparse.training.diffusion.observed import policy_demos
+        >>> from torchrl_sparse.data.for_policy import policy_demos
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> demos = policy_demos("lift.hdf5", "lift", policy)  # doctest: +SKIP
         >>> request = Request("lift", budget_ms=5)
