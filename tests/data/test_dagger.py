@@ -10,7 +10,7 @@ import pytest
 import torch
 from torchrl.data import Unbounded
 
-from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401
+from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401  a fixture
 from torchrl_sparse import DiffusionPolicy, keys
 from torchrl_sparse.data import demos
 from torchrl_sparse.data.dagger import Driver, Driving, load_driver
@@ -304,7 +304,7 @@ def test_a_policy_of_another_convention_drives_as_it_would_in_its_own_environmen
     np.testing.assert_array_equal(episode.observations["object"][0], own.observations["object"][0])
 
 
-def test_a_policy_with_cameras_cannot_drive(driving, monkeypatch, make_image_policy):
+def test_a_policy_with_cameras_cannot_drive(driving, monkeypatch, make_image_policy):  # noqa: F811
     seeing = make_image_policy()
     monkeypatch.setattr(DiffusionPolicy, "from_pretrained", lambda path: seeing)
     with pytest.raises(ValueError, match="policy: expected one that observes states, got one with cameras"):

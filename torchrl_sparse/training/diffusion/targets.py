@@ -145,6 +145,7 @@ def add_queries(
     return together[torch.randperm(len(together), generator=torch.Generator().manual_seed(seed))]
 
 
+@torch.no_grad()
 def dense_answers(
     policy: DiffusionPolicy,
     queries: TensorDictBase,
