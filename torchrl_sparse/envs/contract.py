@@ -21,6 +21,7 @@ __all__ = [
     "continued_source",
     "named_task",
     "policy_contract",
+    "provenance",
     "task_contract",
 ]
 
@@ -129,6 +130,18 @@ def check_contract(policy: DiffusionPolicy, shown: Contract | None) -> None:
         if shown.cameras.get(name) != key:
             got = shown.cameras.get(name, "none")
             raise ValueError(f"demos: {name}: expected {key}, as the policy's source says, got {got}")
+
+
+def provenance(contract: Contract | None) -> dict[str, str]:
+    """Return what a file that is made under a contract notes of it: nothing of one that policies trained here have.
+
+    >>> provenance(task_contract("lift")), provenance(Contract("Lift", ("object",), "1.4"))
+    ({}, {'observed': 'object as of robosuite 1.4'})
+    """
+    if contract is None or contract.task is None:
+        return {}
+    own = task_contract(contract.task, contract.cameras)
+    return {} if contract.meaning == own.meaning else {"observed": contract.meaning}
 
 
 def continued_source(task: str, policy: DiffusionPolicy) -> dict[str, Any]:
