@@ -15,6 +15,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate import (
@@ -28,7 +29,6 @@ from torchrl_sparse.evaluation.accelerate import (
 from torchrl_sparse.evaluation.results.acceleration import acceleration_note, acceleration_rows
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.pruner.config import PrunerConfig
 

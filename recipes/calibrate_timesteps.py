@@ -15,10 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import FoundTimesteps, find_timesteps

@@ -22,9 +22,10 @@ from tqdm import tqdm
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.data.for_policy import instructed_demos
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
-from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.instructed import instructed_env
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
@@ -70,7 +71,7 @@ def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[Budget
     if config.demos is not None:
         task = find_robosuite_task(config.task)
         poses = task.pose_slices(task.proprioception_keys)
-        recorded = demonstrated_queries(policy, demonstrations(config), config.n_action_steps, poses)
+        recorded = demonstrated_queries(policy, demonstrations(policy, config), config.n_action_steps, poses)
     else:
         recorded = recorded_queries(
             policy, executor(policy, config), environment(policy, config), seeds(config)
@@ -93,9 +94,8 @@ def pruners(config: DictConfig) -> Pruners:
     return {number: numbered_pruner(config.method, number, options) for number in config.numbers}
 
 
-def demonstrations(config: DictConfig) -> InstructedDemonstrations:
-    state_keys = find_robosuite_task(config.task).proprioception_keys
-    episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config.cameras))
+def demonstrations(policy: VLAPolicy, config: DictConfig) -> InstructedDemonstrations:
+    episodes = instructed_demos(config.demos, config.task, chosen_cameras(config.cameras), policy)
     return InstructedDemonstrations(episodes, read_instructions(config.demos))
 
 
@@ -110,9 +110,6 @@ def seeds(config: DictConfig) -> range:
 
 
 def environment(policy: VLAPolicy, config: DictConfig) -> Callable[..., EnvBase]:
-    # Here, since queries of demonstrations need no simulator.
-    from torchrl_sparse.envs.instructed import instructed_env
-
     return instructed_env(config.task, policy, chosen_cameras(config.cameras), config.horizon)
 
 

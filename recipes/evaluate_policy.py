@@ -16,7 +16,8 @@ from omegaconf import DictConfig
 from torchrl_sparse import keys
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.data.for_policy import contract_demos
+from torchrl_sparse.envs.contract import task_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
@@ -92,7 +93,9 @@ def demonstrated_ways(config: DictConfig) -> list[int]:
         return []
     task = find_task(config.task)
     way_of = task.load_way_of()
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
+    demos = contract_demos(
+        config.demos, task_contract(task.name)
+    )  # what tells a way sees it as the environment does
     return [way_of(demos.episode(index)[keys.STATE].numpy()) for index in range(len(demos))]
 
 

@@ -19,8 +19,9 @@ from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.control.roll_forward import StateModel
-from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
+from torchrl_sparse.data.for_policy import policy_demos
+from torchrl_sparse.envs.contract import policy_contract
+from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods, time_methods
@@ -50,12 +51,13 @@ def main(config: DictConfig) -> None:
     out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
-    model = state_model(config, task)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
-    if (seen := observed_keys(task.name, policy)) != task.state_keys:  # from which the pose to hold is read
+    seen = policy_contract(task.name, policy).state_keys
+    if seen != task.state_keys:  # from which the pose to hold is read
         raise ValueError(
             f"policy: expected one that observes {', '.join(task.state_keys)}, got one of {', '.join(seen)}"
         )
+    model = state_model(config, task, policy)
     config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
     first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
@@ -96,13 +98,13 @@ def main(config: DictConfig) -> None:
     print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
 
 
-def state_model(config: DictConfig, task: RobosuiteTask) -> StateModel | None:
-    """Fit what methods named ``_ahead`` roll the state forward with; None if there are none."""
+def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy) -> StateModel | None:
+    """Fit what methods named ``_ahead`` roll the policy's state forward with; None if there are none."""
     if not any(MethodName.parse(name).ahead for name in config.methods):
         return None
     if config.demos is None:
         raise ValueError("demos: expected demonstrations to fit the _ahead methods' model to, got null")
-    demos, steps = read_demos(config.demos, task.state_keys, task=task.name), 3
+    demos, steps = policy_demos(config.demos, task.name, policy), 3
     model, error = fit_state_model(demos, steps)
     print(
         f"{config.demos}: {steps} steps ahead the model of the state errs by {error:.2f} of what no model does"

@@ -15,14 +15,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import contract_demos
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.contract import continued_source, policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
-from torchrl_sparse.training.diffusion.published import with_published
+from torchrl_sparse.training.diffusion.published import executed_steps, with_published
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
 from torchrl_sparse.training.loop import train
@@ -43,19 +44,17 @@ def main(config: DictConfig) -> None:
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
-    config.network = with_published(config.task, config.network)
-    config.train = with_published(config.task, config.train)
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
-    demos = read_demos(
-        config.demos,
-        task.proprioception_keys if cameras else task.state_keys,
-        filter_key=config.filter_key,
-        cameras=cameras,
-        image_folder=Path(config.out) / "images",
-        poses=task.acts_in_poses,
-        task=task.name,
+    begun = None if config.init is None else begun_policy(config)
+    source, train = begun.source if begun else {}, config.train
+    train.n_action_steps = executed_steps(task.name, source, train.n_action_steps)
+    config.network = with_published(task.name, config.network)
+    config.train = with_published(task.name, train)
+    contract = task_contract(task.name, cameras) if begun is None else policy_contract(task.name, begun)
+    demos = contract_demos(
+        config.demos, contract, filter_key=config.filter_key, image_folder=Path(config.out) / "images"
     )
-    if config.init is None:
+    if begun is None:
         policy = untrained_policy(
             demos,
             config.network,
@@ -65,12 +64,10 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
             **config.vision,
             seed=config.seed,
         )
+        policy.source = {"task": task.alias, "cameras": cameras} if cameras else {}
     else:
-        policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
-    policy.to(config.device)
-    trainer = PolicyTrainer(
-        policy.network, policy.normalizer, demos, TrainConfig(**config.train), policy.vision
-    )
+        policy = begun
+    trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
     print(
         f"{config.demos}: {len(demos)} demonstrations, {len(demos.data)} steps, "
         f"{len(trainer.train_rows)} training windows; "
@@ -79,20 +76,28 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     return trainer
 
 
+def begun_policy(config: DictConfig) -> DiffusionPolicy:
+    """Read the policy of ``init``, whose ``source`` then says that it is trained for this task."""
+    policy, cameras = (
+        DiffusionPolicy.from_pretrained(config.init, engine="reference"),
+        chosen_cameras(config.cameras),
+    )
+    if policy.vision is not None and "cameras" not in policy.source:
+        policy.source = policy.source | {"cameras": cameras}
+    policy.source = continued_source(config.task, policy)
+    own = policy_contract(config.task, policy).cameras
+    for name, key in cameras.items():
+        if own.get(name) != key:
+            raise ValueError(
+                f"cameras.{name}: expected {own.get(name)}, as of the policy in {config.init}, got {key}"
+            )
+    return policy
+
+
 def export(trainer: PolicyTrainer, config: DictConfig) -> Path:
     path = Path(config.out) / "policy"
-    averaged_policy(trainer, config).save_pretrained(path)
+    trainer.ema_policy().save_pretrained(path)
     return path
-
-
-def averaged_policy(
-    trainer: PolicyTrainer, config: DictConfig, sampler: Sampler | None = None
-) -> DiffusionPolicy:
-    """Return the policy with averaged weights and a note of its cameras, for whoever makes an environment for it."""
-    policy = trainer.ema_policy(sampler)
-    if cameras := chosen_cameras(config.cameras):
-        policy.source = {"task": find_task(config.task).alias, "cameras": cameras}
-    return policy
 
 
 def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | None:
@@ -103,8 +108,9 @@ def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | N
     from torchrl_sparse.envs.for_policy import diffusion_env
     from torchrl_sparse.evaluation.rollouts.evaluate import evaluate, success_rate
 
-    sampler = Sampler("ddim", config.eval_ddim_steps) if config.eval_ddim_steps else Sampler()
-    policy = averaged_policy(trainer, config, sampler)
+    policy = trainer.ema_policy()
+    if config.eval_ddim_steps:
+        policy.sampler = Sampler("ddim", config.eval_ddim_steps, policy.sampler.num_train_timesteps)
     episodes = evaluate(
         "dense",
         ChunkExecutor(policy, trainer.config.n_action_steps),

@@ -20,11 +20,12 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
+from torchrl_sparse.data.for_policy import policy_demos
+from torchrl_sparse.envs.contract import policy_contract, provenance
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 from torchrl_sparse.training.loop import CHECKPOINT, train
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -80,6 +81,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     made_for = {
         "policy": policy.fingerprint,
         **policy.sampler.config,
+        **provenance(policy_contract(config.task, policy)),
         "demos": config.demos,
         **config.targets,
         "rollouts": [config.rollouts, *initial_schedules(config)[:1]] if config.rollouts else [],

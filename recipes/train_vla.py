@@ -19,9 +19,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse import keys
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import instructed_demos
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.data.robomimic import read_demos
+from torchrl_sparse.envs.instructed import continued_vla_source
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -50,21 +52,19 @@ def main(config: DictConfig) -> None:
 def make_trainer(config: DictConfig) -> VLATrainer:
     """Read the demonstrations and build what is trained on them."""
     cameras = chosen_cameras(config.cameras)
-    episodes = read_demos(
-        config.demos,
-        find_robosuite_task(config.task).proprioception_keys,
-        cameras=cameras,
-        image_folder=Path(config.out) / "images",
-    )
+    policy = None
+    if config.init is not None:
+        policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
+        policy.source = continued_vla_source(config.task, policy, cameras)
+    images = Path(config.out) / "images"
+    episodes = instructed_demos(config.demos, config.task, cameras, policy, image_folder=images)
     stages = GroundingConfig(**config.grounding)
     objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
-    if config.init is None:
+    if policy is None:
         sizes = {"changes": config.network, "base": config.base, "rank": config.rank}
         policy = untrained_policy(demos, config.size, cameras=[*cameras], seed=config.seed, **sizes)
-    else:
-        policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
-    policy.source = VLASource(find_robosuite_task(config.task).name, cameras)
+        policy.source = VLASource(find_robosuite_task(config.task).name, cameras)
     trainer = VLATrainer(policy.to(config.device), demos, TrainConfig(**config.train), stages)
     print(
         f"{config.demos}: {len(episodes)} demonstrations of {len(set(demos.instructions))} instructions, "
@@ -76,10 +76,9 @@ def make_trainer(config: DictConfig) -> VLATrainer:
 
 def read_objects(config: DictConfig) -> ObjectPositions:
     """Return where the objects are that the task's instructions name, in the order of these."""
-    positions = read_demos(config.demos, ["object_positions"]).data[keys.STATE]
-    return ObjectPositions(
-        positions.unflatten(1, (-1, 3)), find_robosuite_task(config.task).instructions
-    ).standardised()
+    task = find_robosuite_task(config.task)
+    positions = read_demos(config.demos, ["object_positions"], task=task.name).data[keys.STATE]
+    return ObjectPositions(positions.unflatten(1, (-1, 3)), task.instructions).standardised()
 
 
 def export(trainer: VLATrainer, config: DictConfig) -> Path:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from torchrl_sparse import DiffusionPolicy, keys
-from torchrl_sparse.envs.conventions import source_convention
-from torchrl_sparse.envs.for_policy import diffusion_env, observed_keys
+from torchrl_sparse.envs.contract import policy_contract
+from torchrl_sparse.envs.conventions import source_convention, translate_objects
+from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 
 # joint positions and observations after five steps; by robosuite 1.4.1 with mujoco 3.9
@@ -28,23 +29,30 @@ def replayed(task, state_keys, convention):
     env.sim_env.sim.forward()
     state = env._observe()[keys.STATE]
     assert env.observation_spec[keys.STATE].shape == state.shape
+    own = env.raw_observation(["object"], "1.5")["object"]
     env.close()
-    return state.numpy()
+    return state.numpy(), own
 
 
 @pytest.mark.parametrize("task", RECORDED)
 def test_the_old_convention_is_what_robosuite_1_4_observed(task):
     old = {"object": RECORDED[task]["observed"]["object-state"]} | RECORDED[task]["observed"]
     expected = np.concatenate([old[key] for key in PUBLISHED])
-    np.testing.assert_allclose(replayed(task, PUBLISHED, "1.4"), expected, atol=1e-6)
+    state, own = replayed(task, PUBLISHED, "1.4")
+    np.testing.assert_allclose(state, expected, atol=1e-6)
+    # and both ways between it and what robosuite 1.5 observes
+    translated = translate_objects(task, expected[: len(own)], observed="1.4", wanted="1.5")
+    np.testing.assert_allclose(translated, own, atol=1e-6)
+    back = translate_objects(task, translated, observed="1.5", wanted="1.4")
+    np.testing.assert_array_equal(back, expected[: len(own)])
 
 
 def test_the_present_convention_is_what_robosuite_1_5_observed():
-    np.testing.assert_allclose(replayed("Lift", ["object"], "1.5")[7:], HAND_TO_CUBE_1_5, atol=1e-6)
+    np.testing.assert_allclose(replayed("Lift", ["object"], "1.5")[0][7:], HAND_TO_CUBE_1_5, atol=1e-6)
 
 
 def test_state_keys_come_in_the_order_that_is_asked_for():
-    forwards, backwards = replayed("Lift", PUBLISHED, "1.4"), replayed("Lift", PUBLISHED[::-1], "1.4")
+    forwards, backwards = (replayed("Lift", order, "1.4")[0] for order in (PUBLISHED, PUBLISHED[::-1]))
     fingers, turn, hand, cube = forwards[17:], forwards[13:17], forwards[10:13], forwards[:10]
     np.testing.assert_array_equal(backwards, np.concatenate([fingers, turn, hand, cube]))
 
@@ -72,7 +80,7 @@ def test_an_imported_policy_gets_the_environment_that_it_was_trained_in():
         "state_keys": PUBLISHED,
         "robosuite": "1.2",
     }
-    assert observed_keys("lift", policy) == tuple(PUBLISHED)
+    assert policy_contract("lift", policy).state_keys == tuple(PUBLISHED)
     env = diffusion_env("lift", policy)(seeds=[7])
     state = env.reset()[keys.STATE]
     np.testing.assert_allclose(state[7:10], state[10:13] - state[:3], atol=1e-6)  # the hand minus the cube

@@ -21,13 +21,13 @@ from torchrl_sparse import DiffusionPolicy, Sampler, keys
 from torchrl_sparse.blocks.mask import NetworkSizes, mask_flops
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.rollouts.episodes import read_episodes, totals
 from torchrl_sparse.evaluation.rollouts.evaluate import evaluate
 from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.storage.json import write_json
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.loss import varying_share

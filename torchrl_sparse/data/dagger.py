@@ -29,9 +29,7 @@ from tensordict import TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.envs.conventions import source_convention
-from torchrl_sparse.envs.for_policy import observed_keys
-from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.envs.contract import Contract, policy_contract, task_contract
 from torchrl_sparse.methods.diffusion import make_method
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
@@ -46,7 +44,7 @@ class Driving:
     """Who drives before the expert does, and for how long.
 
     Attributes:
-        policy: folder of a `DiffusionPolicy` that observes the task's state as demonstrations record it.
+        policy: folder of a `DiffusionPolicy` that observes states of the task, in whatever convention.
         fingerprint: of its weights, so that a collection is not continued with others.
         method: how it is sampled, see `torchrl_sparse.methods.diffusion`; none that needs a calibration.
         n_action_steps: actions executed of a chunk.
@@ -87,6 +85,7 @@ class Driver:
     Args:
         driving: decides how many.
         actor: the policy's executor.
+        contract: what it observes; None for the task's state as the environment shows it.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
@@ -96,17 +95,23 @@ class Driver:
         (8, (10,))
     """
 
-    def __init__(self, driving: Driving, actor: ChunkExecutor):
-        self._driving, self._actor = driving, actor
+    def __init__(self, driving: Driving, actor: ChunkExecutor, contract: Contract | None = None):
+        self._driving, self._actor, self._contract = driving, actor, contract
+        self._env: Any = None
 
     def begin(self, seed: int, env: Any) -> int:
         """Begin the episode of a seed; return how many of its steps the policy drives, half of the environment's at most."""
         self._actor.reset(seed)
+        self._env = env
         return self._driving.draw_steps(seed, env.horizon // 2)
 
     def act(self, present: TensorDictBase) -> np.ndarray:
         """Return the environment's action, f64 [A], for this step."""
-        return self._actor.act({"state": present[keys.STATE].numpy()}).astype(np.float64)
+        state = present[keys.STATE].numpy()
+        if (seen := self._contract) is not None:
+            parts = self._env.raw_observation(seen.state_keys, seen.convention)
+            state = np.concatenate([*parts.values()]).astype(np.float32)
+        return self._actor.act({"state": state}).astype(np.float64)
 
 
 @cache
@@ -115,11 +120,11 @@ def load_driver(task: str, driving: Driving) -> Driver:
 
     Raises:
         FileNotFoundError, ValueError: if it cannot be read, is of other weights than ``driving`` says or of another task,
-            observes anything but the task's state, or the method is unknown or needs a calibration.
+            has cameras, or the method is unknown or needs a calibration.
     """
     path = Path(driving.policy)
     policy = DiffusionPolicy.from_pretrained(path)
-    _check_policy(task, policy, driving)
+    _check_policy(policy, driving)
     method = make_method(
         driving.method,
         policy,
@@ -127,20 +132,18 @@ def load_driver(task: str, driving: Driving) -> Driver:
         planners=path.with_suffix("") if path.suffix == ".ckpt" else path,
         calibration=_refuse_calibration,
     )
-    return Driver(driving, ChunkExecutor(method, driving.n_action_steps))
+    contract = policy_contract(task, policy)
+    own = contract == task_contract(task)
+    return Driver(driving, ChunkExecutor(method, driving.n_action_steps), None if own else contract)
 
 
-def _check_policy(task: str, policy: DiffusionPolicy, driving: Driving) -> None:
+def _check_policy(policy: DiffusionPolicy, driving: Driving) -> None:
     if policy.fingerprint != driving.fingerprint:
         raise ValueError(
             f"policy: expected the weights {driving.fingerprint} in {driving.policy}, got {policy.fingerprint}"
         )
-    seen, recorded = observed_keys(task, policy), find_task(task).state_keys
-    if policy.vision is not None or seen != recorded or source_convention(policy.source) != "1.5":
-        raise ValueError(
-            f"policy: expected one that observes {', '.join(recorded)} as demonstrations record them, "
-            f"got {driving.policy}"
-        )
+    if policy.vision is not None:
+        raise ValueError(f"policy: expected one that observes states, got one with cameras, {driving.policy}")
 
 
 def _refuse_calibration() -> Any:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +33,9 @@ from torchrl_sparse.data.hdf5_reader import (
 )
 from torchrl_sparse.data.images import RecordedImages, read_images
 from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
+from torchrl_sparse.data.recorded_objects import RecordedObjects
+from torchrl_sparse.envs.contract import OBJECTS, Contract
+from torchrl_sparse.envs.conventions import Convention
 from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "join_demos", "read_demos"]
@@ -49,11 +52,13 @@ class Demonstrations:
         starts: i64 [E + 1]; episode e is rows ``starts[e]`` up to, not including, ``starts[e + 1]``.
         driven: i64 [E]; so many first rows of an episode a policy drove before the expert took over, see
             `torchrl_sparse.data.dagger`. They are history of the windows that follow. No row by default.
+        contract: what the observations mean; None if nobody noted it.
     """
 
     data: TensorDict
     starts: Tensor
     driven: Tensor = field(default=None)  # type: ignore[assignment]  # never None once made
+    contract: Contract | None = None
 
     def __post_init__(self) -> None:
         if self.driven is None:
@@ -70,7 +75,12 @@ class Demonstrations:
     def between(self, first: int, last: int) -> Demonstrations:
         """Return the episodes from ``first`` up to, not including, ``last``."""
         starts = self.starts[first : last + 1]
-        return Demonstrations(self.data[int(starts[0]) : int(starts[-1])], starts - starts[0])
+        return replace(
+            self,
+            data=self.data[int(starts[0]) : int(starts[-1])],
+            starts=starts - starts[0],
+            driven=self.driven[first:last],
+        )
 
     def window_rows(
         self, horizon: int, n_obs_steps: int, n_action_steps: int, episodes: Sequence[int] | None = None
@@ -127,6 +137,7 @@ def read_demos(
     image_folder: str | Path | None = None,
     poses: bool = True,
     task: str | None = None,
+    convention: Convention = "1.5",
 ) -> Demonstrations:
     """Read all demonstrations of a robomimic file, in the order of their numbers, or of several files, see `join_demos`.
 
@@ -139,14 +150,16 @@ def read_demos(
             memory by default.
         poses: actions are absolute poses of arms; False takes them as they are, as benchmarks outside robosuite want it.
         task: name of the task that they are to show; None for any.
+        convention: the version of robosuite whose meaning ``object`` shall have, whichever recorded it.
 
     Returns:
         f32 demonstrations; poses are converted from rotation vectors to 6-D rotations.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if a file is truncated or malformed, its actions are deltas, it is of another task, or there is no such
-            filter key; the message names file, demonstration and dataset. As `join_demos` if files differ.
+        ValueError: if a file is truncated or malformed, its actions are deltas, it is of another task, there is no such filter
+            key, or its objects cannot be had in that convention; the message names file, demonstration and dataset. As
+            `join_demos` if files differ.
 
     Examples:
         >>> demos = read_demos("data/lift.h5", find_robosuite_task("Lift").state_keys)  # doctest: +SKIP
@@ -157,7 +170,8 @@ def read_demos(
         raise ValueError("state_keys: expected at least one observation key, got none")
     files, parts = [], []
     for path in each_path(paths):
-        names, part = _read_numbers(path, state_keys, filter_key, poses, task)
+        wanted = Contract(task, tuple(state_keys), convention, dict(cameras or {}))
+        names, part = _read_numbers(path, wanted, filter_key, poses)
         files.append(RecordedImages(path, dict(zip(names, part.starts.diff().tolist(), strict=True))))
         parts.append(part)
     demos = join_demos(parts)
@@ -167,20 +181,21 @@ def read_demos(
 
 
 def _read_numbers(
-    path: str | Path, state_keys: Sequence[str], filter_key: str | None, poses: bool, task: str | None
+    path: str | Path, wanted: Contract, filter_key: str | None, poses: bool
 ) -> tuple[list[str], Demonstrations]:
     """Return the names of a file's demonstrations, and these without images."""
     with open_demos(path) as file:
         names, control = demo_names(path, file, filter_key), None
-        if task is not None:
-            check_recorded_task(Path(path), file, task)
+        if wanted.task is not None:
+            check_recorded_task(Path(path), file, wanted.task)
+        recorded = RecordedObjects(path, file, wanted.task)
         # Of files of other simulators only their maker knows whether actions are poses.
         with suppress(ValueError):
             control = read_control(path, file)
         convert = partial(_absolute_poses, control=control) if poses else _as_they_are
         data, reader = demo_group(path, file), ArrayReader(file)
         episodes = [
-            _read_episode(f"{path}, {name}", reader, data, name, state_keys, convert) for name in names
+            _read_episode(f"{path}, {name}", reader, data, name, wanted, recorded, convert) for name in names
         ]
     widths = sorted({(state.shape[1], action.shape[1]) for state, action, _ in episodes})
     if len(widths) > 1:
@@ -189,14 +204,14 @@ def _read_numbers(
     starts = torch.tensor([0, *map(len, actions)]).cumsum(0)
     state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
     data = TensorDict({keys.STATE: state, keys.ACTION: action}, batch_size=[len(state)])
-    return names, Demonstrations(data, starts, torch.tensor(driven))
+    return names, Demonstrations(data, starts, torch.tensor(driven), replace(wanted, task=recorded.task))
 
 
 def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
     """Lay several sets of demonstrations end to end, in memory, such as those of DAgger's rounds.
 
     Raises:
-        ValueError: if there is none, or they differ in what they observe or in sizes.
+        ValueError: if there is none, or they differ in what they observe, in its meaning or in sizes.
     """
     shapes = sorted(
         {str({key: part.data[key].shape[1:] for key in part.data.keys(True, True)}) for part in parts}
@@ -207,10 +222,19 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
         )
     if len(parts) == 1:
         return parts[0]
+    contracts = [part.contract for part in parts if part.contract is not None]
+    if len(meanings := sorted({contract.meaning for contract in contracts})) > 1:
+        raise ValueError(f"demos: expected one meaning of the state, got {'; '.join(meanings)}")
+    contract = contracts[0] if len(contracts) == len(parts) else None
+    if contract is not None and any(other.task != contract.task for other in contracts):
+        contract = replace(contract, task=None)
     lengths = torch.cat([part.starts.diff() for part in parts])
     starts = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
     return Demonstrations(
-        torch.cat([part.data for part in parts]), starts, torch.cat([part.driven for part in parts])
+        torch.cat([part.data for part in parts]),
+        starts,
+        torch.cat([part.driven for part in parts]),
+        contract,
     )
 
 
@@ -219,13 +243,17 @@ def _read_episode(
     reader: ArrayReader,
     data: h5py.Group,
     name: str,
-    state_keys: Sequence[str],
+    wanted: Contract,
+    recorded: RecordedObjects,
     convert: Callable[[str, np.ndarray], np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32, and how many steps were driven."""
     demo, length = open_demo(where, data, name)
     action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
-    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in state_keys]
+    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in wanted.state_keys]
+    if OBJECTS in wanted.state_keys:
+        place = wanted.state_keys.index(OBJECTS)
+        state[place] = recorded.translate(where, state[place], wanted.convention)
     driven = count_attribute(where, demo, "driven") if "driven" in demo.attrs else 0
     if not 0 <= driven <= length:
         raise ValueError(f"{where}, driven: expected 0 to {length} steps, got {driven}")

@@ -8,31 +8,51 @@ of one and the same state are equal in both. Published checkpoints were trained 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-__all__ = ["Convention", "check_convention", "object_state", "source_convention"]
+__all__ = [
+    "Convention",
+    "check_convention",
+    "object_state",
+    "source_convention",
+    "translate_objects",
+    "version_convention",
+]
 
 Convention = Literal["1.5", "1.4"]
 """The last version of robosuite whose meaning the observations have."""
 
 
-def _posed(thing: str) -> tuple[str, ...]:
-    return tuple(f"{thing}{part}" for part in ("_pos", "_quat", "_to_robot0_eef_pos", "_to_robot0_eef_quat"))
+_OWN, _RELATIVE = ("_pos", "_quat"), ("_to_robot0_eef_pos", "_to_robot0_eef_quat")
 
 
-_PARTS = {
-    "Lift": ("cube_pos", "cube_quat", "gripper_to_cube_pos"),
-    "PickPlaceCan": _posed("Can"),
-    "NutAssemblySquare": _posed("SquareNut"),
-    "ToolHang": (*_posed("base"), *_posed("frame"), *_posed("tool"), "frame_is_assembled", "tool_on_frame"),
-    "TwoArmTransport": (
-        *("payload_pos", "payload_quat", "trash_pos", "trash_quat", "lid_handle_pos", "lid_handle_quat"),
-        *("target_bin_pos", "trash_bin_pos", "gripper0_to_payload", "gripper0_to_lid_handle"),
-        *("gripper1_to_payload", "gripper1_to_trash", "payload_in_target_bin", "trash_in_trash_bin"),
-    ),
+def _posed(things: Sequence[str], *groups: Sequence[str]) -> tuple[str, ...]:
+    return tuple(thing + part for thing in things for group in groups for part in group)
+
+
+_LIFT = ("cube_pos", "cube_quat", "gripper_to_cube_pos")
+_TOOLS, _HUNG = ("base", "frame", "tool"), ("frame_is_assembled", "tool_on_frame")
+_PLACED = (
+    *("payload_pos", "payload_quat", "trash_pos", "trash_quat", "lid_handle_pos", "lid_handle_quat"),
+    *("target_bin_pos", "trash_bin_pos"),
+)
+_REACHED = ("gripper0_to_payload", "gripper0_to_lid_handle", "gripper1_to_payload", "gripper1_to_trash")
+_IN_BINS = ("payload_in_target_bin", "trash_in_trash_bin")
+_PARTS: dict[str, dict[Convention, tuple[str, ...]]] = {
+    "Lift": {"1.4": _LIFT, "1.5": _LIFT},
+    "PickPlaceCan": {"1.4": _posed(["Can"], _OWN, _RELATIVE), "1.5": _posed(["Can"], _RELATIVE, _OWN)},
+    "NutAssemblySquare": {
+        "1.4": _posed(["SquareNut"], _OWN, _RELATIVE),
+        "1.5": _posed(["SquareNut"], _RELATIVE, _OWN),
+    },
+    "ToolHang": {
+        "1.4": (*_posed(_TOOLS, _OWN, _RELATIVE), *_HUNG),
+        "1.5": (*_posed(_TOOLS, _RELATIVE, _OWN), *_HUNG),
+    },
+    "TwoArmTransport": {"1.4": (*_PLACED, *_REACHED, *_IN_BINS), "1.5": (*_PLACED, *_IN_BINS, *_REACHED)},
 }
 _NEGATED = ("gripper_to_cube_pos",)
 
@@ -58,8 +78,49 @@ def object_state(task: str, observed: Mapping[str, Any], convention: Convention)
     """
     if convention == "1.5":
         return np.asarray(observed["object-state"])
-    signed = [np.atleast_1d(observed[name]) * (-1.0 if name in _NEGATED else 1.0) for name in _PARTS[task]]
+    signed = [np.atleast_1d(observed[name]) * _sign(name) for name in _PARTS[task]["1.4"]]
     return np.concatenate(signed)
+
+
+def translate_objects(
+    task: str, state: np.ndarray, *, observed: Convention, wanted: Convention
+) -> np.ndarray:
+    """Return the objects' state [..., object_dim] that one convention observed as another observes it.
+
+    Args:
+        task: robosuite's name of it.
+        state: as ``observed`` has it.
+        observed, wanted: see `Convention`.
+
+    Raises:
+        ValueError: if the task is not known in both, or the state is of another size than the task's.
+
+    >>> translate_objects("Lift", np.arange(10.0), observed="1.4", wanted="1.5")[-3:]
+    array([-7., -8., -9.])
+    """
+    if observed == wanted:
+        return state
+    for convention in (observed, wanted):
+        check_convention(convention, task)
+    places, end = {}, 0
+    for name in _PARTS[task][observed]:
+        places[name] = range(end, end := end + _size(name))
+    if state.shape[-1] != end:
+        raise ValueError(f"object: expected {end} numbers for {task}, got {state.shape[-1]}")
+    order = [place for name in _PARTS[task][wanted] for place in places[name]]
+    signs = np.concatenate([np.full(_size(name), _sign(name)) for name in _PARTS[task][wanted]])
+    return state[..., order] * signs.astype(state.dtype)
+
+
+def _size(part: str) -> int:
+    if part in (*_HUNG, *_IN_BINS):
+        return 1
+    return 4 if part.endswith("_quat") else 3
+
+
+def _sign(part: str) -> float:
+    """Return the sign between the two conventions."""
+    return -1.0 if part in _NEGATED else 1.0
 
 
 def source_convention(source: Mapping[str, Any]) -> Convention:
@@ -71,8 +132,19 @@ def source_convention(source: Mapping[str, Any]) -> Convention:
     >>> source_convention({}), source_convention({"weights": "ema_model", "robosuite": "1.4.1"})
     ('1.5', '1.4')
     """
-    version = source.get("robosuite") or ("1.2" if "weights" in source else "1.5")
+    try:
+        return version_convention(source.get("robosuite") or ("1.2" if "weights" in source else "1.5"))
+    except ValueError as error:
+        raise ValueError(f"policy.source['robosuite']: {error}") from error
+
+
+def version_convention(version: str) -> Convention:
+    """Return the convention of a version of robosuite; ValueError for what is no version.
+
+    >>> version_convention("1.4.1"), version_convention("1.10")
+    ('1.4', '1.5')
+    """
     numbers = re.match(r"(\d+)\.(\d+)", version)
     if numbers is None:
-        raise ValueError(f"policy.source['robosuite']: expected a version such as 1.4.1, got {version!r}")
+        raise ValueError(f"expected a version such as 1.4.1, got {version!r}")
     return "1.4" if tuple(map(int, numbers.groups())) < (1, 5) else "1.5"

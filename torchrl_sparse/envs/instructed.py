@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from torchrl.envs import EnvBase
 
-from torchrl_sparse.envs.for_policy import camera_options, named_task
+from torchrl_sparse.envs.contract import named_task
+from torchrl_sparse.envs.for_policy import camera_options
 from torchrl_sparse.envs.libero import SUITES, require_libero
 from torchrl_sparse.envs.libero_suite import make_suite_env
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
 from torchrl_sparse.envs.transforms import make_env
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.vla import VLASource
 
-__all__ = ["InstructedTask", "find_instructed_task", "instructed_env"]
+__all__ = [
+    "InstructedTask",
+    "check_instructed",
+    "continued_vla_source",
+    "find_instructed_task",
+    "instructed_env",
+]
 
 
 @dataclass(frozen=True)
@@ -80,22 +88,55 @@ def instructed_env(
         ...
         ValueError: policy: expected one that was trained for Lift, got one for LiftNamed
     """
-    found = find_instructed_task(task)
-    _check_policy(found, policy)
+    found = check_instructed(task, policy, cameras)
     options = {"image_size": policy.network.config.image_size, "horizon": horizon}
     if found.name in SUITES:
         return partial(
             make_suite_env, found.name, as_released=policy.source.images == "openvla_oft", **options
         )
-    _check_cameras(cameras, policy.source.cameras)
     shown = {"n_obs_steps": 1, "object_state": False, "instruction": True, **camera_options(cameras)}
     return partial(make_env, found.name, **shown, **options)
 
 
-def _check_policy(task: InstructedTask, policy: VLAPolicy) -> None:
-    trained, config = policy.source.task, policy.network.config
-    if trained is not None and _known(trained) not in (None, task.name):
-        raise ValueError(f"policy: expected one that was trained for {task.name}, got one for {trained}")
+def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -> InstructedTask:
+    """Find a task, and refuse it for a policy to which what it shows means something else.
+
+    Args:
+        task: see `find_instructed_task`, which says what it raises.
+        policy: decides by its ``source``.
+        cameras: name of an observation here -> name of the images in demonstrations; not read for a suite of LIBERO.
+
+    Raises:
+        ValueError: as of `instructed_env`.
+    """
+    found, trained = find_instructed_task(task), policy.source.task
+    if trained is not None and _known(trained) not in (None, found.name):
+        raise ValueError(f"policy: expected one that was trained for {found.name}, got one for {trained}")
+    _check_sizes(found, policy)
+    if found.name not in SUITES:
+        _check_cameras(cameras, policy.source.cameras)
+    return found
+
+
+def continued_vla_source(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -> VLASource:
+    """Return the ``source`` of a policy after training it on: its own, for the task that it was last trained on.
+
+    Args:
+        task: that it is trained on now, see `find_instructed_task`.
+        policy: that is trained on.
+        cameras: of the demonstrations; noted where its ``source`` names none.
+
+    Raises:
+        ValueError: if what it observes and commands is not the task's, or its cameras are others.
+    """
+    found = find_instructed_task(task)
+    _check_sizes(found, policy)
+    _check_cameras(cameras, policy.source.cameras)
+    return replace(policy.source, task=found.name, cameras=policy.source.cameras or dict(cameras))
+
+
+def _check_sizes(task: InstructedTask, policy: VLAPolicy) -> None:
+    config = policy.network.config
     if (config.state_dim, config.action_dim) != (task.state_dim, task.action_dim):
         raise ValueError(
             f"policy: expected one of {task.state_dim} observed numbers and {task.action_dim} of an action, for {task.name}, "

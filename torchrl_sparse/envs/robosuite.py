@@ -253,12 +253,14 @@ class RobosuiteEnv(SeededEnv):
         """What demonstrations record: the task's state, and the hands' rotation that published policies observe."""
         return (*self.task.state_keys, *(f"robot{arm}_eef_quat" for arm in range(self.task.arms)))
 
-    def raw_observation(self, state_keys: Sequence[str] | None = None) -> Mapping[str, np.ndarray]:
-        """Return the parts of the task's state, or those of ``state_keys``, by robosuite's names, f64, in that order."""
+    def raw_observation(
+        self, state_keys: Sequence[str] | None = None, convention: Convention | None = None
+    ) -> Mapping[str, np.ndarray]:
+        """Return the parts of the state, or ``state_keys``, by robosuite's names, f64, in order, in a convention or its own."""
         # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
         self.sim_env._update_observables(force=True)
         observed = self.sim_env._get_observations(force_update=True)
-        observed["object"] = object_state(self.task.name, observed, self._convention)
+        observed["object"] = object_state(self.task.name, observed, convention or self._convention)
         wanted = self.task.state_keys if state_keys is None else state_keys
         parts = {name: np.asarray(observed[name]) for name in wanted}
         return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
@@ -290,8 +292,6 @@ class RobosuiteEnv(SeededEnv):
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
         """Return a u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
         return self._cameras.render(self.sim_env.sim, camera, height, width)
-
-    # -- clean-up ------------------------------------------------------------------------------------------------------
 
     def close(self, *, raise_if_closed: bool = True) -> Any:
         self._cameras.close()

@@ -17,10 +17,10 @@ from recipes.studies.carried_noise.chains import carried_noise
 from recipes.studies.carried_noise.figures import plot_carried_noise
 from recipes.studies.carried_noise.results import CarriedNoiseResults, save_carried_noise
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 

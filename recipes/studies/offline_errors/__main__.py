@@ -31,6 +31,7 @@ from recipes.studies.offline_errors.results import (
 )
 from torchrl_sparse.cli.options import Word, Words
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.results.schema import DENSE, load_results
@@ -38,7 +39,6 @@ from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.statistics.offline import OfflineErrors, draw_answers, offline_errors
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.training.diffusion.observed import policy_demos
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 

@@ -33,7 +33,8 @@ def make_trainer(demos):
         network = TransformerForDiffusion(**sizes, n_layer=1, n_emb=16)
         normalizer = Normalizer.fit(demos.data[keys.STATE], demos.data[keys.ACTION])
         config = {"max_steps": 6, "batch_size": 4, "n_action_steps": 2, "lr": 1e-3, "lr_warmup_steps": 1}
-        return PolicyTrainer(network, normalizer, demos, TrainConfig(**(config | changes)), vision)
+        policy = DiffusionPolicy(network, normalizer, vision=vision, engine="reference")
+        return PolicyTrainer(policy, demos, TrainConfig(**(config | changes)))
 
     return make
 

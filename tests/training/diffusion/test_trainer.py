@@ -8,7 +8,7 @@ import pytest
 import torch
 from diffusers.training_utils import EMAModel
 
-from torchrl_sparse import keys
+from torchrl_sparse import DiffusionPolicy, keys
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
@@ -22,7 +22,8 @@ def make_trainer(make_network, demos):
     def make(network_changes=None, **changes) -> PolicyTrainer:
         normalizer = Normalizer.fit(demos.data[keys.STATE], demos.data[keys.ACTION])
         network = make_network(**({"p_drop_attn": 0.2} | (network_changes or {})))
-        return PolicyTrainer(network, normalizer, demos, dataclasses.replace(CONFIG, **changes))
+        policy = DiffusionPolicy(network, normalizer, engine="reference")
+        return PolicyTrainer(policy, demos, dataclasses.replace(CONFIG, **changes))
 
     return make
 
@@ -175,7 +176,7 @@ def test_damaged_checkpoints_are_named(make_trainer, tmp_path):
 def test_diverged_training_stops_with_the_weights_it_had(make_trainer):
     trainer = make_trainer()
     before = [value.clone() for value in weights(trainer)]
-    trainer.normalizer.action_scale.fill_(torch.inf)
+    trainer.policy.normalizer.action_scale.fill_(torch.inf)
     with pytest.raises(FloatingPointError, match="step 0: loss is nan"):
         trainer.train_step()
     assert all(torch.equal(a, b) for a, b in zip(before, weights(trainer), strict=True))

@@ -27,6 +27,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.envs.contract import provenance
 from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate.candidates import Grid, calibrate_candidates, family
@@ -92,7 +93,7 @@ def accelerate(
 
     Examples:
         >>> from torchrl_sparse.envs.for_policy import diffusion_env
-        >>> from torchrl_sparse.training.diffusion.observed import policy_demos
+        >>> from torchrl_sparse.data.for_policy import policy_demos
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
         >>> demos = policy_demos("lift.hdf5", "lift", policy)  # doctest: +SKIP
         >>> request = Request("lift", budget_ms=5)
@@ -102,7 +103,12 @@ def accelerate(
         'ddpm3_logsnr'
     """
     _check_policy(policy)
-    made_for = {"policy": policy.fingerprint, **policy.sampler.config, **made_for}
+    made_for = {
+        "policy": policy.fingerprint,
+        **policy.sampler.config,
+        **provenance(demos.contract),
+        **made_for,
+    }
     made_for |= {"demonstrations": len(demos), "steps": len(demos.data)}
     made_for |= {name: getattr(request, name) for name in ("windows", "seed", "n_action_steps")}
     targets, queries = _from_demonstrations(policy, demos, request)

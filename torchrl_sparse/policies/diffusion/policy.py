@@ -30,7 +30,7 @@ from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, c
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
-from torchrl_sparse.policies.diffusion.kinds import check_kinds
+from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained_steps
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
@@ -53,7 +53,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         network: the denoiser.
         normalizer: of states and actions.
         vision: encoder of the cameras; their features come before the state in the network's condition.
-        sampler: DDPM with all training steps by default.
+        sampler: of as many training steps as the network was trained with; DDPM with all of 100 by default.
         plan: the planner; None is dense.
         engine: what runs the denoising loop, see `torchrl_sparse.blocks.engine.make_engine`: ``"auto"`` (the
             fastest that applies), ``"native"``, ``"torch"`` or ``"reference"``. All give the same actions for the same mask and
@@ -139,6 +139,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
+        check_trained_steps(self.sampler, sampler)
         if recalls := keys.RECALL in plan.out_keys:
             check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
@@ -157,13 +158,13 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
 
         Raises:
-            ValueError: if the planner was made for another policy or sampler, or the start cannot serve it.
+            ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
+                other training steps.
         """
-        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
-        policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
+        shared = {"vision": self.vision, "engine": self.engine, "sampler": self.sampler}
+        policy = DiffusionPolicy(self.network, self.normalizer, **shared)
+        policy._install(plan, sampler or self.sampler, start)
         policy.source = self.source
-        if start is not None:
-            policy.start = start
         policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy

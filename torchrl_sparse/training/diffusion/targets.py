@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.envs.contract import check_contract
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, parse_json
@@ -66,9 +67,11 @@ def make_targets(
         f32 [N, H, A], normalised; with several ``turns``, [N, turns].
 
     Raises:
-        ValueError: if the share leaves no window, or no episode has so many turns.
+        ValueError: if the share leaves no window, no episode has so many turns, or the demonstrations mean something else than
+            what the policy observes.
     """
     network, normalizer = policy.network, policy.normalizer
+    check_contract(policy, demos.contract)
     if source not in ("teacher", "data"):
         raise ValueError(f"source: expected 'teacher' or 'data', got {source!r}")
     rows = demos.window_rows(network.horizon, network.n_obs_steps, n_action_steps)
@@ -142,6 +145,7 @@ def add_queries(
     return together[torch.randperm(len(together), generator=torch.Generator().manual_seed(seed))]
 
 
+@torch.no_grad()
 def dense_answers(
     policy: DiffusionPolicy,
     queries: TensorDictBase,

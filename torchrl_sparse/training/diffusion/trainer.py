@@ -10,10 +10,8 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.envs.contract import check_contract
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
-from torchrl_sparse.networks.diffusion.vision import VisionEncoder
-from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import DemonstrationTrainer, TrainConfig, split_windows
 from torchrl_sparse.training.diffusion.loss import DiffusionLoss
@@ -26,29 +24,23 @@ _VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as publis
 
 
 class PolicyTrainer(DemonstrationTrainer):
-    """Trains a denoiser on demonstrations.
+    """Trains the networks of a diffusion policy on demonstrations.
 
     Args:
-        network: the network, trained in place.
-        normalizer: of states and actions.
-        demos: demonstrations.
+        policy: the policy, whose networks are trained in place. Normaliser, sampler and ``source`` stay as they are.
+        demos: demonstrations of what it observes.
         config: how to train.
-        vision: encoder of the cameras that the demonstrations have images of, trained in place.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on.
+        ValueError: if ``val_ratio`` leaves no episode to train on, or the demonstrations mean something else than what the
+            policy observes.
     """
 
-    def __init__(
-        self,
-        network: TransformerForDiffusion,
-        normalizer: Normalizer,
-        demos: Demonstrations,
-        config: TrainConfig,
-        vision: VisionEncoder | None = None,
-    ) -> None:
-        self.network, self.normalizer, self.demos, self.vision = network, normalizer, demos, vision
-        self.loss = DiffusionLoss(network, normalizer, Sampler(), vision)
+    def __init__(self, policy: DiffusionPolicy, demos: Demonstrations, config: TrainConfig) -> None:
+        check_contract(policy, demos.contract)
+        self.policy, self.demos = policy, demos
+        self.network, self.vision = network, vision = policy.network, policy.vision
+        self.loss = DiffusionLoss(network, policy.normalizer, policy.sampler, vision)
         self._data_checksum = sum(checksum(value) for value in demos.data.values(True, True))
         sizes = (network.horizon, network.n_obs_steps, config.n_action_steps)
         groups, module = optimizer_groups(network, config.weight_decay), network
@@ -58,12 +50,20 @@ class PolicyTrainer(DemonstrationTrainer):
         super().__init__(module, config, groups, *split_windows(demos, sizes, config.val_ratio))
 
     def ema_policy(self, sampler: Sampler | None = None) -> DiffusionPolicy:
-        """Return a policy with copies of the networks, the averaged weights in them, and ``sampler``."""
+        """Return a policy with copies of the networks, the averaged weights in them.
+
+        Args:
+            sampler: of as many training steps as the policy's; None for the policy's own.
+        """
         averaged = self.averaged()
         network, vision = (
             (averaged, None) if self.vision is None else (averaged["network"], averaged["vision"])
         )
-        return DiffusionPolicy(network, self.normalizer, vision=vision, sampler=sampler)
+        policy = DiffusionPolicy(network, self.policy.normalizer, vision=vision, sampler=self.policy.sampler)
+        policy.source = self.policy.source
+        if sampler is not None:
+            policy.sampler = sampler
+        return policy
 
     def window_loss(self, rows: Tensor) -> Tensor:
         batch = self.demos.windows(rows, self.network.n_obs_steps)
