@@ -28,7 +28,6 @@ from torchrl_sparse.evaluation.figures.looking import plot_looking, plot_reuse_s
 from torchrl_sparse.evaluation.statistics.looking import looking
 from torchrl_sparse.evaluation.statistics.oracle import oracle
 from torchrl_sparse.evaluation.statistics.reuse_sources import reuse_sources
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import published_shape
@@ -85,10 +84,16 @@ def make_policy(config: DictConfig) -> DiffusionPolicy:
     """Return the policy with the pruner and its sampler, or with the sampler that is asked for."""
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.pruner is None:
-        return policy if config.sampler is None else policy.with_plan(None, Sampler.from_name(config.sampler))
+        return (
+            policy
+            if config.sampler is None
+            else policy.with_plan(None, policy.sampler.variant_named(config.sampler))
+        )
     pruner = SAGPruner.from_pretrained(config.pruner)
     made_for = pruner.made_for
-    pruned = policy.with_plan(pruner, Sampler.from_name(made_for.sampler, made_for.num_inference_steps))
+    pruned = policy.with_plan(
+        pruner, policy.sampler.variant_named(made_for.sampler, made_for.num_inference_steps)
+    )
     return pruned.to(config.device)
 
 

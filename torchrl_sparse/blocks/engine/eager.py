@@ -31,6 +31,7 @@ def published_forward(
 def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
     """Make diffusers' own, or raise ValueError if it would step elsewhere."""
     options = {"num_train_timesteps": sampler.num_train_timesteps, "beta_schedule": "squaredcos_cap_v2"}
+    options |= {"clip_sample_range": sampler.clip_sample_range}
     if sampler.kind == "ddpm":
         scheduler = DDPMScheduler(variance_type="fixed_small", **options)
         scheduler.set_timesteps(timesteps=sampler.timesteps.tolist())

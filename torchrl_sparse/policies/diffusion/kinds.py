@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["check_kinds"]
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+
+__all__ = ["check_kinds", "check_trained"]
 
 
 def check_kinds(**parts: tuple[Any, type]) -> None:
@@ -24,3 +26,12 @@ def check_kinds(**parts: tuple[Any, type]) -> None:
                 f"the class {part.__name__}" if isinstance(part, type) else f"{type(part).__name__} {part!r}"
             )
             raise ValueError(f"{name}: expected a {kind.__name__}, got {got}")
+
+
+def check_trained(sampler: Sampler, own: Sampler) -> None:
+    """Raise ValueError unless ``sampler`` is one of the network that the policy's ``own`` is of, see `Sampler.trained`."""
+    if sampler.trained != own.trained:
+        raise ValueError(
+            f"sampler: expected {own.trained}, with which the policy was trained, got {sampler.trained}; "
+            "policy.sampler.variant(...) makes one that fits"
+        )

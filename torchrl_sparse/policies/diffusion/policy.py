@@ -30,7 +30,7 @@ from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, c
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
-from torchrl_sparse.policies.diffusion.kinds import check_kinds
+from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
@@ -62,7 +62,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     Attributes:
         plan: the planner. Assign another to change the method, or None for the dense policy, which then reads as `Dense`.
-        sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
+        sampler: the sampler. Assign another of the same training steps to change it: ``policy.sampler = Sampler("ddim", 10)``.
         start: what queries begin from: noise, the last chunk after ``policy.start = WarmStart(1)``, or noise that is drawn to
             the last chunk after ``policy.start = RealtimeChunking()``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
@@ -127,6 +127,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         if name == "plan":
             self._install(value, self.sampler, self.start)
         elif name == "sampler":
+            check_kinds(sampler=(value, Sampler))
+            check_trained(value, self.sampler)
             self._install(self.plan, value, self.start)
         elif name == "start":
             self._install(self.plan, self.sampler, value)
@@ -159,7 +161,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         Raises:
             ValueError: if the planner was made for another policy or sampler, or the start cannot serve it.
         """
-        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler or self.sampler}
+        check_trained(sampler := sampler or self.sampler, self.sampler)
+        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
         policy.source = self.source
         if start is not None:
