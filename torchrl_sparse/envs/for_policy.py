@@ -70,12 +70,25 @@ def _check_task(task: Task, policy: DiffusionPolicy) -> None:
     trained = policy.source.get("task")
     if trained is not None and named_task(trained) not in (None, task.name):
         raise ValueError(f"policy: expected one that was trained for {task.name}, got one for {trained}")
+    _check_actions(task, policy.source)
     found = (policy.normalizer.state_scale.numel(), policy.normalizer.action_scale.numel())
     expected = (_state_size(task, policy), task.action_dim)
     if found != expected:
         raise ValueError(
             f"policy: expected one of {expected[0]} observed numbers and {expected[1]} of an action, for {task.name}, "
             f"got one of {found[0]} and {found[1]}"
+        )
+
+
+def _check_actions(task: Task, source: Mapping[str, Any]) -> None:
+    """Refuse an imported policy whose actions are of the other kind than the task's: their sizes may be the same."""
+    absolute = source.get("abs_action")
+    if absolute is None and "weights" in source and not task.acts_in_poses:
+        absolute = False  # as published code takes it; a pose of a robosuite arm is known by its size
+    if task.abs_action is not None and absolute is not None and absolute != task.abs_action:
+        kinds = {True: "absolute actions (abs_action true)", False: "relative actions (abs_action false)"}
+        raise ValueError(
+            f"policy: expected one of {kinds[task.abs_action]} for {task.name}, got one of {kinds[absolute]}"
         )
 
 

@@ -29,7 +29,7 @@ from numbers import Integral
 import numpy as np
 from torch import Tensor
 
-__all__ = ["SPACINGS", "check_timesteps", "spaced_timesteps", "timesteps_fall"]
+__all__ = ["SPACINGS", "check_timesteps", "falls_evenly", "spaced_timesteps", "timesteps_fall"]
 
 SPACINGS = ("leading", "trailing", "linspace", "logsnr")
 _SMALLEST_LOG_RATIO = -2.1
@@ -105,3 +105,15 @@ def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
     (True, False, False)
     """
     return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
+
+
+def falls_evenly(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+    """Return whether each of K timesteps lies T // K above the next, and the last no more above the clean sample.
+
+    Whatever the spacing, diffusers' DDIM leads T // K down; elsewhere it asks the network about another timestep than that.
+
+    >>> falls_evenly([90, 60, 30, 0], 120), falls_evenly([99, 66, 33, 0], 100)
+    (True, False)
+    """
+    gap = num_train_timesteps // len(timesteps)
+    return all(max(earlier - gap, -1) == later for earlier, later in pairwise((*timesteps, -1)))

@@ -7,6 +7,7 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
@@ -127,8 +128,6 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         if name == "plan":
             self._install(value, self.sampler, self.start)
         elif name == "sampler":
-            check_kinds(sampler=(value, Sampler))
-            check_trained(value, self.sampler)
             self._install(self.plan, value, self.start)
         elif name == "start":
             self._install(self.plan, self.sampler, value)
@@ -141,6 +140,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
+        check_trained(sampler, self.sampler)
         if recalls := keys.RECALL in plan.out_keys:
             check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
@@ -161,12 +161,10 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         Raises:
             ValueError: if the planner was made for another policy or sampler, or the start cannot serve it.
         """
-        check_trained(sampler := sampler or self.sampler, self.sampler)
-        shared = {"vision": self.vision, "engine": self.engine, "sampler": sampler}
-        policy = DiffusionPolicy(self.network, self.normalizer, plan=plan, **shared)
+        shared = {"vision": self.vision, "engine": self.engine, "sampler": self.sampler}
+        policy = DiffusionPolicy(self.network, self.normalizer, **shared)
         policy.source = self.source
-        if start is not None:
-            policy.start = start
+        policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy
@@ -279,15 +277,17 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return policy
 
     @classmethod
-    def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
+    def from_diffusion_policy(
+        cls, path: str | Path, *, engine: EngineName = "auto", ignore: Collection[str] = ()
+    ) -> DiffusionPolicy:
+        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`, also on ``ignore``).
 
-        Averaged weights are used where there are any; ``source`` says what it was trained for. Nothing is executed.
+        Averaged weights are used unless ``use_ema`` is false; ``source`` says what it was trained for. Nothing is executed.
 
         Raises:
             FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.
         """
-        return cls._assemble(read_diffusion_policy(path), engine)
+        return cls._assemble(read_diffusion_policy(path, ignore), engine)
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:

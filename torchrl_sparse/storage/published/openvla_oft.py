@@ -26,6 +26,7 @@ from torchrl_sparse.networks.vla.text import LlamaTokenizer
 from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.published.faults import naming_faults
 from torchrl_sparse.storage.published.torch_archive import TorchArchive
+from torchrl_sparse.storage.published.wrappers import without_wrappers
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, shapes_of, take
 from torchrl_sparse.storage.vla import StoredVLA, VLASource
 
@@ -144,7 +145,7 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
             tensors = {name: archive.tensor(value) for name, value in archive.contents().items()}
     except (AttributeError, ValueError) as error:  # AttributeError: it holds anything but tensors by name
         raise ValueError(f"{files[0]}: expected a file of tensors, got: {error}") from error
-    return {prefix + name.removeprefix("module."): value for name, value in tensors.items()}
+    return {prefix + name: value for name, value in without_wrappers(str(files[0]), tensors).items()}
 
 
 def _statistics(path: Path, unnorm_key: str | None) -> tuple[str, dict[str, Any]]:
