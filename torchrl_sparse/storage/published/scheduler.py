@@ -62,6 +62,8 @@ def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampl
         raise ValueError(f"cfg: {_PLACE}.timestep_spacing: expected one of {_SPACINGS}, got {spacing!r}")
     offset = config.get(f"{_PLACE}.steps_offset", int, 0) if spacing == "leading" else 0
     eta = config.get("policy.eta", float, 0.0)
+    if eta and kind == "ddpm":
+        raise ValueError(f"cfg: policy.eta: expected none of DDPM, whose step does not take it, got {eta}")
     try:
         sampler = Sampler(kind, steps, eta=eta, spacing=spacing, **trained)
         if offset:
