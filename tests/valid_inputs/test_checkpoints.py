@@ -130,13 +130,13 @@ def test_every_entry_that_diffusers_has_may_be_written_out(tmp_path, made, kind)
 
 
 REFUSED = [
-    (DDPM, 10, {"trained_betas": [0.1] * 100}, "trained_betas: expected None"),
-    (DDPM, 10, {"thresholding": True}, "thresholding: expected False"),
-    (DDPM, 10, {"rescale_betas_zero_snr": True}, "rescale_betas_zero_snr: expected False"),
+    (DDPM, 10, {"trained_betas": [0.1] * 100}, "trained_betas: expected null"),
+    (DDPM, 10, {"thresholding": True}, "thresholding: expected false"),
+    (DDPM, 10, {"rescale_betas_zero_snr": True}, "rescale_betas_zero_snr: expected false"),
     (DDPM, 10, {"variance_type": "fixed_small_log"}, "variance_type: expected 'fixed_small'"),
     (DDPM, 100, {"steps_offset": 1}, "steps_offset: timesteps: expected 100"),
     (DDPM, 10, {"_target_": "mine.schedulers.DDPMScheduler"}, "expected diffusers' DDPMScheduler or DDIM"),
-    (DDIM, 10, {"set_alpha_to_one": False}, "set_alpha_to_one: expected True, got False"),
+    (DDIM, 10, {"set_alpha_to_one": False}, "set_alpha_to_one: expected true, got false"),
     # diffusers' DDIM leads T // K down and asks elsewhere: no chain of timesteps
     (DDIM, 10, {"timestep_spacing": "linspace"}, "timestep_spacing: expected timesteps 10 apart"),
     (DDIM, 7, {"timestep_spacing": "trailing"}, "timestep_spacing: expected timesteps 14 apart"),
@@ -163,10 +163,10 @@ def put(path, value):
     [
         ("n_latency_steps", 2, "expected 0, got 2"),
         ("task.env_runner.n_latency_steps", 1, "expected 0, got 1"),
-        ("past_action_visible", True, "expected False, got True"),
+        ("past_action_visible", True, "expected false, got true"),
         ("keypoint_visible_rate", 0.5, r"expected 1\.0, got 0\.5"),
-        ("policy.use_clipped_model_output", True, "expected False, got True"),
-        ("policy.obs_as_cond", False, "expected True, got False"),
+        ("policy.use_clipped_model_output", True, "expected false, got true"),
+        ("policy.obs_as_cond", False, "expected true, got false"),
         ("policy.eta", 0.5, "expected none of DDPM"),
         ("policy.guidance", 2.0, "expected no entry of this name"),
         ("policy.n_action_steps", 4, "expected 8, as n_action_steps, got 4"),
@@ -175,12 +175,12 @@ def put(path, value):
         ("policy.model._target_", "mine.Mamba", "expected TransformerForDiffusion, got mine.Mamba"),
         ("obs_dim", 20, "is 20, the tensors say 19"),
         ("action_dim", 7, "is 7, the tensors say 10"),
-        ("task.obs_eef_target", False, "expected True, got False"),
-        ("task.env_runner.agent_keypoints", True, "expected False, got True"),
-        ("task.env_runner.abs_action", False, "expected True, as task.abs_action, got False"),
+        ("task.obs_eef_target", False, "expected true, got false"),
+        ("task.env_runner.agent_keypoints", True, "expected false, got true"),
+        ("task.env_runner.abs_action", False, "expected true, as task.abs_action, got false"),
         ("task.env_runner.obs_keys", ["object"], r"expected \['object', 'robot0_eef_pos'"),
         ("task.dataset.rotation_rep", "axis_angle", "expected 'rotation_6d', got 'axis_angle'"),
-        ("task.dataset.delta_action", True, "expected False, got True"),
+        ("task.dataset.delta_action", True, "expected false, got true"),
         ("task.pose_repr", {"obs": "relative"}, "expected no entry of this name"),
     ],
 )
@@ -348,5 +348,5 @@ def test_a_crop_that_is_not_written_is_the_published_default(tmp_path, said, cro
 
 def test_batch_norms_of_an_image_policy_are_named(tmp_path):
     """Without ``obs_encoder_group_norm`` the published encoder has batch norms, which this one has not."""
-    with pytest.raises(CheckpointError, match="obs_encoder_group_norm: expected True, got False"):
+    with pytest.raises(CheckpointError, match="obs_encoder_group_norm: expected true, got false"):
         read(tmp_path, ImagePolicy(), put("policy.obs_encoder_group_norm", False), make_config=image_config)

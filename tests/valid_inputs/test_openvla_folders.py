@@ -136,7 +136,7 @@ def test_two_arms_are_refused(weights, tmp_path):
     }
     published.write(tmp_path, weights[0], head, weights[2] | {"module.fc1.weight": torch.zeros(width, 14)})
     with pytest.raises(
-        CheckpointError, match="expected a policy of LIBERO's 8 numbers .* and 7 .*, got one of 14 and 14"
+        CheckpointError, match=r"expected a policy of LIBERO's 8 numbers .* and 7 .*, got one of 14 and 14"
     ):
         load(tmp_path)
 
@@ -161,7 +161,7 @@ def test_arguments_of_the_other_layout_are_not_passed_over(folder, tmp_path):
     """A folder of ours says everything itself, and a published one is of one architecture."""
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny()))
     policy.save_pretrained(tmp_path / "ours")
-    with pytest.raises(ValueError, match="chunk_size: expected none for .*ours"):
+    with pytest.raises(ValueError, match=r"chunk_size: expected none for .*ours"):
         VLAPolicy.from_pretrained(tmp_path / "ours", chunk_size=5)
     with pytest.raises(ValueError, match="config: expected none for"):
         VLAPolicy.from_pretrained(folder, config=VLAConfig.tiny())

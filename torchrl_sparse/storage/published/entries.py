@@ -7,6 +7,7 @@ does not depend on. Any other is refused: what it does is not known here. Entrie
 
 from __future__ import annotations
 
+import json
 import reprlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -50,7 +51,12 @@ def check_value(config: PublishedConfig, path: str, default: Any, supported: Any
     """Raise ValueError unless the entry at ``path``, or the ``default`` where there is none, is ``supported``."""
     found = config.value(path) if supported is None else config.get(path, type(supported), default)
     if found != supported:
-        raise ValueError(f"cfg: {path}: expected {supported!r}, got {reprlib.repr(found)}")
+        raise ValueError(f"cfg: {path}: expected {_written(supported)}, got {_written(found)}")
+
+
+def _written(value: Any) -> str:
+    """Return a value as YAML has it, shortened."""
+    return json.dumps(value) if isinstance(value, bool | None) else reprlib.repr(value)
 
 
 _NO_LATENCY = {
@@ -186,7 +192,9 @@ def _agreed(said: Mapping[str, Any]) -> Any:
     first = next(iter(said), None)
     for place, value in said.items():
         if value != said[first]:
-            raise ValueError(f"cfg: {place}: expected {said[first]!r}, as {first}, got {value!r}")
+            raise ValueError(
+                f"cfg: {place}: expected {_written(said[first])}, as {first}, got {_written(value)}"
+            )
     return said.get(first)
 
 
