@@ -131,6 +131,12 @@ def test_every_entry_that_diffusers_has_may_be_written_out(tmp_path, made, kind)
 
 REFUSED = [
     (DDPM, 10, {"trained_betas": [0.1] * 100}, "trained_betas: expected null"),
+    (
+        DDPM,
+        10,
+        {"clip_sample": None},
+        "clip_sample: expected a value, got null",
+    ),  # to diffusers, null is false
     (DDPM, 10, {"thresholding": True}, "thresholding: expected false"),
     (DDPM, 10, {"rescale_betas_zero_snr": True}, "rescale_betas_zero_snr: expected false"),
     (DDPM, 10, {"variance_type": "fixed_small_log"}, "variance_type: expected 'fixed_small'"),

@@ -28,21 +28,26 @@ class Section:
         fixed: name -> (what the published code takes where it is missing, what is supported).
         read: names that are read elsewhere.
         unused: names on which a query does not depend.
+        nullable: those of ``fixed`` and ``read`` that may be null, which is no default to the published code.
     """
 
     fixed: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     read: frozenset[str] = frozenset()
     unused: frozenset[str] = frozenset()
+    nullable: frozenset[str] = frozenset()
 
     def check(self, config: PublishedConfig, path: str, ignore: Collection[str] = ()) -> None:
         """Raise ValueError for an entry of the section at ``path`` that is not supported, or unknown and not in ``ignore``."""
-        known = self.fixed.keys() | self.read | self.unused | _HYDRA
-        for place in (f"{path}.{name}" for name in config.names(path) or () if name not in known):
-            if place not in ignore:
+        read = self.fixed.keys() | self.read
+        for name in config.names(path) or ():
+            place = f"{path}.{name}"
+            if name not in read | self.unused | _HYDRA and place not in ignore:
                 raise ValueError(
                     f"cfg: {place}: expected no entry of this name, whose effect is not known here; "
                     f"import with ignore=[{place!r}] if the policy does not depend on it"
                 )
+            if name in read - self.nullable and config.value(place) is None:
+                raise ValueError(f"cfg: {place}: expected a value, got null")
         for name, (default, supported) in self.fixed.items():
             check_value(config, f"{path}.{name}", default, supported)
 
@@ -59,9 +64,8 @@ def _written(value: Any) -> str:
     return json.dumps(value) if isinstance(value, bool | None) else reprlib.repr(value)
 
 
-_NO_LATENCY = {
-    "n_latency_steps": (0, 0)
-}  # else the policy is asked about the past and part of its chunk is dropped
+# With latency, the policy is asked about the past and the first actions of its chunk are dropped.
+_NO_LATENCY = {"n_latency_steps": (0, 0)}
 _TOP = _NO_LATENCY | {
     "past_action_visible": (False, False),
     "keypoint_visible_rate": (1.0, 1.0),  # else some keypoints are zeros
@@ -72,26 +76,28 @@ _DENOISER = frozenset(
     | {"causal_attn"}
 )
 _POLICY = frozenset({"noise_scheduler", "horizon", "n_action_steps", "n_obs_steps", "num_inference_steps"})
+_NULLABLE = frozenset({"num_inference_steps"})  # as many as in training
 # What the policy hands on to the scheduler's step; eta is read with the scheduler.
 _STEP = {"use_clipped_model_output": (False, False)}
 _WHOLE_CHUNK = {"pred_action_steps_only": (False, False)}
 
 _MODEL = Section(
-    fixed={
-        "time_as_cond": (True, True),
-        "obs_as_cond": (True, True),
-    },  # of the second, published code asks cond_dim
+    # Of obs_as_cond, the published denoiser asks cond_dim alone, which the tensors have.
+    fixed={"time_as_cond": (True, True), "obs_as_cond": (True, True)},
     read=_DENOISER | {"input_dim", "output_dim", "cond_dim"},
+    nullable=frozenset({"n_obs_steps"}),  # as many as the horizon
 )
 _LOW_DIM = Section(
     fixed={"obs_as_cond": (False, True)} | _WHOLE_CHUNK | _STEP,
     read=_POLICY | {"model", "obs_dim", "action_dim", "eta"},
+    nullable=_NULLABLE,
 )
 _IMAGES = Section(
     fixed={"obs_encoder_group_norm": (False, True), "time_as_cond": (True, True), "obs_as_cond": (True, True)}
     | _WHOLE_CHUNK
     | _STEP,
     read=_POLICY | _DENOISER | {"shape_meta", "crop_shape", "eval_fixed_crop", "eta"},
+    nullable=_NULLABLE | {"crop_shape"},
 )
 
 _SEEN_TARGET = {"obs_eef_target": (True, True)}  # of block pushing; else two numbers of the state are zeros
@@ -99,16 +105,17 @@ _TASK = Section(
     fixed=_SEEN_TARGET,
     read=frozenset({"name", "abs_action", "obs_keys", "obs_dim", "action_dim", "shape_meta", "env_meta"})
     | {"env_runner", "dataset"},
-    unused=frozenset(
-        {"task_name", "dataset_type", "dataset_path", "dataset_dir", "image_shape"}
-    )  # where data are
-    | {"keypoint_dim", "robot_noise_ratio"},  # noise of published training and evaluation
+    nullable=frozenset({"name", "env_runner", "dataset", "env_meta", "obs_keys"}),
+    # Where data are, and noise of published training and evaluation.
+    unused=frozenset({"task_name", "dataset_type", "dataset_path", "dataset_dir", "image_shape"})
+    | {"keypoint_dim", "robot_noise_ratio"},
 )
 _RUNNER = Section(
     fixed=_NO_LATENCY
     | _SEEN_TARGET
     | {"past_action": (False, False), "keypoint_visible_rate": (1.0, 1.0), "agent_keypoints": (False, False)},
     read=frozenset({"abs_action", "obs_keys", "shape_meta", "env_meta", "n_obs_steps", "n_action_steps"}),
+    nullable=frozenset({"env_meta"}),
     # Which episodes are played, how long, how many at once, and how they are filmed.
     unused=frozenset(
         {"n_train", "n_train_vis", "train_start_idx", "train_start_seed", "n_test", "n_test_vis"}

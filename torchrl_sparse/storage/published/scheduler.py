@@ -30,9 +30,10 @@ _COMMON = {  # with diffusers' defaults
 }
 _READ = frozenset({"num_train_timesteps", "clip_sample_range", "timestep_spacing", "steps_offset"})
 _UNUSED = frozenset({"beta_start", "beta_end", "sample_max_value", "dynamic_thresholding_ratio"})
+_NULLABLE = frozenset({"trained_betas"})
 _SECTIONS = {
-    "ddpm": Section(_COMMON, _READ, _UNUSED),
-    "ddim": Section(_COMMON | {"set_alpha_to_one": (True, True)}, _READ, _UNUSED),
+    "ddpm": Section(_COMMON, _READ, _UNUSED, _NULLABLE),
+    "ddim": Section(_COMMON | {"set_alpha_to_one": (True, True)}, _READ, _UNUSED, _NULLABLE),
 }
 
 
