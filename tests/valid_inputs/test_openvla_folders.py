@@ -4,12 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.fixtures.gguf import METADATA, gguf_bytes, llama_tensors, tiny_weights
 from tests.storage.published import openvla as published
 from tests.storage.published.test_openvla_oft import edit, published_crop
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.language_model import read_language_model
 from torchrl_sparse.storage.published.faults import CheckpointError
 
 
@@ -165,3 +167,14 @@ def test_arguments_of_the_other_layout_are_not_passed_over(folder, tmp_path):
         VLAPolicy.from_pretrained(tmp_path / "ours", chunk_size=5)
     with pytest.raises(ValueError, match="config: expected none for"):
         VLAPolicy.from_pretrained(folder, config=VLAConfig.tiny())
+
+
+@pytest.mark.parametrize("name", ["llama.rope.dimension_count", "llama.attention.key_length"])
+def test_a_language_model_that_turns_a_part_of_each_head_is_named(tmp_path, name):
+    """GGUF files may say how much of a head its rotary embeddings turn; the decoder here turns all of it."""
+    for size in (8, 4):
+        tensors = llama_tensors(tiny_weights())
+        (tmp_path / f"{size}.gguf").write_bytes(gguf_bytes(METADATA | {name: size}, tensors))
+    assert read_language_model(tmp_path / "8.gguf").sizes["kv_heads"] == 2
+    with pytest.raises(ValueError, match=rf"4.gguf: {name}: expected 8, the size of a head, got 4"):
+        read_language_model(tmp_path / "4.gguf")

@@ -86,10 +86,9 @@ def _check_actions(task: Task, source: Mapping[str, Any]) -> None:
     if absolute is None and "weights" in source and not task.acts_in_poses:
         absolute = False  # as published code takes it; a pose of a robosuite arm is known by its size
     if task.abs_action is not None and absolute is not None and absolute != task.abs_action:
-        kinds = {True: "absolute actions (abs_action true)", False: "relative actions (abs_action false)"}
-        raise ValueError(
-            f"policy: expected one of {kinds[task.abs_action]} for {task.name}, got one of {kinds[absolute]}"
-        )
+        kinds = {"True": "absolute actions (abs_action true)", "False": "relative actions (abs_action false)"}
+        expected, got = (kinds.get(str(kind), repr(kind)) for kind in (task.abs_action, absolute))
+        raise ValueError(f"policy: expected one of {expected} for {task.name}, got one of {got}")
 
 
 def named_task(trained: str) -> str | None:
