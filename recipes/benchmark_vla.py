@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.cli.options import check_names
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.vla import load_vla
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.instructed import find_instructed_task, instructed_env
@@ -112,8 +113,7 @@ def main(config: DictConfig) -> None:
 
 
 def load_policy(config: DictConfig) -> VLAPolicy:
-    published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
-    return VLAPolicy.from_pretrained(config.policy, base=config.base, **published).to(config.device)
+    return load_vla(config, config.task).to(config.device)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 
@@ -29,8 +28,7 @@ def main(config: DictConfig) -> None:
     task = find_task(config.task).name
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.sampler is not None:
-        train_steps = policy.sampler.num_train_timesteps
-        policy.sampler = Sampler.from_name(config.sampler, num_train_timesteps=train_steps)
+        policy.sampler = policy.sampler.variant_named(config.sampler)
     environment = diffusion_env(task, policy)
     seeds = tuning_seeds(config.seed, config.samples)
     calibration = calibrate_policy(policy, environment, seeds)

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.vla import load_vla
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.data.for_policy import instructed_demos
@@ -48,9 +49,8 @@ def main(config: DictConfig) -> None:
     measures = {"action_error": errors, "success": lost_episodes}
     if config.measure not in measures:
         raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
-    published = {"unnorm_key": config.task, "heads": tuple(config.heads)}
     tried = pruners(config)  # first, since what it refuses need not be recorded
-    policy = VLAPolicy.from_pretrained(config.policy, base=config.base, **published).to(config.device)
+    policy = load_vla(config, config.task).to(config.device)
     points = tuple(measures[config.measure](policy, tried, config))
     for point in points:
         print(f"{config.method}@{point.number:g}: {point.kept:.1f} visual tokens, loss {point.loss:.4g}")

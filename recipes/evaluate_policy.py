@@ -27,7 +27,6 @@ from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
 from torchrl_sparse.evaluation.statistics.ways import way_entropy
 from torchrl_sparse.methods.diffusion import method_identity
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
 
@@ -39,7 +38,7 @@ def main(config: DictConfig) -> None:
     demonstrated = demonstrated_ways(config)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     if config.sampler is not None:
-        policy.sampler = Sampler(**config.sampler)
+        policy.sampler = policy.sampler.variant(**config.sampler)
     episodes = play(policy, config)
     print(f"{config.policy}: {summarize(episodes)}")
     if demonstrated:

@@ -20,6 +20,7 @@ from torchrl.envs.utils import ExplorationType
 
 from torchrl_sparse import keys
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.vla import load_vla
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.libero import SUITES, make_libero_env
@@ -54,7 +55,7 @@ def play(suite: str, config: DictConfig) -> str:
 def make_policy(suite: str, config: DictConfig) -> VLAPolicy:
     """Load the policy in a folder, with the suite's own range of actions, or make a small one with random weights."""
     if config.policy is not None:
-        return VLAPolicy.from_pretrained(config.policy, unnorm_key=suite, heads=tuple(config.heads))
+        return load_vla(config, suite)
     torch.manual_seed(0)
     return VLAPolicy(VLANetwork(VLAConfig.small()))
 

@@ -29,7 +29,6 @@ from torchrl_sparse.evaluation.latency.profile import (
     thread_seconds,
 )
 from torchrl_sparse.evaluation.results.query_report import QueryProfile, format_query_profile
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
@@ -39,7 +38,7 @@ from torchrl_sparse.storage.json import write_json
 @recipe("profile_query")
 def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine)
-    dense, chosen = policy.sampler, Sampler.from_name(config.sampler)
+    dense, chosen = policy.sampler, policy.sampler.variant_named(config.sampler)
     policy.sampler = chosen
     # Threads that wait for each other on one core show the scheduler, not the engine.
     counts = sorted({1, *(count for count in config.thread_counts if count <= usable_cores())})

@@ -25,7 +25,6 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import describe_differences, write_json
 from torchrl_sparse.training.diffusion.published import executed_steps
@@ -38,7 +37,9 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     out, schedule = Path(config.out), CacheSchedule.from_pretrained(config.schedule)
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
-    policy = policy.with_plan(None, Sampler.from_name(schedule.sampler, schedule.num_inference_steps))
+    policy = policy.with_plan(
+        None, policy.sampler.variant_named(schedule.sampler, schedule.num_inference_steps)
+    )
     schedule.spec.check_is(policy.plan.spec, config.schedule)
     judges = make_judges(policy, schedule, config)
     start = Choice(schedule.mask(), torch.zeros_like(schedule.mask()))

@@ -22,7 +22,6 @@ from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.contract import policy_contract, provenance
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
@@ -60,7 +59,7 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     """Read the policy and make what its gates are trained on, unless an earlier run did."""
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.sampler is not None:
-        policy.sampler = Sampler(**config.sampler)
+        policy.sampler = policy.sampler.variant(**config.sampler)
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
     sizes = {**config.network, "rate_input": options.rate_range is not None}
     gates = make_gates(config.method, policy, seed=options.seed, **sizes)

@@ -8,6 +8,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
+from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 
 from tests.data.published_demos import env_args_14, env_args_15
 from tests.evaluation.accelerate.small import GRID, ask, fixed_times
@@ -21,7 +22,6 @@ from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate import run
 from torchrl_sparse.evaluation.accelerate.schedules import Judge
-from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 from torchrl_sparse.evaluation.statistics.offline import draw_answers, offline_errors
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy

@@ -89,6 +89,7 @@ def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
 
 
 def _shown(task: Task, policy: DiffusionPolicy) -> Contract:
+    _check_actions(task, policy.source)
     cameras = _cameras(policy)
     own = task_contract(task.name, cameras)
     keys = tuple(policy.source.get("state_keys") or own.state_keys)
@@ -188,6 +189,17 @@ def _cameras(policy: DiffusionPolicy) -> dict[str, str]:
     if not all(cameras.values()):
         raise ValueError(f"policy.source['cameras']: expected those of {list(cameras)}, got {named}")
     return cameras
+
+
+def _check_actions(task: Task, source: Mapping[str, Any]) -> None:
+    """Refuse an imported policy whose actions are of the other kind than the task's: their sizes may be the same."""
+    absolute = source.get("abs_action")
+    if absolute is None and "weights" in source and not task.acts_in_poses:
+        absolute = False  # as published code takes it; a pose of a robosuite arm is known by its size
+    if task.abs_action is not None and absolute is not None and absolute != task.abs_action:
+        kinds = {"True": "absolute actions (abs_action true)", "False": "relative actions (abs_action false)"}
+        expected, got = (kinds.get(str(kind), repr(kind)) for kind in (task.abs_action, absolute))
+        raise ValueError(f"policy: expected one of {expected} for {task.name}, got one of {got}")
 
 
 def _state_size(task: Task, keys: tuple[str, ...]) -> int:

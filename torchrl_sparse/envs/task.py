@@ -23,6 +23,7 @@ class Task(Protocol):
         state_dim, action_dim: sizes of the low-dimensional observation and of the action.
         state_keys: names, in demonstration files, of the observations whose concatenation is the state.
         proprioception_keys: those of them that remain where cameras show the objects; ValueError for a task without cameras.
+        abs_action: whether actions say where to go (True) or how far (False), where published policies do either; else None.
         acts_in_poses: whether actions are absolute poses of arms.
         demonstrator: class whose instances act out one demonstration, see `torchrl_sparse.envs.experts.demonstrators`.
     """
@@ -31,6 +32,9 @@ class Task(Protocol):
     alias: str
     by_degrees: bool
     early_cut: int | None
+
+    @property
+    def abs_action(self) -> bool | None: ...
 
     @property
     def state_dim(self) -> int: ...

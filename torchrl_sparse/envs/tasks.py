@@ -102,6 +102,10 @@ class RobosuiteTask(_Named):
         return True
 
     @property
+    def abs_action(self) -> bool:
+        return True
+
+    @property
     def state_dim(self) -> int:
         return self.object_dim + self.arms * sum(_PROPRIOCEPTION.values())
 
@@ -153,7 +157,7 @@ class StateTask(_Named):
         environment: ``"module:class"`` of the environment.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
             without one.
-        early_cut, by_degrees: see `Task`.
+        early_cut, by_degrees, abs_action: see `Task`.
         way_of: see `RobosuiteTask`.
     """
 
@@ -166,6 +170,7 @@ class StateTask(_Named):
     early_cut: int | None = None
     way_of: str | None = None
     by_degrees: bool = False
+    abs_action: bool | None = None
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -269,8 +274,9 @@ _OTHERS = (
         expert=_expert("block_push:BlockPushExpert"),
         early_cut=148,
         way_of=f"{_ENVS}.block_push:way_of",
+        abs_action=False,
     ),
-    StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv"),
+    StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv", abs_action=True),
 )
 
 TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}

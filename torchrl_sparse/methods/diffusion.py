@@ -117,7 +117,7 @@ def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 def _sampler(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Take the sampler of the name."""
     chain = inputs.name.partition("_warm")[0].removesuffix("_rtc")
-    return Dense(), Sampler.from_name(chain, num_train_timesteps=inputs.sampler.num_train_timesteps)
+    return Dense(), inputs.sampler.variant_named(chain)
 
 
 def _warm(inputs: MethodInputs) -> WarmStart:
@@ -143,7 +143,7 @@ def _interval_and_sampler(inputs: MethodInputs, prefix: str) -> tuple[int, Sampl
     interval, _, chain = inputs.name.removeprefix(prefix).partition("_")
     sampler = inputs.sampler
     if chain:
-        sampler = Sampler.from_name(chain, num_train_timesteps=sampler.num_train_timesteps)
+        sampler = sampler.variant_named(chain)
     return int(interval), sampler
 
 
@@ -166,7 +166,7 @@ def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Load a planner; its sampler is the one that it was made for."""
     planner, sampler = load_planner(_saved_path(inputs.planners, inputs.name)), inputs.sampler
     if (spec := planner.made_for) is not None:
-        sampler = Sampler.from_name(spec.sampler, spec.num_inference_steps, sampler.num_train_timesteps)
+        sampler = sampler.variant_named(spec.sampler, spec.num_inference_steps)
     return planner, sampler
 
 

@@ -64,9 +64,9 @@ class StoredPolicy:
         vision: encoder of the cameras, f32, in evaluation mode.
         source: where an imported policy comes from and how to feed it; empty for policies trained here.
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
-            chunk, ``"robosuite"``, the version whose observations it was trained on, ``"state_keys"``, robomimic's
-            names of the observations that make up the state, in order, and ``"cameras"``, name of the image here ->
-            robomimic's; None for what a checkpoint does not say.
+            chunk, ``"abs_action"``, whether actions say where to go, ``"robosuite"``, the version whose observations
+            it was trained on, ``"state_keys"``, robomimic's names of the observations that make up the state, in
+            order, and ``"cameras"``, name of the image here -> robomimic's; None for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
         warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
         engine: that rounds weights and activations; None if nothing is rounded.

@@ -46,6 +46,7 @@ _NAMES = {
     "ffn_up": "mlp.up_proj",
     "ffn_down": "mlp.down_proj",
 }
+_HEAD_SIZES = ("llama.rope.dimension_count", "llama.attention.key_length", "llama.attention.value_length")
 _CONTROL = 3  # type of a token that no text has
 
 
@@ -119,6 +120,11 @@ def _sizes(file: GGUF) -> dict[str, Any]:
     llm = TransformerSize(
         number("embedding_length"), number("block_count"), heads, number("feed_forward_length")
     )
+    for name in _HEAD_SIZES:  # rotary embeddings of a part of a head would be others
+        if (found := file.metadata.get(name, llm.dim // heads)) != llm.dim // heads:
+            raise ValueError(
+                f"{name}: expected {llm.dim // heads}, the size of a head, got {str(found)[:80]}"
+            )
     return {
         "llm": llm,
         "vocab_size": len(_entry(file, "tokenizer.ggml.tokens", list)),

@@ -19,7 +19,6 @@ from recipes.studies.carried_noise.results import CarriedNoiseResults, save_carr
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
@@ -30,8 +29,7 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     policy, task = DiffusionPolicy.from_pretrained(config.policy).to(config.device), find_task(config.task)
-    train_steps = policy.sampler.num_train_timesteps
-    samplers = {name: Sampler.from_name(name, num_train_timesteps=train_steps) for name in config.samplers}
+    samplers = {name: policy.sampler.variant_named(name) for name in config.samplers}
     demos = policy_demos(config.demos, task.name, policy)
     n_action_steps = executed_steps(task.name, policy.source)
     targets = make_targets(policy, demos, source="data", n_action_steps=n_action_steps, **config.targets)

@@ -30,7 +30,6 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import published_shape
@@ -96,10 +95,16 @@ def make_policy(config: DictConfig) -> DiffusionPolicy:
     """Return the policy with the pruner and its sampler, or with the sampler that is asked for."""
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.pruner is None:
-        return policy if config.sampler is None else policy.with_plan(None, Sampler.from_name(config.sampler))
+        return (
+            policy
+            if config.sampler is None
+            else policy.with_plan(None, policy.sampler.variant_named(config.sampler))
+        )
     pruner = SAGPruner.from_pretrained(config.pruner)
     made_for = pruner.made_for
-    pruned = policy.with_plan(pruner, Sampler.from_name(made_for.sampler, made_for.num_inference_steps))
+    pruned = policy.with_plan(
+        pruner, policy.sampler.variant_named(made_for.sampler, made_for.num_inference_steps)
+    )
     return pruned.to(config.device)
 
 

@@ -146,6 +146,7 @@ obs_as_cond: true
 pred_action_steps_only: false
 task:
   name: lift_lowdim
+  abs_action: true
   obs_keys: [object, robot0_eef_pos, robot0_eef_quat, robot0_gripper_qpos]
   env_runner:
     max_steps: ${eval:'500 if "${task.dataset_type}" == "mh" else 400'}

@@ -141,7 +141,11 @@ def image_config(policy):
         key: {"shape": shape, **({"type": "rgb"} if len(shape) == 3 else {})}
         for key, shape in policy.shape_meta.items()
     }
-    config.task = {"name": "lift_image", "shape_meta": {"obs": obs, "action": {"shape": [10]}}}
+    config.task = {
+        "name": "lift_image",
+        "abs_action": True,
+        "shape_meta": {"obs": obs, "action": {"shape": [10]}},
+    }
     config.shape_meta = "${task.shape_meta}"
     config.horizon, config.n_obs_steps = 10, 2
     config.policy.update(

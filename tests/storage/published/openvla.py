@@ -128,8 +128,8 @@ def make_tokenizer():
 # -- the plain reading -------------------------------------------------------------------------------------------------
 
 
-def forward(tensors, head, proprio, pixels, state, ids):
-    """Normalised actions [8, 7] of two images f32 [2, 3, 28, 28] in [0, 1], a normalised state [8] and the prompt's ids."""
+def forward(tensors, head, proprio, pixels, state, ids, chunk=8):
+    """Normalised actions [chunk, 7] of two images f32 [2, 3, 28, 28] in [0, 1], a normalised state [8] and the prompt's ids."""
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     dino = tower(tensors, DINO, (pixels - mean[:, None, None]) / std[:, None, None], SIZES["heads"][0])
     features = torch.cat([dino, tower(tensors, SIGLIP, pixels * 2 - 1, SIZES["heads"][1])], -1)
@@ -140,10 +140,10 @@ def forward(tensors, head, proprio, pixels, state, ids):
     proprio = {name.removeprefix("module."): value for name, value in proprio.items()}
     token = apply(proprio, "fc2", functional.gelu(apply(proprio, "fc1", state)))[None]
     embedding = tensors[LLM + "embed_tokens.weight"]
-    slots = torch.zeros(56, SIZES["llm"])
+    slots = torch.zeros(chunk * 7, SIZES["llm"])
     x = torch.cat([embedding[[1]], visual, token, embedding[ids], slots, embedding[[2]]])
-    x = llama(tensors, x)[-58:-2]  # the last prompt token and all slots but the last
-    return action_head(head, x.reshape(8, -1))
+    x = llama(tensors, x)[-chunk * 7 - 2 : -2]  # the last prompt token and all slots but the last
+    return action_head(head, x.reshape(chunk, -1))
 
 
 def tower(tensors, prefix, pixels, heads):

@@ -103,6 +103,7 @@ def test_source_says_how_to_feed_the_policy(checkpoint):
         "task": "lift_lowdim",
         "epoch": 650,
         "n_action_steps": 8,
+        "abs_action": True,
         "robosuite": None,
         "state_keys": ["object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"],
     }

@@ -12,6 +12,7 @@ from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.spacing import falls_evenly
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["EagerBaseline", "published_forward"]
@@ -31,13 +32,12 @@ def published_forward(
 def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
     """Make diffusers' own, or raise ValueError if it would step elsewhere."""
     options = {"num_train_timesteps": sampler.num_train_timesteps, "beta_schedule": "squaredcos_cap_v2"}
+    options |= {"clip_sample_range": sampler.clip_sample_range}
     if sampler.kind == "ddpm":
         scheduler = DDPMScheduler(variance_type="fixed_small", **options)
         scheduler.set_timesteps(timesteps=sampler.timesteps.tolist())
         return scheduler
-    gap = sampler.num_train_timesteps // sampler.num_inference_steps
-    steps = zip(sampler.timesteps.tolist(), sampler.previous_timesteps, strict=True)
-    if sampler.kind != "ddim" or any(max(timestep - gap, -1) != after for timestep, after in steps):
+    if sampler.kind != "ddim" or not falls_evenly(sampler.timesteps.tolist(), sampler.num_train_timesteps):
         raise ValueError(f"eager baseline: diffusers has no sampler {sampler.name!r} that clips and steps so")
     scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **options)
     scheduler.set_timesteps(sampler.num_inference_steps)

@@ -147,7 +147,7 @@ def _check_fits(policy: DiffusionPolicy, grid: Grid) -> None:
 
 
 def _sampler(policy: DiffusionPolicy, name: str) -> Sampler:
-    return Sampler.from_name(name, num_train_timesteps=policy.sampler.num_train_timesteps)
+    return policy.sampler.variant_named(name)
 
 
 def _search(

@@ -123,7 +123,7 @@ class Judge:
         planner, sampler = None, self.policy.sampler
         if chain is not None:
             planner = SchedulePlanner(chain_schedule(self.policy, chain, self.reuse))
-            sampler = Sampler("ddpm", None, sampler.num_train_timesteps, timesteps=chain.timesteps)
+            sampler = sampler.variant("ddpm", timesteps=chain.timesteps)
         return draw_answers(self.policy.with_plan(planner, sampler), self.targets, **self._drawn)
 
 
@@ -134,7 +134,7 @@ def chain_schedule(
     settings: Mapping[str, Any] | None = None,
 ) -> CacheSchedule:
     """Return the schedule of a chain, which a benchmark finds by the name of its file."""
-    sampler = Sampler("ddpm", None, policy.sampler.num_train_timesteps, timesteps=chain.timesteps)
+    sampler = policy.sampler.variant("ddpm", timesteps=chain.timesteps)
     return CacheSchedule.from_mask(
         chain.mask(),
         method="searched",

@@ -1,6 +1,6 @@
 """A sampler as eight numbers for each denoising step, so that a loop needs no scheduler.
 
-With ``clip`` to [-1, 1] and the clean predictions of the two steps before, every sampler is one update::
+With ``clip`` to [-1, 1], or another range, and the clean predictions of the two steps before, every sampler is one update::
 
     clean = clip((sample - noise_scale * eps) / signal_scale)
     next  = clean_weight * clean + sample_weight * sample + eps_weight * eps
@@ -14,8 +14,10 @@ those that do. A `Guide` changes the clean prediction before it is used: ``clean
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -23,7 +25,7 @@ from torch import Tensor
 
 from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 
-__all__ = ["Guide", "StepCoefficients", "step_coefficients"]
+__all__ = ["Guide", "StepCoefficients", "squared_cosine", "step_coefficients"]
 
 
 class Guide(NamedTuple):
@@ -109,6 +111,17 @@ class StepCoefficients:
     def table(self) -> Tensor:
         """Return the eight coefficients of every step, f32 [K, 8], in the order of the fields."""
         return torch.stack([getattr(self, field.name) for field in fields(self)[:-1]], dim=1)
+
+
+def squared_cosine(steps: int) -> Tensor:
+    """Return the share of signal after each training step, f32 [steps]: arXiv:2102.09672 Eq. 17, its betas at most 0.999.
+
+    Diffusers has the same to the last bit, and takes two seconds to import.
+    """
+
+    signal = [math.cos((step / steps + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(steps + 1)]
+    betas = [min(1 - after / before, 0.999) for before, after in pairwise(signal)]
+    return (1.0 - torch.tensor(betas)).cumprod(0)
 
 
 def step_coefficients(

@@ -26,26 +26,29 @@ error of smooth actions saturates after very few steps, and takes two of DDIM.
 
 from __future__ import annotations
 
-import math
-import reprlib
 from collections.abc import Sequence
-from itertools import pairwise
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.coefficients import Guide, StepCoefficients, step_coefficients
+from torchrl_sparse.networks.diffusion.coefficients import (
+    Guide,
+    StepCoefficients,
+    squared_cosine,
+    step_coefficients,
+)
 from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
 from torchrl_sparse.networks.diffusion.naming import KINDS, SamplerName
-from torchrl_sparse.networks.diffusion.spacing import spaced_timesteps
+from torchrl_sparse.networks.diffusion.spacing import check_timesteps, spaced_timesteps
 from torchrl_sparse.networks.sizes import check_size
 
-__all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler", "timesteps_fall"]
+__all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler"]
 
 MAX_TRAIN_TIMESTEPS = 10_000
 """Far beyond any diffusion model: tables as long as this are made of what a file asks for."""
+_MAX_CLIP = 1e6
 
 
 class Sampler:
@@ -63,6 +66,7 @@ class Sampler:
         eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance.
         spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
             :mod:`~torchrl_sparse.networks.diffusion.spacing`.
+        clip_sample_range: largest absolute value of a predicted clean action, as in diffusers; 1 for normalised actions.
 
     Attributes:
         timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
@@ -73,7 +77,8 @@ class Sampler:
     Raises:
         AttributeError: if an attribute is assigned.
         ValueError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
-            ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM.
+            ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM, a
+            ``clip_sample_range`` that is not positive.
 
     Examples:
         >>> sampler = Sampler("ddim", num_inference_steps=10)
@@ -91,6 +96,7 @@ class Sampler:
     num_train_timesteps: int
     eta: float
     spacing: str
+    clip_sample_range: float
     timesteps: Tensor
     previous_timesteps: tuple[int, ...]
     alphas_cumprod: Tensor
@@ -105,6 +111,7 @@ class Sampler:
         timesteps: Sequence[int] | None = None,
         eta: float = 0.0,
         spacing: str = "leading",
+        clip_sample_range: float = 1.0,
     ) -> None:
         if kind not in KINDS:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
@@ -116,22 +123,32 @@ class Sampler:
             raise ValueError(
                 f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
-        alphas_cumprod = _squared_cosine(num_train_timesteps)
+        if not isinstance(clip_sample_range, Real) or not 0 < clip_sample_range <= _MAX_CLIP:
+            raise ValueError(
+                f"clip_sample_range: expected a number above 0, at most {_MAX_CLIP:g}, got {clip_sample_range!r}"
+            )
+        alphas_cumprod = squared_cosine(num_train_timesteps)
+        clip, eta = float(clip_sample_range), float(eta)
         if timesteps is None:
-            order = _spaced(kind, spacing, num_inference_steps, alphas_cumprod)
+            order = spaced_timesteps(
+                spacing, num_inference_steps, alphas_cumprod, without_last=kind in MULTISTEP
+            )
+        elif spacing != "leading":
+            raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
         else:
-            order = _chosen(timesteps, spacing, num_inference_steps, num_train_timesteps)
+            order = check_timesteps(timesteps, num_inference_steps, num_train_timesteps)
         previous = (*order[1:], -1)
         vars(self).update(
             kind=kind,
             num_inference_steps=num_inference_steps,
             num_train_timesteps=num_train_timesteps,
-            eta=float(eta),
+            eta=eta,
             spacing=spacing,
+            clip_sample_range=clip,
             timesteps=torch.tensor(order),
             previous_timesteps=previous,
             alphas_cumprod=alphas_cumprod,
-            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=float(eta)),
+            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=eta, clip=clip),
             _chosen=None if timesteps is None else tuple(order),
         )
 
@@ -162,6 +179,30 @@ class Sampler:
         options = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
+    def variant(self, kind: str = "ddpm", num_inference_steps: int | None = None, **options: Any) -> Sampler:
+        """Return another sampler of the same network: what it was trained with stays, see :attr:`trained`.
+
+        Arguments and errors are those of the constructor.
+
+        >>> Sampler("ddpm", 50, 50, clip_sample_range=2.0).variant("ddim", 10)
+        Sampler(kind='ddim', num_inference_steps=10, num_train_timesteps=50, clip_sample_range=2.0)
+        """
+        return Sampler(kind, num_inference_steps, **self.trained | options)
+
+    def variant_named(self, name: str, num_inference_steps: int | None = None) -> Sampler:
+        """Return the :meth:`variant` that is called so; arguments and errors are those of :meth:`from_name`.
+
+        >>> Sampler("ddpm", 50, 50).variant_named("ddim10").num_train_timesteps
+        50
+        """
+        named = Sampler.from_name(name, num_inference_steps, self.num_train_timesteps)
+        return Sampler(**named.config | self.trained)
+
+    @property
+    def trained(self) -> dict[str, Any]:
+        """The arguments that follow from how the network was trained: ``num_train_timesteps``, ``clip_sample_range``."""
+        return {"num_train_timesteps": self.num_train_timesteps, "clip_sample_range": self.clip_sample_range}
+
     def last_steps(self, number: int) -> Sampler:
         """Return the sampler of the last steps alone, 1 to K; each has the coefficients that it has here.
 
@@ -174,7 +215,7 @@ class Sampler:
         if number == self.num_inference_steps:
             return self
         timesteps = self.timesteps[-number:].tolist()
-        return Sampler(self.kind, None, self.num_train_timesteps, timesteps=timesteps, eta=self.eta)
+        return self.variant(self.kind, timesteps=timesteps, eta=self.eta)
 
     @property
     def name(self) -> str:
@@ -191,9 +232,10 @@ class Sampler:
         }
         if self._chosen is not None:
             config["timesteps"] = list(self._chosen)
-        if self.eta:
-            config["eta"] = self.eta
-        return config if self.spacing == "leading" else config | {"spacing": self.spacing}
+        defaults = {"eta": 0.0, "spacing": "leading", "clip_sample_range": 1.0}
+        return config | {
+            name: found for name, default in defaults.items() if (found := vars(self)[name]) != default
+        }
 
     def step(
         self,
@@ -255,46 +297,3 @@ class Sampler:
 
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
-
-
-def _squared_cosine(steps: int) -> Tensor:
-    """Return the share of signal after each training step, f32 [steps]: arXiv:2102.09672 Eq. 17, its betas at most 0.999.
-
-    Diffusers has the same to the last bit, and takes two seconds to import.
-    """
-
-    signal = [math.cos((step / steps + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(steps + 1)]
-    betas = [min(1 - after / before, 0.999) for before, after in pairwise(signal)]
-    return (1.0 - torch.tensor(betas)).cumprod(0)
-
-
-def _spaced(kind: str, spacing: str, steps: int, alphas_cumprod: Tensor) -> list[int]:
-    found = spaced_timesteps(spacing, steps, alphas_cumprod, without_last=kind in MULTISTEP)
-    num_train = len(alphas_cumprod)
-    if not timesteps_fall(found, num_train):
-        raise ValueError(
-            f"num_inference_steps: expected fewer, {spacing!r} has no {steps} falling timesteps of {num_train} for {kind!r}"
-        )
-    return found
-
-
-def _chosen(timesteps: Sequence[int], spacing: str, steps: int, num_train_timesteps: int) -> list[int]:
-    chosen = list(timesteps)
-    whole = all(isinstance(timestep, Integral) for timestep in chosen)
-    if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != steps:
-        raise ValueError(
-            f"timesteps: expected {steps} (num_inference_steps) whole numbers that fall from at most "
-            f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
-        )
-    if spacing != "leading":
-        raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
-    return [int(timestep) for timestep in chosen]
-
-
-def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
-    """Return whether each timestep is below the last, from under ``num_train_timesteps`` down to at least 0.
-
-    >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
-    (True, False, False)
-    """
-    return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))

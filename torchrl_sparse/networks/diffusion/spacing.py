@@ -21,10 +21,15 @@ left to do: the spacing therefore counts from above.
 
 from __future__ import annotations
 
+import reprlib
+from collections.abc import Sequence
+from itertools import pairwise
+from numbers import Integral
+
 import numpy as np
 from torch import Tensor
 
-__all__ = ["SPACINGS", "spaced_timesteps"]
+__all__ = ["SPACINGS", "check_timesteps", "falls_evenly", "spaced_timesteps", "timesteps_fall"]
 
 SPACINGS = ("leading", "trailing", "linspace", "logsnr")
 _SMALLEST_LOG_RATIO = -2.1
@@ -33,7 +38,7 @@ _SMALLEST_LOG_RATIO = -2.1
 def spaced_timesteps(
     spacing: str, num_steps: int, alphas_cumprod: Tensor, *, without_last: bool = False
 ) -> list[int]:
-    """Return the timesteps of a spacing, in execution order; they may repeat or leave 0 .. T-1 where K is large.
+    """Return the timesteps of a spacing, in execution order.
 
     Args:
         spacing: one of :data:`SPACINGS`.
@@ -42,7 +47,7 @@ def spaced_timesteps(
         without_last: leave out the last timestep of ``"leading"`` and ``"linspace"``, as diffusers' solvers do.
 
     Raises:
-        ValueError: on an unknown spacing.
+        ValueError: on an unknown spacing, or where K is so large that they would repeat or leave 0 .. T-1.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -63,10 +68,52 @@ def spaced_timesteps(
         first = num_train if spacing == "trailing" else _first_clear(alphas_cumprod)
         gap = num_train / num_steps
         rising = np.arange(first, first - (num_steps - 0.5) * gap, -gap).round()[::-1] - 1
-    return rising[::-1][:num_steps].astype(int).tolist()
+    found = rising[::-1][:num_steps].astype(int).tolist()
+    if not timesteps_fall(found, num_train):
+        raise ValueError(
+            f"num_inference_steps: expected fewer, {spacing!r} has no {num_steps} falling timesteps of {num_train} here"
+        )
+    return found
 
 
 def _first_clear(alphas_cumprod: Tensor) -> int:
     """Return how many timesteps are clear enough to begin at."""
     log_ratio = 0.5 * (alphas_cumprod / (1 - alphas_cumprod)).log()
     return int((log_ratio >= _SMALLEST_LOG_RATIO).sum())
+
+
+def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timesteps: int) -> list[int]:
+    """Return chosen timesteps as plain numbers; ValueError unless they are ``num_steps`` whole numbers that fall.
+
+    >>> check_timesteps((82, 14), 2, 100)
+    [82, 14]
+    """
+    chosen = list(timesteps)
+    whole = all(isinstance(timestep, Integral) for timestep in chosen)
+    if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != num_steps:
+        raise ValueError(
+            f"timesteps: expected {num_steps} (num_inference_steps) whole numbers that fall from at most "
+            f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
+        )
+    return [int(timestep) for timestep in chosen]
+
+
+def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+    """Return whether each timestep is below the last, from under ``num_train_timesteps`` down to at least 0.
+
+    >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
+    (True, False, False)
+    """
+    return all(later < earlier for earlier, later in pairwise((num_train_timesteps, *timesteps, -1)))
+
+
+def falls_evenly(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+    """Return whether each of K timesteps lies T // K above the next, and the last no more above the clean sample.
+
+    Whatever the spacing, diffusers' DDIM leads T // K down; elsewhere it asks the network about another timestep than that.
+
+    >>> falls_evenly([90, 60, 30, 0], 120), falls_evenly([99, 66, 33, 0], 100)
+    (True, False)
+    """
+    gap = num_train_timesteps // len(timesteps)
+    return all(max(earlier - gap, -1) == later for earlier, later in pairwise((*timesteps, -1)))

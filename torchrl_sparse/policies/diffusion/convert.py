@@ -23,9 +23,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("checkpoint", help="a .ckpt file of the published code")
     parser.add_argument("out", help="folder for config.json and model.safetensors")
     parser.add_argument("--half", action="store_true", help="write fp16 weights")
+    parser.add_argument("--ignore", nargs="+", default=[], metavar="ENTRY", help="entries of no effect here")
     options = parser.parse_args(arguments)
     try:
-        policy = DiffusionPolicy.from_diffusion_policy(options.checkpoint)
+        policy = DiffusionPolicy.from_diffusion_policy(options.checkpoint, ignore=options.ignore)
     except (OSError, ValueError) as error:
         print(f"convert: {error}", file=sys.stderr)
         return 1

@@ -6,7 +6,7 @@ from typing import Any
 
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
-__all__ = ["check_kinds", "check_trained_steps"]
+__all__ = ["check_kinds", "check_trained"]
 
 
 def check_kinds(**parts: tuple[Any, type]) -> None:
@@ -28,15 +28,10 @@ def check_kinds(**parts: tuple[Any, type]) -> None:
             raise ValueError(f"{name}: expected a {kind.__name__}, got {got}")
 
 
-def check_trained_steps(own: Sampler, other: Sampler) -> None:
-    """Raise ValueError if another sampler counts other training steps than a policy's own: timesteps mean noise levels by them.
-
-    >>> check_trained_steps(Sampler(num_train_timesteps=50), Sampler("ddim", 10))
-    Traceback (most recent call last):
-    ...
-    ValueError: sampler: expected one with num_train_timesteps=50, as the policy was trained, got 100
-    """
-    if (got := other.num_train_timesteps) != (expected := own.num_train_timesteps):
+def check_trained(sampler: Sampler, own: Sampler) -> None:
+    """Raise ValueError unless ``sampler`` is one of the network that the policy's ``own`` is of, see `Sampler.trained`."""
+    if sampler.trained != own.trained:
         raise ValueError(
-            f"sampler: expected one with num_train_timesteps={expected}, as the policy was trained, got {got}"
+            f"sampler: expected {own.trained}, with which the policy was trained, got {sampler.trained}; "
+            "policy.sampler.variant(...) makes one that fits"
         )

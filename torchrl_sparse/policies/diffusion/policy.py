@@ -7,6 +7,7 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
@@ -30,7 +31,7 @@ from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, c
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
-from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained_steps
+from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
@@ -62,7 +63,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     Attributes:
         plan: the planner. Assign another to change the method, or None for the dense policy, which then reads as `Dense`.
-        sampler: the sampler. Assign another to change it: ``policy.sampler = Sampler("ddim", 10)``.
+        sampler: the sampler. Assign another of the same training steps to change it: ``policy.sampler = Sampler("ddim", 10)``.
         start: what queries begin from: noise, the last chunk after ``policy.start = WarmStart(1)``, or noise that is drawn to
             the last chunk after ``policy.start = RealtimeChunking()``.
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
@@ -139,7 +140,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
-        check_trained_steps(self.sampler, sampler)
+        check_trained(sampler, self.sampler)
         if recalls := keys.RECALL in plan.out_keys:
             check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
@@ -163,8 +164,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """
         shared = {"vision": self.vision, "engine": self.engine, "sampler": self.sampler}
         policy = DiffusionPolicy(self.network, self.normalizer, **shared)
-        policy._install(plan, sampler or self.sampler, start)
         policy.source = self.source
+        policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
         return policy
@@ -277,15 +278,17 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return policy
 
     @classmethod
-    def from_diffusion_policy(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`).
+    def from_diffusion_policy(
+        cls, path: str | Path, *, engine: EngineName = "auto", ignore: Collection[str] = ()
+    ) -> DiffusionPolicy:
+        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`, also on ``ignore``).
 
-        Averaged weights are used where there are any; ``source`` says what it was trained for. Nothing is executed.
+        Averaged weights are used unless ``use_ema`` is false; ``source`` says what it was trained for. Nothing is executed.
 
         Raises:
             FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.
         """
-        return cls._assemble(read_diffusion_policy(path), engine)
+        return cls._assemble(read_diffusion_policy(path, ignore), engine)
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:

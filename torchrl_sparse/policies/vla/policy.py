@@ -24,7 +24,8 @@ from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
 from torchrl_sparse.policies.vla.sizes import VLASizes
 from torchrl_sparse.runtime.clock import synchronised_clock
-from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft, read_openvla_oft
+from torchrl_sparse.storage.published.openvla_oft import Unsaid, is_openvla_oft, read_openvla_oft
+from torchrl_sparse.storage.published.openvla_statistics import Normalization
 from torchrl_sparse.storage.vla import StoredVLA, VLASource, read_vla, write_vla
 from torchrl_sparse.tokens.base import TokenPruner
 
@@ -194,7 +195,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         return images
 
     def _answer(self, query: TensorDictBase, actions: Tensor, decoded: Decoded) -> TensorDict:
-        """Return everything that the policy writes but the latency, [B]."""
+        """Return all that the policy writes but the latency, [B]."""
         answer = TensorDict({}, query.batch_size, device=query.device)
         answer.set(self.tensor_keys.action_chunk, self.normalizer.unnormalize_action(actions))
         answer.set(keys.TOKEN_DEPTH, decoded.depth)
@@ -234,9 +235,10 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         Raises:
             FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
         """
-        if is_openvla_oft(path):
-            if base is not None:
-                raise ValueError(f"base: expected none for {path}, which holds its decoder, got {base}")
+        ours = {name: given for name, given in (("base", base), ("config", config)) if given is not None}
+        if unread := ours if (released := is_openvla_oft(path)) else published:
+            raise ValueError(f"{', '.join(unread)}: expected none for {path}, whose own files tell")
+        if released:
             return cls.from_openvla_oft(path, **published)
         stored = read_vla(Path(path), config, None if base is None else Path(base))
         if stored.base is not None and fold:
@@ -251,6 +253,9 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         unnorm_key: str | None = None,
         cameras: int = 2,
         heads: Sequence[int] = (16, 16, 32),
+        chunk_size: int = 8,
+        normalization: Normalization = "bounds_q99",
+        center_crop: bool = True,
         dtype: torch.dtype | None = None,
     ) -> VLAPolicy:
         """Load a published OpenVLA-OFT checkpoint, a folder as on the Hugging Face hub. Nothing in its files is executed.
@@ -269,6 +274,9 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
                 the file has it so); not needed where the file has one only.
             cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
             heads: attention heads of DINOv2, SigLIP and the decoder, which cannot be seen in the weights; the published ones.
+            chunk_size: actions of a chunk with which it was trained, ``NUM_ACTIONS_CHUNK`` there; 8 is LIBERO's.
+            normalization: ``"bounds_q99"``, the quantiles, as LIBERO's constants say, or ``"bounds"``, ``min`` and ``max``.
+            center_crop: whether images are cropped to their central 90 %, as where training cropped at random.
             dtype: of the network; by default that of the embeddings in the shards, bf16 where they are as published.
 
         Raises:
@@ -277,10 +285,8 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         Examples:
             >>> policy = VLAPolicy.from_openvla_oft("checkpoint", unnorm_key="libero_spatial")  # doctest: +SKIP
         """
-        stored = read_openvla_oft(
-            Path(path), unnorm_key=unnorm_key, cameras=cameras, heads=heads, dtype=dtype
-        )
-        return cls._assemble(stored)
+        unsaid = Unsaid(cameras, heads, chunk_size, normalization, center_crop)
+        return cls._assemble(read_openvla_oft(Path(path), unnorm_key=unnorm_key, unsaid=unsaid, dtype=dtype))
 
     @classmethod
     def _assemble(cls, stored: StoredVLA) -> VLAPolicy:

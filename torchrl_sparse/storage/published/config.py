@@ -100,6 +100,15 @@ class PublishedConfig:
             raise ValueError(f"cfg: {path}: expected at most {_MAX_NAMES} names, got {type(found).__name__}")
         return list(found)
 
+    def literal(self, path: str, kind: type) -> Any:
+        """Return the entry at ``path``; None if there is none, or an expression; errors as of `get`."""
+        found = self._find(path, _MAX_DEPTH)
+        return None if isinstance(found, str) and "${" in found else self.get(path, kind, None)
+
+    def value(self, path: str) -> Any:
+        """Return what is at ``path``, of any type; None if there is nothing."""
+        return self._find(path, _MAX_DEPTH)
+
     def _find(self, path: str, depth: int) -> Any:
         """Return the entry at ``path``; what was found is kept, or references to references would multiply."""
         if path.count(".") > _MAX_DEPTH:

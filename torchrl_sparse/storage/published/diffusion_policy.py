@@ -8,61 +8,82 @@ the tensors; the configuration gives what they cannot tell (heads, sampler, layo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.diffusion import StoredPolicy
 from torchrl_sparse.storage.published.config import KNOWN_NAMES, PublishedConfig
+from torchrl_sparse.storage.published.entries import check_policy_entries, check_task_entries
 from torchrl_sparse.storage.published.faults import naming_faults
 from torchrl_sparse.storage.published.inert_pickle import read_pickle
-from torchrl_sparse.storage.published.network import read_affine, read_network, read_sampler
+from torchrl_sparse.storage.published.network import read_affine, read_network
+from torchrl_sparse.storage.published.scheduler import read_sampler
 from torchrl_sparse.storage.published.torch_archive import StoredTensor, TorchArchive
 from torchrl_sparse.storage.published.vision import ImageLayout, read_vision
+from torchrl_sparse.storage.published.wrappers import without_wrappers
 from torchrl_sparse.storage.tensors import take
 
 __all__ = ["read_diffusion_policy"]
 
+_Parts = tuple[TransformerForDiffusion, Normalizer, VisionEncoder | None]
 
-def read_diffusion_policy(path: str | Path) -> StoredPolicy:
+
+def read_diffusion_policy(path: str | Path, ignore: Collection[str] = ()) -> StoredPolicy:
     """Read a checkpoint of ``DiffusionTransformerLowdimPolicy`` or ``DiffusionTransformerHybridImagePolicy``.
+
+    Args:
+        path: the file.
+        ignore: paths of entries, such as ``"task.dataset.note"``, that the policy does not depend on and that
+            `torchrl_sparse.storage.published.entries` does not know.
 
     Raises:
         FileNotFoundError: if there is no file.
-        CheckpointError: if it is damaged, asks for anything but data, or holds another kind of policy.
+        CheckpointError: if it is damaged, asks for anything but data, holds another kind of policy, or was trained or used
+            in a way that is not supported or, by an entry of its configuration, not known.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a checkpoint, got no file")
     with naming_faults(path), TorchArchive(path) as archive:
-        return _read(archive)
+        return _read(archive, frozenset(ignore))
 
 
-def _read(archive: TorchArchive) -> StoredPolicy:
+def _read(archive: TorchArchive, ignore: frozenset[str]) -> StoredPolicy:
     payload = _mapping("payload", archive.contents(KNOWN_NAMES))
     config = PublishedConfig(payload.get("cfg"))
     kind = config.get("policy._target_", str).rpartition(".")[2]
     if kind not in _READERS:
         raise ValueError(f"cfg: policy._target_: expected one of {sorted(_READERS)}, got {kind}")
+    check_policy_entries(config, cameras=kind == _IMAGES, ignore=ignore)
+    state_keys, abs_action = check_task_entries(config, ignore)
     weights, tensors = _weights(config, payload)
     source = {
         "weights": weights,
         "task": config.get("task.name", str, None),
         "epoch": _epoch(payload),
-        "n_action_steps": config.get("n_action_steps", int),
+        "n_action_steps": _executed_steps(config),
+        "abs_action": abs_action,
         "robosuite": _robosuite_version(config, payload),
     }
-    policy = _READERS[kind](archive, config, tensors, source)
+    source["state_keys"] = state_keys
+    sampler = read_sampler(config, ignore)
+    network, normalizer, vision = _READERS[kind](archive, config, tensors, source)
     _nothing_left(tensors)
-    return policy
+    return StoredPolicy(network, normalizer, sampler, vision, source)
 
 
 def _read_low_dim(
-    archive: TorchArchive, config: PublishedConfig, tensors: dict[str, StoredTensor], source: dict[str, Any]
-) -> StoredPolicy:
+    archive: TorchArchive, config: PublishedConfig, tensors: dict[str, StoredTensor], _: dict[str, Any]
+) -> _Parts:
+    target = config.get("policy.model._target_", str)
+    if target.rpartition(".")[2] != "TransformerForDiffusion":
+        raise ValueError(f"cfg: policy.model._target_: expected TransformerForDiffusion, got {target}")
     network = read_network(archive, config, "policy.model", take(tensors, "model."))
     entries = take(tensors, "normalizer.params_dict.")
     normalizer = Normalizer(
@@ -70,13 +91,12 @@ def _read_low_dim(
         *read_affine(archive, entries, "action", network.input_dim),
     )
     _nothing_left(entries)
-    source["state_keys"] = config.names("task.obs_keys")
-    return StoredPolicy(network, normalizer, read_sampler(config), source=source)
+    return network, normalizer, None
 
 
 def _read_images(
     archive: TorchArchive, config: PublishedConfig, tensors: dict[str, StoredTensor], source: dict[str, Any]
-) -> StoredPolicy:
+) -> _Parts:
     layout = ImageLayout.of(config)
     network = read_network(archive, config, "policy", take(tensors, "model."))
     vision = read_vision(archive, config, layout, take(tensors, "obs_encoder.obs_nets."))
@@ -100,13 +120,20 @@ def _read_images(
     )
     _nothing_left(entries)
     source |= {"state_keys": list(layout.states), "cameras": layout.cameras}
-    return StoredPolicy(network, normalizer, read_sampler(config), vision, source)
+    return network, normalizer, vision
 
 
-_READERS = {
-    "DiffusionTransformerLowdimPolicy": _read_low_dim,
-    "DiffusionTransformerHybridImagePolicy": _read_images,
-}
+_LOW_DIM, _IMAGES = "DiffusionTransformerLowdimPolicy", "DiffusionTransformerHybridImagePolicy"
+_READERS = {_LOW_DIM: _read_low_dim, _IMAGES: _read_images}
+
+
+def _executed_steps(config: PublishedConfig) -> int:
+    """Return how many actions of a chunk are executed."""
+    steps = config.get("n_action_steps", int)
+    for place in ("policy.n_action_steps", "task.env_runner.n_action_steps"):
+        if (said := config.literal(place, int)) not in (None, steps):
+            raise ValueError(f"cfg: {place}: expected {steps}, as n_action_steps, got {said}")
+    return steps
 
 
 def _robosuite_version(config: PublishedConfig, payload: Mapping) -> str | None:
@@ -128,17 +155,20 @@ def _epoch(payload: Mapping) -> int | None:
 
 
 def _weights(config: PublishedConfig, payload: Mapping) -> tuple[str, dict[str, StoredTensor]]:
-    """Return the state dict to use, by preference the averaged one, and what it is called."""
+    """Return what the state dict to use is called, and it: what ``use_ema`` says, else the averaged one if there is one."""
     states = _mapping("state_dicts", payload.get("state_dicts"))
-    averaged = "ema_model" in states
-    if not averaged and config.get("training.use_ema", bool, False):
-        raise ValueError("state_dicts: expected ema_model, since cfg.training.use_ema is true, got none")
+    averaged = config.get("training.use_ema", bool, "ema_model" in states)
     name = "ema_model" if averaged else "model"
-    tensors = dict(_mapping(f"state_dicts: {name}", states.get(name)))
+    if name not in states:
+        raise ValueError(
+            f"state_dicts: expected {name}, since cfg.training.use_ema is {str(averaged).lower()}, got {sorted(states)}"
+        )
+    tensors = dict(_mapping(f"state_dicts: {name}", states[name]))
     for key, value in tensors.items():
         if not isinstance(key, str) or not isinstance(value, StoredTensor):
             raise ValueError(f"state_dicts: {name}: {key}: expected a tensor, got {type(value).__name__}")
-    return name, {key: value for key, value in tensors.items() if not key.endswith("_dummy_variable")}
+    tensors = {key: value for key, value in tensors.items() if not key.endswith("_dummy_variable")}
+    return name, without_wrappers(f"state_dicts: {name}", tensors)
 
 
 def _mapping(where: str, value: Any) -> Mapping:

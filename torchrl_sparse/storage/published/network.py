@@ -1,4 +1,4 @@
-"""The parts of a published checkpoint that both kinds of policy have: denoiser, sampler, entries of the normaliser."""
+"""The parts of a published checkpoint that both kinds of policy have: denoiser and entries of the normaliser."""
 
 from __future__ import annotations
 
@@ -8,23 +8,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.published.config import PublishedConfig
+from torchrl_sparse.storage.published.entries import check_sizes
 from torchrl_sparse.storage.published.torch_archive import StoredTensor, TorchArchive
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, shapes_of, take
 
-__all__ = ["read_affine", "read_network", "read_sampler", "read_tensors"]
-
-_SAMPLERS = {"DDPMScheduler": "ddpm", "DDIMScheduler": "ddim"}
-# The settings of diffusers' schedulers that `Sampler` has; each with its default in diffusers.
-_SAMPLER_SETTINGS = {
-    "beta_schedule": ("linear", "squaredcos_cap_v2"),
-    "clip_sample": (True, True),
-    "prediction_type": ("epsilon", "epsilon"),
-}
-_DDPM_SETTINGS = {"variance_type": ("fixed_small", "fixed_small")}
-_DDIM_SETTINGS = {"set_alpha_to_one": (True, True), "steps_offset": (0, 0)}
+__all__ = ["read_affine", "read_network", "read_tensors"]
 
 
 def read_network(
@@ -41,18 +31,15 @@ def read_network(
     Raises:
         ValueError: if tensors are missing, do not fit together or contradict the configuration.
     """
-    default = section == "policy"  # what the published image policy assumes, and the denoiser alone does not
-    for option in (f"{section}.time_as_cond", f"{section}.obs_as_cond"):
-        if not config.get(option, bool, default or option.endswith("time_as_cond")):
-            raise ValueError(f"cfg: {option}: expected true, got false")
-    if config.get("policy.pred_action_steps_only", bool, False):
-        raise ValueError("cfg: policy.pred_action_steps_only: expected false, got true")
+    cameras = section == "policy"
+    # What the published image policy takes where nothing is said, and what the denoiser alone does.
+    heads, causal, dropout = (4, True, (0.0, 0.3)) if cameras else (12, False, (0.1, 0.1))
     masks = {name: stored.pop(name) for name in ("mask", "memory_mask") if name in stored}
     arguments = {
         **_sizes(stored),
-        "n_head": config.get(f"{section}.n_head", int),
-        "p_drop_emb": config.get(f"{section}.p_drop_emb", float, 0.0),
-        "p_drop_attn": config.get(f"{section}.p_drop_attn", float, 0.0),
+        "n_head": config.get(f"{section}.n_head", int, heads),
+        "p_drop_emb": config.get(f"{section}.p_drop_emb", float, dropout[0]),
+        "p_drop_attn": config.get(f"{section}.p_drop_attn", float, dropout[1]),
         "causal_attn": bool(masks),
     }
     with torch.device("meta"):  # everything is compared with the tensors before memory is taken for it
@@ -60,7 +47,9 @@ def read_network(
     expected = {"mask": declared.mask, "memory_mask": declared.memory_mask} if masks else {}
     check_shapes("model", shapes_of(masks), shapes_of(expected))
     check_shapes("model", shapes_of(stored), shapes_of(declared.state_dict()))
-    _check_options(config, section, declared)
+    check_sizes(config, section, declared, cameras=cameras)
+    if (said := config.get(f"{section}.causal_attn", bool, causal)) != declared.causal_attn:
+        raise ValueError(f"cfg: {section}.causal_attn is {said}, the tensors say {declared.causal_attn}")
     tensors = read_tensors(archive, "model", stored)
     network = TransformerForDiffusion(**arguments)
     for name, value in masks.items():
@@ -96,45 +85,6 @@ def _sizes(stored: Mapping[str, StoredTensor]) -> dict[str, int]:
 
 def _describe(stored: Mapping[str, StoredTensor], name: str) -> str:
     return f"shape {stored[name].shape}" if name in stored else "none"
-
-
-def _check_options(config: PublishedConfig, section: str, network: TransformerForDiffusion) -> None:
-    """Compare what the tensors tell with what the configuration says."""
-    said = {
-        f"{section}.causal_attn": (
-            config.get(f"{section}.causal_attn", bool, section == "policy"),
-            network.causal_attn,
-        ),
-        "n_obs_steps": (config.get("n_obs_steps", int), network.n_obs_steps),
-        "horizon": (config.get("horizon", int), network.horizon),
-    }
-    for name, (configured, found) in said.items():
-        if configured != found:
-            raise ValueError(f"cfg: {name} is {configured}, the tensors say {found}")
-
-
-def read_sampler(config: PublishedConfig) -> Sampler:
-    """Make the sampler.
-
-    Raises:
-        ValueError: if it has settings that `Sampler` has not.
-    """
-    section = "policy.noise_scheduler"
-    name = config.get(f"{section}._target_", str).rpartition(".")[2]
-    if name not in _SAMPLERS:
-        raise ValueError(f"cfg: {section}._target_: expected one of {sorted(_SAMPLERS)}, got {name}")
-    kind = _SAMPLERS[name]
-    for option, (default, supported) in (
-        _SAMPLER_SETTINGS | (_DDPM_SETTINGS if kind == "ddpm" else _DDIM_SETTINGS)
-    ).items():
-        found = config.get(f"{section}.{option}", type(supported), default)
-        if found != supported:
-            raise ValueError(f"cfg: {section}.{option}: expected {supported!r}, got {found!r}")
-    train_steps = config.get(f"{section}.num_train_timesteps", int)
-    try:
-        return Sampler(kind, config.get("policy.num_inference_steps", int, train_steps), train_steps)
-    except ValueError as error:
-        raise ValueError(f"cfg: {section}: {error}") from error
 
 
 def read_affine(

@@ -7,34 +7,49 @@ read.
 The towers carry timm's names there (``featurizer`` is DINOv2, ``fused_featurizer`` SigLIP), with LayerScale's ``gamma`` renamed
 to ``scale_factor``, and the two ``.pt`` files the prefix ``module.``. The towers' last blocks and final norms, SigLIP's pooling
 head and the vocabulary projection take no part in OpenVLA-OFT and are left out.
+
+A folder does not say how many actions a chunk has, which statistics normalise, or whether images are cropped; those are
+arguments. It has to be a policy for LIBERO's arm: position, axis-angle and both fingers observed, and seven numbers of an
+action, whose last is the gripper. Sizes of other arms, FiLM, diffusion heads and discrete actions are refused.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import make_network, network_of
-from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import LlamaTokenizer
 from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.published.faults import naming_faults
+from torchrl_sparse.storage.published.openvla_statistics import (
+    ACTION_DIM,
+    STATE_DIM,
+    Normalization,
+    read_normalizer,
+)
 from torchrl_sparse.storage.published.torch_archive import TorchArchive
+from torchrl_sparse.storage.published.wrappers import without_wrappers
 from torchrl_sparse.storage.tensors import check_finite, check_shapes, read_tensors, shapes_of, take
 from torchrl_sparse.storage.vla import StoredVLA, VLASource
 
-__all__ = ["is_openvla_oft", "read_openvla_oft"]
+__all__ = ["Unsaid", "is_openvla_oft", "read_openvla_oft"]
 
 _DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 _LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
-_EMBEDDING, _NO_NOOPS = "decoder.llama.embed_tokens.weight", "_no_noops"
-_FIXED_TEXT = {"rms_norm_eps": 1e-6, "rope_theta": 10000.0, "hidden_act": "silu"}
+_EMBEDDING = "decoder.llama.embed_tokens.weight"
+_FIXED = {"image_resize_strategy": "resize-naive", "arch_specifier": "no-align+fused-gelu-mlp"}
+_FIXED |= {"use_fused_vision_backbone": True, "timm_override_act_layers": [None, None]}
+_FIXED_TEXT = {"rms_norm_eps": 1e-6, "rope_theta": 10000.0, "rope_scaling": None, "hidden_act": "silu"}
+_DIFFUSION = "expected a head for L1 regression, got a diffusion head, which is not supported"
 
 _DINO_NAMES = {
     "cls_token": "embeddings.cls_token",
@@ -67,8 +82,28 @@ def is_openvla_oft(path: str | Path) -> bool:
     return config.is_file() and read_json(config, dict[str, Any]).get("model_type") == "openvla"
 
 
+@dataclass(frozen=True)
+class Unsaid:
+    """What a folder does not say; see `VLAPolicy.from_openvla_oft`.
+
+    Raises:
+        ValueError: if there are not one or two cameras, or no three numbers of heads.
+    """
+
+    cameras: int
+    heads: Sequence[int]
+    chunk_size: int
+    normalization: Normalization
+    center_crop: bool
+
+    def __post_init__(self) -> None:
+        check_size("cameras", self.cameras, len(VLAConfig().cameras))
+        if len(self.heads) != 3:
+            raise ValueError(f"heads: expected those of DINOv2, SigLIP and the decoder, got {self.heads!r}")
+
+
 def read_openvla_oft(
-    path: Path, *, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype | None
+    path: Path, *, unnorm_key: str | None, unsaid: Unsaid, dtype: torch.dtype | None
 ) -> StoredVLA:
     """Read the policy in the folder ``path``; see `VLAPolicy.from_openvla_oft`.
 
@@ -77,40 +112,44 @@ def read_openvla_oft(
         CheckpointError: naming the file, what was expected in it and what was found.
     """
     with naming_faults(path):
-        return _read(path, unnorm_key, cameras, heads, dtype)
+        return _read(path, unnorm_key, unsaid, dtype)
 
 
-def _read(
-    path: Path, unnorm_key: str | None, cameras: int, heads: Sequence[int], dtype: torch.dtype | None
-) -> StoredVLA:
+def _read(path: Path, unnorm_key: str | None, unsaid: Unsaid, dtype: torch.dtype | None) -> StoredVLA:
     if list(path.glob("vision_backbone*checkpoint*")):
         raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
-    image_size = _image_size(path / "config.json")
+    if list(path.glob("noisy_action_projector*checkpoint*")):
+        raise ValueError(f"{path}: {_DIFFUSION}: noisy_action_projector*checkpoint*")
+    image_size = _image_size(path / "config.json", unsaid.heads[2])
     tensors = _read_shards(path) | _read_part(path, _HEAD) | _read_part(path, _PROPRIO)
-    config = _config(path, tensors, heads, image_size, VLAConfig().cameras[:cameras])
-    data_set, statistics = _statistics(path / "dataset_statistics.json", unnorm_key)
-    normalizer = _normalizer(path / "dataset_statistics.json", statistics, config)
+    if any(name.startswith(f"{_HEAD}noise_predictor.") for name in tensors):
+        raise ValueError(f"{path}: {_DIFFUSION}: {_HEAD}noise_predictor")
+    config = _config(path, tensors, image_size, unsaid)
+    statistics = path / "dataset_statistics.json"
+    data_set, normalizer = read_normalizer(statistics, unnorm_key, unsaid.normalization)
     weights = _rename(tensors, config)
     expected = make_network(config, device="meta").state_dict()  # compared before memory is taken for it
     check_shapes(str(path), shapes_of(weights), shapes_of(expected))
     check_finite(str(path), weights)
     dtype = weights[_EMBEDDING].dtype if dtype is None else dtype
     network = network_of(config, {name: value.to(dtype) for name, value in weights.items()})
-    source = VLASource(data_set.removesuffix(_NO_NOOPS), images="openvla_oft")
+    source = VLASource(data_set, images="openvla_oft")
     return StoredVLA(network, normalizer, LlamaTokenizer.from_file(path / "tokenizer.json"), source)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def _image_size(path: Path) -> int:
+def _image_size(path: Path, heads: int) -> int:
     config = read_json(path, dict[str, Any])
     if config.get("model_type") != "openvla":
         raise ValueError(f"{path}: model_type: expected 'openvla', got {config.get('model_type')!r}")
     text = config.get("text_config", {})
-    for name, value in _FIXED_TEXT.items():
-        if text.get(name, value) != value:
-            raise ValueError(f"{path}: text_config.{name}: expected {value}, got {text[name]}")
+    fixed = _FIXED_TEXT | {"num_attention_heads": heads, "num_key_value_heads": heads}
+    for where, found, values in (("", config, _FIXED), ("text_config.", text, fixed)):
+        for name, value in values.items():
+            if found.get(name, value) != value:
+                raise ValueError(f"{path}: {where}{name}: expected {value}, got {found[name]}")
     sizes = config.get("image_sizes")
     if not isinstance(sizes, list) or len({*sizes}) != 1:
         raise ValueError(f"{path}: image_sizes: expected one size for both towers, got {sizes}")
@@ -138,48 +177,21 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
     files = sorted(path.glob(pattern))
     if len(files) != 1:
         found = [file.name for file in files]
-        raise ValueError(f"{path}: expected exactly one file {pattern}, got {found}")
+        needed = "; a policy without is not supported" if not files else ""
+        raise ValueError(f"{path}: expected exactly one file {pattern}, got {found}{needed}")
     try:
         with TorchArchive(files[0]) as archive:
             tensors = {name: archive.tensor(value) for name, value in archive.contents().items()}
     except (AttributeError, ValueError) as error:  # AttributeError: it holds anything but tensors by name
         raise ValueError(f"{files[0]}: expected a file of tensors, got: {error}") from error
-    return {prefix + name.removeprefix("module."): value for name, value in tensors.items()}
-
-
-def _statistics(path: Path, unnorm_key: str | None) -> tuple[str, dict[str, Any]]:
-    """Return the name of the data set, and its statistics."""
-    every = read_json(path, dict[str, dict[str, Any]])
-    wanted = [unnorm_key, f"{unnorm_key}{_NO_NOOPS}"] if unnorm_key is not None else list(every)
-    found = [name for name in wanted if name in every]
-    if not found or (unnorm_key is None and len(found) > 1):
-        raise ValueError(f"{path}: unnorm_key: expected one of {sorted(every)}, got {unnorm_key!r}")
-    return found[0], every[found[0]]
-
-
-def _normalizer(path: Path, statistics: dict[str, Any], config: VLAConfig) -> QuantileNormalizer:
-    action, proprio = statistics.get("action", {}), statistics.get("proprio", {})
-    mask = torch.tensor(action.get("mask", [True] * config.action_dim))
-    try:
-        ranges = [torch.tensor(part[q]) for part in (proprio, action) for q in ("q01", "q99")]
-        normalizer = QuantileNormalizer(*ranges, ~mask)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected q01 and q99 of action and proprio: {error}") from error
-    found = len(normalizer.state_low), len(normalizer.action_low)
-    if found != (config.state_dim, config.action_dim):
-        raise ValueError(
-            f"{path}: expected {config.state_dim} proprio and {config.action_dim} action numbers, got {found}"
-        )
-    return normalizer
+    return {prefix + name: value for name, value in without_wrappers(str(files[0]), tensors).items()}
 
 
 # -- sizes and names ---------------------------------------------------------------------------------------------------
 
 
-def _config(
-    path: Path, tensors: dict[str, Tensor], heads: Sequence[int], image_size: int, cameras: tuple
-) -> VLAConfig:
-    """Infer the sizes from the shapes of the weights."""
+def _config(path: Path, tensors: dict[str, Tensor], image_size: int, unsaid: Unsaid) -> VLAConfig:
+    """Infer the sizes from the shapes of the weights; ValueError if they are not those of LIBERO's arm."""
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in tensors:
@@ -193,7 +205,13 @@ def _config(
 
     vocab_size, width = shape(_LLM + "embed_tokens.weight")
     patch = shape(_DINO + "patch_embed.proj.weight")
-    action_dim = shape(_HEAD + "model.fc2.weight")[0]
+    found = shape(_PROPRIO + "fc1.weight")[1], shape(_HEAD + "model.fc2.weight")[0]
+    if found != (STATE_DIM, ACTION_DIM):
+        raise ValueError(
+            f"{path}: expected a policy of LIBERO's {STATE_DIM} numbers of the state and {ACTION_DIM} of an action, got one of "
+            f"{found[0]} and {found[1]}"
+        )
+    heads = unsaid.heads
     return VLAConfig(
         dino=size(_DINO, "blocks", "mlp.fc1", patch[0], heads[0]),
         siglip=size(_SIGLIP, "blocks", "mlp.fc1", shape(_SIGLIP + "pos_embed")[2], heads[1]),
@@ -202,10 +220,11 @@ def _config(
         image_size=image_size,
         patch_size=patch[2],
         registers=shape(_DINO + "reg_token")[1],
-        cameras=cameras,
-        state_dim=shape(_PROPRIO + "fc1.weight")[1],
-        action_dim=action_dim,
-        crop_area=0.9,
+        cameras=VLAConfig().cameras[: unsaid.cameras],
+        state_dim=STATE_DIM,
+        action_dim=ACTION_DIM,
+        chunk_size=unsaid.chunk_size,
+        crop_area=0.9 if unsaid.center_crop else 1.0,
     )
 
 

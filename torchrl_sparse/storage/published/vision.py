@@ -18,7 +18,7 @@ from torchrl_sparse.storage.tensors import check_shapes, shapes_of, take
 
 __all__ = ["ImageLayout", "read_vision"]
 
-_FEATURES = 64
+_FEATURES, _DEFAULT_CROP = 64, (76, 76)
 _HAND = "eye_in_hand"
 _RENAMED = ((r"^nets\.0\.nets\.", "trunk."), (r"^nets\.1\.nets\.", "keypoints."), (r"^nets\.3\.", "linear."))
 
@@ -52,7 +52,10 @@ class ImageLayout:
         sizes = set()
         for key in config.names("policy.shape_meta.obs") or ():
             shape = _sizes(config, f"policy.shape_meta.obs.{key}.shape")
-            if config.get(f"policy.shape_meta.obs.{key}.type", str, "low_dim") == "rgb":
+            kind = config.get(f"policy.shape_meta.obs.{key}.type", str, "low_dim")
+            if kind not in ("rgb", "low_dim"):
+                raise ValueError(f"cfg: shape_meta: {key}: type: expected rgb or low_dim, got {kind}")
+            if kind == "rgb":
                 cameras[_camera_name(key, cameras)] = key
                 sizes.add(shape)
                 order[key] = _FEATURES
@@ -95,12 +98,17 @@ def read_vision(
     Raises:
         ValueError: if tensors are missing, do not fit together or describe another encoder.
     """
-    cropped = config.get("policy.crop_shape", list, None) is not None
+    said = "crop_shape" in (
+        config.names("policy") or ()
+    )  # null is none, and nothing is the published default
+    cropped = not said or config.get("policy.crop_shape", list, None) is not None
     if cropped and not config.get("policy.eval_fixed_crop", bool, False):
         raise ValueError(
             "cfg: policy.eval_fixed_crop: expected true, got false: crops would be random in use"
         )
-    crop = _sizes(config, "policy.crop_shape") if cropped else layout.image_size
+    crop = layout.image_size
+    if cropped:
+        crop = _sizes(config, "policy.crop_shape") if said else _DEFAULT_CROP
     tensors: dict[str, Tensor] = {}
     widths = set()
     for name, key in layout.cameras.items():

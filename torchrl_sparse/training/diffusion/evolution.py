@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.sampler import Sampler, timesteps_fall
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
 
 __all__ = ["ChainSpace", "Evolution", "PrunedChain", "evolve"]
 

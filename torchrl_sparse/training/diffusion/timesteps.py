@@ -20,7 +20,8 @@ from functools import cache
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_sparse.networks.diffusion.sampler import Sampler, timesteps_fall
+from torchrl_sparse.networks.diffusion.sampler import Sampler
+from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import dense_answers, planned_answers
 
@@ -142,7 +143,7 @@ def find_timesteps(
     train_steps = policy.sampler.num_train_timesteps
 
     def chain(**where) -> Sampler:
-        return Sampler(kind, num_train_timesteps=train_steps, eta=eta, **where)
+        return policy.sampler.variant(kind, eta=eta, **where)
 
     @cache
     def error(timesteps: tuple[int, ...]) -> float:
