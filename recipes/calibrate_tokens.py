@@ -94,8 +94,8 @@ def pruners(config: DictConfig) -> Pruners:
 
 
 def demonstrations(config: DictConfig) -> InstructedDemonstrations:
-    state_keys = find_robosuite_task(config.task).proprioception_keys
-    episodes = read_demos(config.demos, state_keys, cameras=chosen_cameras(config.cameras))
+    task, cameras = find_robosuite_task(config.task), chosen_cameras(config.cameras)
+    episodes = read_demos(config.demos, task.proprioception_keys, cameras=cameras, task=task.name)
     return InstructedDemonstrations(episodes, read_instructions(config.demos))
 
 

@@ -92,7 +92,7 @@ def demonstrated_ways(config: DictConfig) -> list[int]:
         return []
     task = find_task(config.task)
     way_of = task.load_way_of()
-    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses)
+    demos = read_demos(config.demos, task.state_keys, poses=task.acts_in_poses, task=task.name)
     return [way_of(demos.episode(index)[keys.STATE].numpy()) for index in range(len(demos))]
 
 

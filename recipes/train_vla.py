@@ -55,6 +55,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
         find_robosuite_task(config.task).proprioception_keys,
         cameras=cameras,
         image_folder=Path(config.out) / "images",
+        task=find_robosuite_task(config.task).name,
     )
     stages = GroundingConfig(**config.grounding)
     objects = None if stages == GroundingConfig() else read_objects(config)

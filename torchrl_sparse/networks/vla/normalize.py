@@ -13,7 +13,7 @@ from torchrl_sparse.networks.normalize import MIN_RANGE
 __all__ = ["QuantileNormalizer"]
 
 _EPS = 1e-8
-_RARE = 10
+_RARE = 100
 """A channel whose whole range is so many times that between its quantiles is used rarely."""
 
 
@@ -21,9 +21,8 @@ class QuantileNormalizer(nn.Module):
     """Maps the range between the 1 % and the 99 % quantile to [-1, 1], per dimension.
 
     Both are clipped to [-1, 1]. Gripper dimensions have no range: the policy says how open the gripper shall be, from 0
-    (closed) to 1, the environment takes -1 (open) or 1 (close). What varies by less than 1e-4 is shown to the policy centred and
-    not stretched, as by `torchrl_sparse.networks.normalize.Normalizer`, which would show its rounding; and such an action stays
-    within its range whatever the policy says.
+    (closed) to 1, the environment takes -1 (open) or 1 (close). What varies by less than 1e-4 is centred and not stretched, as
+    by `torchrl_sparse.networks.normalize.Normalizer`: the policy would see its rounding. Such an action stays within its range.
 
     Args:
         state_low, state_high: f32 [Ds], the quantiles.
@@ -68,8 +67,8 @@ class QuantileNormalizer(nn.Module):
     def fit(cls, state: Tensor, action: Tensor, *, gripper: Sequence[int] = (6,)) -> QuantileNormalizer:
         """Fit a normaliser to states [N, Ds] and actions [N, A], whose ``gripper`` dimensions are -1 (open) to 1 (close).
 
-        Beyond the quantiles no output can command. An action that is used so rarely that they leave out nine tenths of its
-        range, a turn in 5 of 1,000 steps, is mapped by its least and its largest number instead, with a warning.
+        Beyond the quantiles no output can command. An action that is used so rarely that they leave out 99 % of its
+        range, such as a turn in 5 of 1,000 steps, is mapped by its least and its largest number instead, with a warning.
         """
         is_gripper = torch.zeros(action.shape[1], dtype=torch.bool)
         is_gripper[list(gripper)] = True
