@@ -97,8 +97,8 @@ def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
     """Return of each [..., 4] the one of +q and -q (xyzw) that is nearer to the Panda's rest, (1, 1, 0, 0) / sqrt(2).
 
-    Both are the same rotation; at rest the gripper points down. Conventions that look at w flip where w crosses zero, which is where a downward gripper lives,
-    and a policy would see a jump where nothing moved.
+    Both are the same rotation; at rest the gripper points down. Conventions that look at w flip where w crosses zero, which is
+    where a downward gripper lives, and a policy would see a jump where nothing moved.
     """
     return np.where(quat[..., :1] + quat[..., 1:2] < 0, -quat, quat)
 

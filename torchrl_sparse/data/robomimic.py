@@ -217,6 +217,9 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
 
 _Arrays = Mapping[str, np.ndarray]
 
+_HAND = {"eef_pos": 3, "eef_quat_site": 4}
+"""What is observed of a hand that actions command, and in how many numbers."""
+
 
 def _read_episode(
     reader: ArrayReader,
@@ -230,7 +233,8 @@ def _read_episode(
     action = reader.numbers(demo, "actions", length)
     hands = [key for key in _hand_keys(action.shape[1]) if key not in state_keys and demo.find(f"obs/{key}")]
     observed = {
-        key: _canonical(key, reader.numbers(demo, f"obs/{key}", length)) for key in (*state_keys, *hands)
+        key: _canonical(demo.where, key, reader.numbers(demo, f"obs/{key}", length))
+        for key in (*state_keys, *hands)
     }
     action = convert(f"{demo.where}, actions", action, observed)
     driven = demo.count("driven", default=0)
@@ -242,15 +246,15 @@ def _read_episode(
 
 def _hand_keys(action_dim: int) -> list[str]:
     """Return the observations of the hands that actions of so many numbers command, where they are poses."""
-    return [
-        f"robot{arm}_{name}" for arm in range(action_dim // POSE_DIM) for name in ("eef_pos", "eef_quat_site")
-    ]
+    return [f"robot{arm}_{name}" for arm in range(action_dim // POSE_DIM) for name in _HAND]
 
 
-def _canonical(key: str, observed: np.ndarray) -> np.ndarray:
+def _canonical(where: str, key: str, observed: np.ndarray) -> np.ndarray:
     """Return an observation [T, n] as environments show it: of a quaternion and its negative, one rotation, always one."""
-    is_quaternion = key.endswith("eef_quat_site") and observed.shape[1] == 4
-    return downward_quaternion(observed) if is_quaternion else observed
+    for name, size in _HAND.items():
+        if key.endswith(name) and observed.shape[1] != size:
+            raise ValueError(f"{where}, obs/{key}: expected {size} numbers, got {observed.shape[1]}")
+    return downward_quaternion(observed) if key.endswith("eef_quat_site") else observed
 
 
 def _absolute_poses(where: str, pose: np.ndarray, observed: _Arrays) -> np.ndarray:
