@@ -96,16 +96,25 @@ def replaced(value):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (None, r"expected a dataset 'obs/agentview_image', got \['actions'"),
-        (np.zeros((3, 6, 8, 3), np.float32), r"expected uint8 \[3, h, w, 3\], got float32"),
-        (np.zeros((2, 6, 8, 3), np.uint8), r"expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]"),
-        (np.zeros((3, 6, 6, 3), np.uint8), r"expected images \[3, 6, 8\] as before, got \[3, 6, 6\]"),
+        (None, r": expected a dataset 'obs/agentview_image', got \['actions'"),
+        (
+            np.zeros((3, 6, 8, 3), np.float32),
+            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got float32",
+        ),
+        (
+            np.zeros((2, 6, 8, 3), np.uint8),
+            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]",
+        ),
+        (
+            np.zeros((3, 6, 6, 3), np.uint8),
+            r", obs/agentview_image: expected images \[3, 6, 8\] as before, got \[3, 6, 6\]",
+        ),
     ],
 )
 def test_a_wrong_file_names_the_demonstration(path, value, message):
     with h5py.File(path, "r+") as file:
         replaced(value)(file)
-    with pytest.raises(ValueError, match=rf"demos\.h5, demo_1, obs/agentview_image: {message}"):
+    with pytest.raises(ValueError, match=rf"demos\.h5, demo_1{message}"):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS)
     with pytest.raises(ValueError, match="demo_1"):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=path.parent / "images")

@@ -33,9 +33,9 @@ def recorded():
 def poses(path, env_args=None, steps=6, change=lambda actions: actions):
     """Write a file of absolute poses whose hand is where they command it; ``change`` edits the actions after that."""
     random = np.random.default_rng(0)
-    actions = np.concatenate(
-        [random.uniform(-0.2, 0.2, (steps, 3)) + [0, 0, 1], np.zeros((steps, 4))], axis=1
-    )
+    actions = np.zeros((steps, 7))
+    actions[:, :3] = random.uniform(-0.2, 0.2, (steps, 3))
+    actions[:, 2] += 1
     actions[:, 3:5] = np.pi / np.sqrt(2) + random.uniform(-0.02, 0.02, (steps, 2))
     with h5py.File(path, "w") as file:
         demo = file.create_group("data/demo_0")
