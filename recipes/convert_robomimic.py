@@ -3,7 +3,8 @@
     python recipes/convert_robomimic.py demos=low_dim_v15.hdf5 out=data/lift_human.h5
     python recipes/train_policy.py task=lift demos=data/lift_human.h5 filter_key=train
 
-Deltas become absolute actions, observations are made anew from the recorded states, images are copied.
+Deltas become absolute actions, observations are made anew from the recorded states, images are copied. Of Diffusion Policy's
+``*_abs.hdf5``, which hold poses and still name a controller of deltas, say ``poses=true``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torchrl_sparse.data.absolute import convert_demos
 
 @recipe("convert_robomimic", out="file")
 def main(config: DictConfig) -> None:
-    number = convert_demos(config.demos, config.out)
+    number = convert_demos(config.demos, config.out, poses=config.poses)
     print(f"{config.out}: {number} demonstrations with absolute actions")
 
 

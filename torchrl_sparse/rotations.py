@@ -95,12 +95,12 @@ def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
 
 
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
-    """Return the one of +q and -q (xyzw) that is nearer to the Panda's rest orientation, gripper down: (1, 1, 0, 0) / sqrt(2).
+    """Return of each [..., 4] the one of +q and -q (xyzw) that is nearer to the Panda's rest, (1, 1, 0, 0) / sqrt(2).
 
-    Both are the same rotation. Conventions that look at w flip where w crosses zero, which is where a downward gripper lives,
-    and a policy would see a jump where nothing moved.
+    Both are the same rotation; at rest the gripper points down. Conventions that look at w flip where w crosses zero, which is
+    where a downward gripper lives, and a policy would see a jump where nothing moved.
     """
-    return -quat if quat[0] + quat[1] < 0 else quat
+    return np.where(quat[..., :1] + quat[..., 1:2] < 0, -quat, quat)
 
 
 def _split_arms(flat: np.ndarray, dim: int) -> np.ndarray:

@@ -10,6 +10,8 @@ import zlib
 import h5py
 import numpy as np
 
+from tests.fixtures.demonstrations import describe
+
 SIZE = 84
 CHUNK = 50
 FRAME = np.arange(SIZE * SIZE * 3, dtype=np.uint32).astype(np.uint8).reshape(SIZE, SIZE, 3)
@@ -23,13 +25,14 @@ def write_big(path, demos, length):
         for index in range(demos):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = length
-            demo["actions"] = np.ones((length, 7))
+            demo["actions"] = np.full((length, 7), index, float)
             demo["obs/robot0_eef_pos"] = np.full((length, 3), index, float)
             images = demo.create_dataset(
                 "obs/agentview_image", shape, np.uint8, chunks=(CHUNK, *FRAME.shape), compression="gzip"
             )
             for row in range(0, length, CHUNK):
                 images.id.write_direct_chunk((row, 0, 0, 0), chunk)
+        describe(file)
     return path
 
 

@@ -62,9 +62,7 @@ def replay(path, task):
 
 
 def test_deltas_are_not_read_as_poses(published):
-    message = (
-        r"low_dim_v15\.hdf5, demo_0, actions: expected absolute poses, got deltas; recipes/convert_robomimic"
-    )
+    message = r"low_dim_v15\.hdf5: expected absolute poses, got deltas, as its controller says; recipes/convert_robomimic"
     with pytest.raises(ValueError, match=message):
         read_demos(published, ["robot0_eef_pos"])
 
@@ -132,7 +130,11 @@ def test_files_with_poses_keep_them(lifts, converted, tmp_path):
         poses = [file[f"data/demo_{i}/actions"][()] for i in range(2)]
     demos = [lift | {"actions": pose} for lift, pose in zip(lifts, poses, strict=True)]
     path = write(tmp_path / "low_dim_abs.hdf5", demos, env_args_14(LIFT))
-    convert_demos(path, tmp_path / "again.h5")
+    with pytest.raises(
+        ValueError, match=r"demo_0: actions: expected deltas, .* got absolute poses; poses=true"
+    ):
+        convert_demos(path, tmp_path / "again.h5")
+    convert_demos(path, tmp_path / "again.h5", poses=True)
     with h5py.File(tmp_path / "again.h5") as file:
         np.testing.assert_allclose(file["data/demo_1/actions"], poses[1], atol=1e-6)
 
@@ -219,13 +221,16 @@ def sawyer():
         (shorten_states, "demo_1: expected 32 numbers of a state and 7 of an action of Lift, got 31 and 7"),
         (
             lambda file: file["data"].attrs.pop("env_args"),
-            "expected an attribute env_args of 'data', got none",
+            "expected an attribute env_args of 'data', .* got none",
         ),
         (set_env_args("{"), "env_args: expected robomimic's description"),
         (set_env_args(env_args_15(LIFT, type="JOINT_VELOCITY")), "JOINT_VELOCITY"),
         (set_env_args(env_args_15(LIFT, frame="base", input_type="absolute")), "frame of the robot's base"),
-        (set_env_args(env_args_14(LIFT, impedance_mode="variable")), "impedance variable"),
-        (set_env_args(sawyer()), "robots: expected 1 times Panda, got Sawyer"),
+        (
+            set_env_args(env_args_14(LIFT, impedance_mode="variable")),
+            "impedance_mode: expected 'fixed', got 'variable'",
+        ),
+        (set_env_args(sawyer()), "robots: expected 1 times Panda, got 'Sawyer'"),
     ],
 )
 def test_what_cannot_be_converted_is_named_and_leaves_no_file(published, tmp_path, change, message):

@@ -68,12 +68,12 @@ def test_what_is_no_hdf5_file(path, text):
 
 def test_filter_keys(path):
     with open_demos(path) as file:
-        assert demo_names(path, file) == DEMOS
-        assert demo_names(path, file, "train") == ["demo_2", "demo_10"]
+        assert demo_names(file) == DEMOS
+        assert demo_names(file, "train") == ["demo_2", "demo_10"]
         for key, message in (
             ("valid", "expected a filter key mask/valid, got empty, gone, train"),
             ("gone", "mask/gone: expected demonstrations of the file, got demo_99"),
             ("empty", "mask/empty: expected at least one demonstration, got none"),
         ):
             with pytest.raises(ValueError, match=rf"demos\.h5.*{message}"):
-                demo_names(path, file, key)
+                demo_names(file, key)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.data.big_files import write_big
+from tests.fixtures.demonstrations import describe
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import read_demos
 
@@ -24,10 +25,11 @@ def write(path, lengths=LENGTHS, frame=(6, 8), seed=0):
         for index, length in enumerate(lengths):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = length
-            demo["actions"] = random.uniform(-1, 1, (length, 7))
-            demo["obs/robot0_eef_pos"] = random.uniform(-1, 1, (length, 3))
+            demo["actions"] = actions = random.uniform(-1, 1, (length, 7))
+            demo["obs/robot0_eef_pos"] = actions[:, :3]
             for camera in CAMERAS.values():
                 demo[f"obs/{camera}"] = random.integers(0, 256, (length, *frame, 3), dtype=np.uint8)
+        describe(file)
     return path
 
 
@@ -77,7 +79,7 @@ def test_a_later_file_with_other_images_or_none_is_named_and_nothing_is_written(
         ValueError, match=r"smaller\.h5, demo_0, obs/agentview_image: expected images \[3, 6, 8\]"
     ):
         read_demos([path, smaller], ["robot0_eef_pos"], **options)
-    with pytest.raises(ValueError, match=r"without\.h5, demo_0, obs/agentview_image: expected a dataset"):
+    with pytest.raises(ValueError, match=r"without\.h5, demo_0: expected a dataset 'obs/agentview_image'"):
         read_demos([path, without], ["robot0_eef_pos"], **options)
     assert not list((tmp_path / "images").iterdir())
 
@@ -94,16 +96,25 @@ def replaced(value):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (None, r"expected a dataset 'obs/agentview_image', got \['actions'"),
-        (np.zeros((3, 6, 8, 3), np.float32), r"expected uint8 \[3, h, w, 3\], got float32"),
-        (np.zeros((2, 6, 8, 3), np.uint8), r"expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]"),
-        (np.zeros((3, 6, 6, 3), np.uint8), r"expected images \[3, 6, 8\] as before, got \[3, 6, 6\]"),
+        (None, r": expected a dataset 'obs/agentview_image', got \['actions'"),
+        (
+            np.zeros((3, 6, 8, 3), np.float32),
+            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got float32",
+        ),
+        (
+            np.zeros((2, 6, 8, 3), np.uint8),
+            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]",
+        ),
+        (
+            np.zeros((3, 6, 6, 3), np.uint8),
+            r", obs/agentview_image: expected images \[3, 6, 8\] as before, got \[3, 6, 6\]",
+        ),
     ],
 )
 def test_a_wrong_file_names_the_demonstration(path, value, message):
     with h5py.File(path, "r+") as file:
         replaced(value)(file)
-    with pytest.raises(ValueError, match=rf"demos\.h5, demo_1, obs/agentview_image: {message}"):
+    with pytest.raises(ValueError, match=rf"demos\.h5, demo_1{message}"):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS)
     with pytest.raises(ValueError, match="demo_1"):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=path.parent / "images")

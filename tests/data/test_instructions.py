@@ -5,6 +5,7 @@ import json
 import h5py
 import pytest
 
+from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.instructions import read_instruction, read_instructions
 
 
@@ -28,20 +29,20 @@ def test_they_come_in_the_order_of_the_demonstrations_numbers(tmp_path):
 @pytest.mark.parametrize("meta", [None, "{}", '{"lang": ""}'])
 def test_a_demonstration_without_one_is_named(tmp_path, meta):
     path = write(tmp_path / "demos.h5", ['{"lang": "lift"}', meta])
-    with pytest.raises(ValueError, match=r"demos.h5, /data/demo_1: expected an instruction"):
+    with pytest.raises(ValueError, match=r"demos.h5, demo_1: expected an instruction"):
         read_instructions(path)
 
 
 @pytest.mark.parametrize("meta", ["{", "[3]", "4", '{"lang": 4}'])
 def test_a_damaged_one_is_named(tmp_path, meta):
     path = write(tmp_path / "demos.h5", [meta])
-    with pytest.raises(ValueError, match=r"demos.h5: /data/demo_0, ep_meta: expected a .* got "):
+    with pytest.raises(ValueError, match=r"demos.h5, demo_0, ep_meta: expected a .* got "):
         read_instructions(path)
 
 
 def test_older_files_have_none(tmp_path):
     with h5py.File(write(tmp_path / "demos.h5", [None])) as file:
-        assert read_instruction(file["data/demo_0"]) is None
+        assert read_instruction(Node("demo_0", file["data/demo_0"])) is None
 
 
 def test_no_file(tmp_path):

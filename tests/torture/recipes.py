@@ -12,13 +12,14 @@ import h5py
 import numpy as np
 
 from tests.evaluation.synthetic import make_results
+from tests.fixtures.demonstrations import describe, hands
 from tests.torture.formats import small_policy
 from tests.torture.processes import recipe
 from tests.training.vla.rendered import write_demos as write_rendered
 from torchrl_sparse.evaluation.results.schema import save_results
 
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline", "WANDB_SILENT": "true", "MPLBACKEND": "agg"}
-_STATE = {"object": 10, "robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
+_STATE = {"object": 10, "robot0_gripper_qpos": 2}
 
 TRIAL = """
 import os, shutil, sys, time
@@ -99,9 +100,11 @@ def _write_demos(path: Path) -> Path:
         for index in range(4):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = 15
-            demo["actions"] = random.uniform(-1, 1, (15, 7))
+            demo["actions"] = actions = random.uniform(-1, 1, (15, 7))
+            demo["obs/robot0_eef_pos"], demo["obs/robot0_eef_quat_site"] = hands(actions)
             for key, size in _STATE.items():
                 demo[f"obs/{key}"] = random.uniform(-1, 1, (15, size))
+        describe(file)
     return path
 
 

@@ -13,6 +13,7 @@ between hand and cube has the other sign, Transport's parts another order) and p
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,18 +24,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from torchrl_sparse.data.controller_settings import CONTROL_FREQ
 from torchrl_sparse.data.hdf5_files import new_hdf5
+from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import (
     ArrayReader,
     demo_group,
     demo_names,
-    naming,
     open_demo,
     open_demos,
 )
-from torchrl_sparse.data.hdf5_writer import copy_attributes, lay_out
+from torchrl_sparse.data.hdf5_writer import lay_out
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
+from torchrl_sparse.data.recorded_poses import REACH, TURN, check_poses, steps_out_of_reach
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import POSE_DIM
@@ -45,16 +48,20 @@ __all__ = ["AbsoluteActions", "convert_demos"]
 _TOLERANCE = 1e-3
 
 
-def convert_demos(path: str | Path, out: str | Path) -> int:
+def convert_demos(path: str | Path, out: str | Path, *, poses: bool = False) -> int:
     """Copy a robomimic file with absolute actions and with the observations that policies of the task read.
 
     Images, simulator states, rewards, attributes and filter keys are copied; one demonstration at a time is in memory. A
     killed conversion goes on where it stopped, from ``<out>.parts``; ``out`` appears when it is complete. Calling again
     after that only reports.
 
+    Whether actions are deltas or poses is decided for the whole file, by the controller that it names or by ``poses``. Then the
+    data have to agree. Deltas beyond the controller's input are clipped, as the simulator does; a warning says how many.
+
     Args:
-        path: a published file, low-dimensional, with images, or raw; its ``env_args`` have the form of robosuite 1.4 or 1.5.
+        path: a published file, low-dimensional, with images, or raw; its ``env_args`` have the form of robosuite 1.2 to 1.5.
         out: the file to write.
+        poses: its actions are absolute poses whatever controller it names, as in Diffusion Policy's ``*_abs.hdf5``.
 
     Returns:
         The number of demonstrations.
@@ -62,7 +69,8 @@ def convert_demos(path: str | Path, out: str | Path) -> int:
     Raises:
         FileNotFoundError: if there is no file.
         ValueError: naming file and demonstration, if the file is damaged or not of a known task with Pandas under
-            OSC_POSE, or its recorded hand is not where its states put it; or if ``out`` was made of another file.
+            OSC_POSE at 20 actions a second, its recorded hand is not where its states put it, or its actions are not what its
+            controller or ``poses`` says; or if ``out`` was made of another file.
 
     Examples:
         >>> convert_demos("low_dim_v15.hdf5", "data/lift_human.h5")  # doctest: +SKIP
@@ -70,21 +78,25 @@ def convert_demos(path: str | Path, out: str | Path) -> int:
     """
     path, out = Path(path), Path(out)
     with open_demos(path) as source:
-        names, control = demo_names(path, source), read_control(path, source)
+        names, control = demo_names(source), read_control(source, poses=poses)
         settings = {"source": path.name, "source_bytes": path.stat().st_size, "demonstrations": len(names)}
         if out.exists():
             shutil.rmtree(parts_of(out), ignore_errors=True)  # a kill between the two last steps leaves them
             with open_demos(out) as file:
-                check_same(out, {key: file["data"].attrs.get(key) for key in settings}, settings)
+                check_same(out, {"poses": False} | demo_group(file).told(), settings | {"poses": poses})
             return len(names)
-        if control is None:
-            raise ValueError(f"{path}: expected an attribute env_args of 'data', got none")
-        parts = claim_parts(out, settings)
+        parts = claim_parts(out, settings | {"poses": poses})
         missing = [name for name in names if not _part(parts, name).exists()]
         if missing:
-            _make_parts(path, demo_group(path, source), missing, control, parts)
-        _merge(path, source, out, names, parts, settings | {"env_args": _env_args(control)})
+            _make_parts(source, missing, control, parts)
+        settings |= {"env_args": _env_args(control)} | ({"poses": True} if poses else {})
+        clipped = _merge(source, out, names, parts, settings)
     shutil.rmtree(parts)
+    if clipped:
+        warnings.warn(
+            f"{path}: {clipped} numbers of its actions lie beyond the controller's input and were clipped, as robosuite does",
+            stacklevel=2,
+        )
     return len(names)
 
 
@@ -95,27 +107,23 @@ class AbsoluteActions:
         control: how the actions were meant.
 
     Raises:
-        ValueError: if the task is unknown or its robots are not Pandas.
+        ValueError: if the task is unknown.
 
     Examples:
-        >>> settings = {"type": "OSC_POSE", "input_type": "delta", "input_ref_frame": "world"}
-        >>> absolute = AbsoluteActions(RecordedControl("Lift", ("Panda",), settings, keeps_orientation=False))
+        >>> absolute = AbsoluteActions(RecordedControl("Lift"))
         >>> state = absolute.env.sim_env.sim.get_state().flatten()
-        >>> made = absolute.convert(state[None], np.array([[0, 0, 1.0, 0, 0, 0, -1]]))
+        >>> made, _ = absolute.convert(state[None], np.array([[0, 0, 1.0, 0, 0, 0, -1]]))
         >>> (made["actions"][0, :3] - made["obs/robot0_eef_pos"][0]).round(6).tolist()
         [0.0, 0.0, 0.05]
     """
 
     def __init__(self, control: RecordedControl):
         self.control = control
-        task = find_robosuite_task(control.env_name)
-        if control.robots != ("Panda",) * task.arms:
-            raise ValueError(f"robots: expected {task.arms} times Panda, got {', '.join(control.robots)}")
-        self.env = RobosuiteEnv(task.name)
+        self.env = RobosuiteEnv(find_robosuite_task(control.env_name).name)
         self.env.reset()
-        self._controllers = [_recorded_osc(robot, control.arm) for robot in self.env.sim_env.robots]
+        self._controllers = [_recorded_osc(robot, control) for robot in self.env.sim_env.robots]
 
-    def convert(self, states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+    def convert(self, states: np.ndarray, actions: np.ndarray) -> tuple[dict[str, np.ndarray], int]:
         """Convert one demonstration.
 
         Args:
@@ -124,15 +132,17 @@ class AbsoluteActions:
 
         Returns:
             ``"actions"`` f64 [T, 7 * arms] (position in m, rotation vector in rad, both in the world frame; gripper), and
-            ``"obs/<key>"`` f64 [T, n] for each of the environment's ``recorded_keys``.
+            ``"obs/<key>"`` f64 [T, n] for each of the environment's ``recorded_keys``. And how many numbers of the deltas lay
+            beyond the controller's input and were clipped.
 
         Raises:
-            ValueError: if the sizes are not those of the task.
+            ValueError: if the sizes are not those of the task, or the actions are not what the controller says: poses that no
+                hand could follow, or deltas that are poses.
         """
         sim = self.env.sim_env.sim
         self._check(states, actions)
-        deltas = self.control.are_deltas(actions)
-        goals = actions.copy()
+        deltas = self.control.are_deltas
+        goals, clipped = self.control.clip(actions) if deltas else (actions.copy(), 0)
         observed: dict[str, list[np.ndarray]] = {f"obs/{key}": [] for key in self.env.recorded_keys}
         rotations: list[np.ndarray | None] = [None] * len(self._controllers)
         for state, goal in zip(states, goals.reshape(len(goals), -1, POSE_DIM), strict=True):
@@ -143,7 +153,9 @@ class AbsoluteActions:
             for arm, osc in enumerate(self._controllers if deltas else ()):
                 position, rotations[arm] = self._goal(osc, goal[arm, :6], rotations[arm])
                 goal[arm, :6] = *position, *Rotation.from_matrix(rotations[arm]).as_rotvec()
-        return {"actions": goals} | {key: np.stack(values) for key, values in observed.items()}
+        arrays = {key: np.stack(values) for key, values in observed.items()}
+        self._check_kind(actions, arrays)
+        return {"actions": goals} | arrays, clipped
 
     def _goal(self, osc: Any, delta: np.ndarray, last: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the world-frame position [3] and rotation matrix [3, 3] that the controller aims at."""
@@ -164,26 +176,44 @@ class AbsoluteActions:
                 f"got {states.shape[1]} and {actions.shape[1]}"
             )
 
+    def _check_kind(self, actions: np.ndarray, observed: Mapping[str, np.ndarray]) -> None:
+        """Refuse actions that are not of the kind which the controller says."""
+        arms = range(self.env.task.arms)
+        positions = [observed[f"obs/robot{arm}_eef_pos"] for arm in arms]
+        quaternions = [observed[f"obs/robot{arm}_eef_quat_site"] for arm in arms]
+        if not self.control.are_deltas:
+            check_poses("actions", actions, positions, quaternions)
+            return
+        far, turn = steps_out_of_reach(actions, positions, quaternions)
+        if (far <= REACH).all() and (turn <= TURN).all():
+            raise ValueError(
+                "actions: expected deltas, as the file's controller takes them, got absolute poses; poses=true says so"
+            )
+
     def close(self) -> None:
         """Free the simulator."""
         self.env.close()
 
 
-def _recorded_osc(robot: Any, settings: Mapping[str, Any]) -> Any:
+def _recorded_osc(robot: Any, control: RecordedControl) -> Any:
     """Make robosuite's OSC controller with recorded settings, for the goals that it sets."""
     from robosuite.controllers.parts.arm.osc import OperationalSpaceController
 
     own = robot.part_controllers["right"]
     joints = {"joints": own.joint_index, "qpos": own.qpos_index, "qvel": own.qvel_index}
     place = {"part_name": own.part_name, "naming_prefix": own.naming_prefix}
-    settings = {key: value for key, value in settings.items() if key not in ("type", "gripper", *place)}
     osc = OperationalSpaceController(
         sim=own.sim,
         ref_name=own.ref_name,
         joint_indexes=joints,
         actuator_range=(own.actuator_min, own.actuator_max),
         **place,
-        **settings,
+        input_min=control.input_min,
+        input_max=control.input_max,
+        output_min=control.output_min,
+        output_max=control.output_max,
+        input_type="delta" if control.are_deltas else "absolute",
+        input_ref_frame=control.frame,
     )
     osc.update_origin(*robot.composite_controller.get_controller_base_pose("right"))
     osc.reset_goal()
@@ -194,23 +224,31 @@ def _part(parts: Path, name: str) -> Path:
     return parts / f"{name}.h5"
 
 
-def _make_parts(
-    path: Path, data: h5py.Group, names: Sequence[str], control: RecordedControl, parts: Path
-) -> None:
-    with _saying(path):
+def _make_parts(source: Node, names: Sequence[str], control: RecordedControl, parts: Path) -> None:
+    with _saying(source.where):
         absolute = AbsoluteActions(control)
     for name in tqdm(names, unit="demo"):
-        where = f"{path}, {name}"
-        demo, length = open_demo(where, data, name)
-        reader = ArrayReader(data.file)  # one demonstration is in memory at a time
-        states, actions = (reader.numbers(where, demo, key, length) for key in ("states", "actions"))
-        with _saying(where):
-            arrays = absolute.convert(states, actions)
-        _check_hands(where, demo, arrays, length)
+        demo, length = open_demo(demo_group(source), name)
+        reader = ArrayReader(source)  # one demonstration is in memory at a time
+        states, actions = (reader.numbers(demo, key, length) for key in ("states", "actions"))
+        _check_rate(demo, states[:, 0])
+        with _saying(demo.where):
+            arrays, clipped = absolute.convert(states, actions)
+        _check_hands(demo, arrays, length)
         with new_hdf5(_part(parts, name)) as file:
+            file.attrs["clipped"] = clipped
             for key, value in arrays.items():
                 file[key] = value
     absolute.close()
+
+
+def _check_rate(demo: Node, seconds: np.ndarray) -> None:
+    """Refuse states that are another time apart than this library's environments pass in a step."""
+    apart = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    if apart > 0 and abs(apart * CONTROL_FREQ - 1) > 0.1:
+        raise ValueError(
+            f"{demo.where}, states: expected {1 / CONTROL_FREQ} s between them, got {apart:.3f} s, another control_freq"
+        )
 
 
 @contextmanager
@@ -221,43 +259,51 @@ def _saying(where: str | Path) -> Iterator[None]:
         raise ValueError(f"{where}: {error}") from error
 
 
-def _check_hands(where: str, demo: h5py.Group, arrays: Mapping[str, np.ndarray], length: int) -> None:
+def _check_hands(demo: Node, arrays: Mapping[str, np.ndarray], length: int) -> None:
     """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
     for key, value in arrays.items():
-        if key.endswith("eef_pos") and key in demo:
-            far = np.linalg.norm(
-                ArrayReader(demo.file).numbers(where, demo, key, length) - value, axis=1
-            ).max()
+        if key.endswith("eef_pos") and (recorded := demo.find(key)) is not None:
+            far = np.linalg.norm(ArrayReader(demo).numbers(demo, key, length) - value, axis=1).max()
             if far > _TOLERANCE:
                 raise ValueError(
-                    f"{where}, {key}: expected the hand where the states put it, got {far:.4f} m off"
+                    f"{recorded.where}: expected the hand where the states put it, got {far:.4f} m off"
                 )
 
 
-def _merge(
-    path: Path, source: h5py.File, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]
-) -> None:
-    total = sum(open_demo(f"{path}, {name}", source["data"], name)[1] for name in names)
+def _merge(source: Node, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]) -> int:
+    """Write the file, and return how many numbers of its actions were clipped."""
+    demos, total, clipped = demo_group(source), 0, 0
+    for name in names:
+        total += open_demo(demos, name)[1]
+        with open_demos(_part(parts, name)) as part:
+            clipped += part.count("clipped", default=0)
+    told = {"total": total} | ({"clipped": clipped} if clipped else {})
     with new_hdf5(out) as file:
-        data = lay_out(file, names, attributes | {"total": total})
-        if "mask" in source:
-            source.copy("mask", file)
+        data = lay_out(file, names, attributes | told)
+        source.copy(file, "mask")
         for name in names:
-            with naming(f"{path}, {name}"), h5py.File(_part(parts, name), "r") as part:
-                _fill(data[name], source["data"][name], part)
+            with open_demos(_part(parts, name)) as part:
+                _fill(data[name], demos.group(name), part)
+    return clipped
 
 
-def _fill(target: h5py.Group, demo: h5py.Group, part: h5py.File) -> None:
+def _fill(target: h5py.Group, demo: Node, part: Node) -> None:
     """Merge what was converted with those recordings that do not depend on the controller."""
-    copy_attributes(demo, target)
-    part.copy("actions", target)
-    part.copy("obs", target)
+    demo.copy_attributes(target)
+    part.copy(target, "actions")
+    part.copy(target, "obs")
     for name in ("states", "rewards", "dones"):
-        if name in demo:
-            demo.copy(name, target)
-    for name, item in demo.get("obs", {}).items():
-        if item.dtype == np.uint8 and item.ndim == 4:
-            demo.copy(item, target["obs"], name=name)
+        demo.copy(target, name)
+    observed = demo.find("obs")
+    for name in observed.names() if observed is not None and observed.is_group else ():
+        item = observed.find(name)
+        if (
+            item is not None
+            and item.is_array
+            and item.layout().dtype == np.uint8
+            and len(item.layout().shape or ()) == 4
+        ):
+            item.copy_to(target["obs"], name)
 
 
 def _env_args(control: RecordedControl) -> dict[str, Any]:

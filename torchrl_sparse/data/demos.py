@@ -15,13 +15,13 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 
-import h5py
-import numpy as np
 from torchrl.envs import EnvBase
 
 from torchrl_sparse.data.dagger import Driver, Driving, load_driver
 from torchrl_sparse.data.demo_workers import in_order
 from torchrl_sparse.data.demonstrate import demonstrate
+from torchrl_sparse.data.hdf5_nodes import Node
+from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, open_demo, open_demos
 from torchrl_sparse.data.hdf5_writer import episode_outcome, merge_episodes, split_episodes, write_episode
 from torchrl_sparse.data.instructions import read_instruction
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
@@ -202,16 +202,31 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
 
     Raises:
         FileNotFoundError: if there is no file.
-        KeyError: if the file has no demonstration of that number.
+        ValueError: naming file and demonstration, if there is none of that number, it is damaged, or its model is of robosuite
+            1.4 or earlier, which robosuite 1.5 cannot play.
     """
-    with h5py.File(path, "r") as file:
-        demo = file[f"data/demo_{index}"]
+    with open_demos(path) as file:
+        demo, length = open_demo(demo_group(file), f"demo_{index}")
         return InitialState(
-            model_xml=str(demo.attrs["model_file"]),
-            sim_state=np.asarray(demo["states"][0]),
-            seed=int(demo.attrs.get("seed", -1)),
+            model_xml=_read_model(demo),
+            sim_state=ArrayReader(file).numbers(demo, "states", length)[0],
+            seed=demo.count("seed", default=-1),
             instruction=read_instruction(demo),
         )
+
+
+def _read_model(demo: Node) -> str:
+    """Read the MuJoCo model of a demonstration; "" where it is of another simulator."""
+    if (model := demo.text("model_file")) is None:
+        raise ValueError(f"{demo.where}: expected an attribute model_file, the episode's model, got none")
+    if (
+        "gripper0_" in model and "gripper0_right_" not in model
+    ):  # 1.5 calls the gripper's parts by the side of its arm
+        raise ValueError(
+            f"{demo.where}, model_file: expected a model of robosuite 1.5, got one of robosuite 1.4 or earlier, "
+            "whose parts have other names"
+        )
+    return model
 
 
 def _check_yield(tally: Summary) -> None:
@@ -221,8 +236,8 @@ def _check_yield(tally: Summary) -> None:
 
 
 def _read_finished(path: Path) -> _Finished:
-    with h5py.File(path, "r") as file:
-        return parse_json(file["data"].attrs.get("collection", "{}"), _Finished, f"{path}: collection")
+    with open_demos(path) as file:
+        return parse_json(demo_group(file).text("collection") or "{}", _Finished, f"{path}: collection")
 
 
 def _add(tally: Summary, part: Path, kept: list[Path], keep_failures: bool) -> Summary:

@@ -33,6 +33,7 @@ import h5py
 import numpy as np
 
 from torchrl_sparse.data.hdf5_files import new_hdf5
+from torchrl_sparse.data.hdf5_reader import demo_group, open_demos
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,9 @@ class Outcome:
 
 def episode_outcome(path: Path) -> Outcome:
     """Return the outcome of an episode written by `write_episode`."""
-    with h5py.File(path, "r") as file:
-        told = file["demo"].attrs
-        return Outcome(int(told["num_samples"]), bool(told["success"]), int(told.get("driven", 0)))
+    with open_demos(path) as file:
+        demo = file.group("demo")
+        return Outcome(demo.count("num_samples"), demo.flag("success"), demo.count("driven", default=0))
 
 
 def merge_episodes(
@@ -95,19 +96,21 @@ def merge_episodes(
     with new_hdf5(path) as file:
         data = lay_out(file, parts, attributes)
         for name, part in parts.items():
-            with h5py.File(part, "r") as source:
-                copy_attributes(source["demo"], data[name])
-                for child in source["demo"]:
-                    source.copy(f"demo/{child}", data[name])
+            with open_demos(part) as source:
+                demo = source.group("demo")
+                demo.copy_attributes(data[name])
+                for child in demo.names():
+                    demo.copy(data[name], child)
 
 
 def split_episodes(path: Path, part: Callable[[int], Path]) -> None:
     """Undo `merge_episodes`: write each demonstration as the file ``part(seed)``, unless that is there."""
-    with h5py.File(path, "r") as source:
-        for demo in source["data"].values():
-            if not (episode := part(int(demo.attrs["seed"]))).exists():
+    with open_demos(path) as source:
+        for name in (data := demo_group(source)).names():
+            demo = data.group(name)
+            if not (episode := part(demo.count("seed"))).exists():
                 with new_hdf5(episode) as file:
-                    source.copy(demo, file, "demo")
+                    demo.copy_to(file, "demo")
 
 
 def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:
@@ -122,12 +125,6 @@ def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]
     for name in names:
         data.create_group(name)
     return data
-
-
-def copy_attributes(source: h5py.Group, target: h5py.Group) -> None:
-    """Copy all attributes of one demonstration to another."""
-    for name, value in source.attrs.items():
-        target.attrs[name] = value
 
 
 def _fill(group: h5py.Group, episode: Episode) -> None:

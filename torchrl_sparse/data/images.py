@@ -43,11 +43,10 @@ class RecordedImages:
     def episodes(self, key: str) -> Iterator[tuple[str, np.ndarray]]:
         """Return for each demonstration where it is, for messages, and its images of one camera, u8 [T, 3, h, w]."""
         with open_demos(self.path) as file:
-            data, reader = demo_group(self.path, file), ArrayReader(file, IMAGES)
+            data, reader = demo_group(file), ArrayReader(file, IMAGES)
             for name, length in self.lengths.items():
-                where = f"{self.path}, {name}, obs/{key}"
-                images = reader.images(where, data[name], f"obs/{key}", length)
-                yield where, np.ascontiguousarray(images.transpose(0, 3, 1, 2))
+                images = reader.images(data.group(name), f"obs/{key}", length)
+                yield f"{self.path}, {name}, obs/{key}", np.ascontiguousarray(images.transpose(0, 3, 1, 2))
 
 
 def read_images(files: Sequence[RecordedImages], key: str, folder: str | Path | None) -> Tensor:

@@ -7,29 +7,29 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
-
-from torchrl_sparse.data.hdf5_bounds import text_attribute
-from torchrl_sparse.data.hdf5_reader import demo_names, each_path, open_demos
+from torchrl_sparse.data.hdf5_nodes import Node
+from torchrl_sparse.data.hdf5_reader import demo_group, demo_names, each_path, open_demos
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["read_instruction", "read_instructions"]
 
 
-def read_instruction(demo: h5py.Group) -> str | None:
+def read_instruction(demo: Node) -> str | None:
     """Read the instruction of one demonstration; None if it has none.
 
     Raises:
         ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
     """
-    text = text_attribute(demo.name, demo, "ep_meta") or "{}"
+    text = demo.text("ep_meta") or "{}"
     try:
         words = parse_json(text, dict[str, Any], "ep_meta").get("lang")
     except ValueError as error:
-        raise ValueError(f"{demo.name}, ep_meta: expected a json object, got {reprlib.repr(text)}") from error
+        raise ValueError(
+            f"{demo.where}, ep_meta: expected a json object, got {reprlib.repr(text)}"
+        ) from error
     if words is None or isinstance(words, str):
         return words
-    raise ValueError(f"{demo.name}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
+    raise ValueError(f"{demo.where}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
 
 
 def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
@@ -48,14 +48,11 @@ def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
 
 def _read_file(path: str | Path) -> list[str]:
     with open_demos(path) as file:
-        return [_required(path, file["data"][name]) for name in demo_names(path, file)]
+        data = demo_group(file)
+        return [_required(data.group(name)) for name in demo_names(file)]
 
 
-def _required(path: str | Path, demo: h5py.Group) -> str:
-    try:
-        words = read_instruction(demo)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    if not words:
-        raise ValueError(f"{path}, {demo.name}: expected an instruction, ep_meta['lang'], got none")
+def _required(demo: Node) -> str:
+    if not (words := read_instruction(demo)):
+        raise ValueError(f"{demo.where}: expected an instruction, ep_meta['lang'], got none")
     return words

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
 from tqdm import tqdm
 
 from torchrl_sparse.data.demos import read_initial_state
 from torchrl_sparse.data.hdf5_files import new_hdf5
-from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
-from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.storage.json import parse_json
+from torchrl_sparse.data.hdf5_nodes import Node
+from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
+from torchrl_sparse.data.recorded_control import read_control
+from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
 
 __all__ = ["render_demos"]
 
@@ -38,21 +39,38 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     Raises:
         FileNotFoundError: if there is no file.
         RuntimeError: if no GL library is installed.
-        ValueError: if the file is truncated, there is no such camera, or ``out`` is ``path``.
+        ValueError: naming the demonstration, if one is damaged or its model is none of robosuite 1.5; if there is no such
+            camera, or ``out`` is ``path``.
     """
     if Path(path).resolve() == Path(out).resolve():
         raise ValueError(f"out: expected another file than the demonstrations, got {out}")
     with open_demos(path) as source, new_hdf5(out) as file:
-        for group in source:  # the demonstrations and their filter keys
-            source.copy(group, file)
-        env_args = parse_json(file["data"].attrs["env_args"], dict[str, Any], f"{path}: env_args")
-        env = RobosuiteEnv(env_args["env_name"])
-        for name in tqdm(demo_names(path, source), unit="demo"):
-            env.reset(initial_state=read_initial_state(path, int(name[5:])))
-            demo = file["data"][name]
-            for key, values in _render(env, demo["states"][:], cameras, image_size).items():
-                demo.create_dataset(f"obs/{key}", data=values, compression="lzf")
+        env = RobosuiteEnv(read_control(source).env_name)
+        for name in source.names():  # the demonstrations and their filter keys
+            source.copy(file, name)
+        for name in tqdm(demo_names(source), unit="demo"):
+            demo, length = open_demo(demo_group(source), name)
+            states = ArrayReader(source).numbers(demo, "states", length)
+            _restore(env, demo, read_initial_state(path, int(name[5:])))
+            for key, values in _render(env, states, cameras, image_size).items():
+                file["data"][name].create_dataset(f"obs/{key}", data=values, compression="lzf")
         env.close()
+
+
+def _restore(env: RobosuiteEnv, demo: Node, start: InitialState) -> None:
+    """Put the environment at a demonstration's start."""
+    size = len(env.sim_env.sim.get_state().flatten())
+    if len(start.sim_state) != size:
+        raise ValueError(
+            f"{demo.where}, states: expected {size} numbers of {env.task.name}, got {len(start.sim_state)}"
+        )
+    try:
+        env.reset(initial_state=start)
+    except (ValueError, KeyError, AttributeError, ParseError) as error:
+        raise ValueError(
+            f"{demo.where}, model_file: expected a model of robosuite 1.5, got one that it cannot play "
+            f"({' '.join(str(error).split())[:200]})"
+        ) from error
 
 
 def _render(

@@ -2,41 +2,37 @@
 
 Layout: ``data/demo_<i>/actions`` [T, 7 * arms] absolute poses (position, rotation vector, gripper),
 ``data/demo_<i>/obs/<key>`` [T, n], images u8 [T, h, w, 3] among them, and the attribute ``num_samples`` = T on every
-demonstration; whatever else a file holds is ignored. Published files record deltas and need
-`torchrl_sparse.data.absolute.convert_demos` first. Writing is in `torchrl_sparse.data.hdf5_writer`. Images are streamed: one
-demonstration at a time is in memory.
+demonstration. The attribute ``env_args`` of ``data`` says of which task and controller they are, see
+`torchrl_sparse.data.controller_settings`; observations and arrays that nobody asks for are not read. Published files record
+deltas and need `torchrl_sparse.data.absolute.convert_demos` first. Quaternions of the grip site have the sign that
+environments show. Writing is in `torchrl_sparse.data.hdf5_writer`. Images are streamed: one demonstration at a time is in
+memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_sparse import keys
-from torchrl_sparse.data.hdf5_bounds import count_attribute
 from torchrl_sparse.data.hdf5_reader import (
     ArrayReader,
     demo_group,
     demo_names,
     each_path,
-    open_demo,
     open_demos,
 )
 from torchrl_sparse.data.images import RecordedImages, read_images
-from torchrl_sparse.data.recorded_control import RecordedControl, check_recorded_task, read_control
-from torchrl_sparse.data.recorded_objects import RecordedObjects
-from torchrl_sparse.envs.contract import OBJECTS, Contract
+from torchrl_sparse.data.recorded_control import check_recorded_task, read_control
+from torchrl_sparse.data.recorded_episode import read_episode
+from torchrl_sparse.envs.contract import Contract
 from torchrl_sparse.envs.conventions import Convention
-from torchrl_sparse.rotations import POSE_DIM, pose_to_absolute
 
 __all__ = ["Demonstrations", "join_demos", "read_demos"]
 
@@ -148,8 +144,9 @@ def read_demos(
         cameras: images to read: the name here -> the observation there, e.g. ``{"image": "agentview_image"}``.
         image_folder: where to put the images as memory-mapped files, for more of them than there is memory; in
             memory by default.
-        poses: actions are absolute poses of arms; False takes them as they are, as benchmarks outside robosuite want it.
-        task: name of the task that they are to show; None for any.
+        poses: actions are absolute poses of arms, as the file's controller says and the recorded hands bear out; False takes
+            them as they are, as benchmarks outside robosuite want it.
+        task: name of the task that they are to show; None for any known one.
         convention: the version of robosuite whose meaning ``object`` shall have, whichever recorded it.
 
     Returns:
@@ -157,9 +154,10 @@ def read_demos(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if a file is truncated or malformed, its actions are deltas, it is of another task, there is no such filter
-            key, or its objects cannot be had in that convention; the message names file, demonstration and dataset. As
-            `join_demos` if files differ.
+        ValueError: if a file is truncated or malformed, does not say what it is of, its actions are deltas or were played by
+            another controller, robot or at another rate, it is of another task, there is no such filter key, or its objects
+            cannot be had in that convention; the message names file, demonstration and dataset. As `join_demos` if files
+            differ.
 
     Examples:
         >>> demos = read_demos("data/lift.h5", find_robosuite_task("Lift").state_keys)  # doctest: +SKIP
@@ -185,18 +183,16 @@ def _read_numbers(
 ) -> tuple[list[str], Demonstrations]:
     """Return the names of a file's demonstrations, and these without images."""
     with open_demos(path) as file:
-        names, control = demo_names(path, file, filter_key), None
-        if wanted.task is not None:
-            check_recorded_task(Path(path), file, wanted.task)
-        recorded = RecordedObjects(path, file, wanted.task)
-        # Of files of other simulators only their maker knows whether actions are poses.
-        with suppress(ValueError):
-            control = read_control(path, file)
-        convert = partial(_absolute_poses, control=control) if poses else _as_they_are
-        data, reader = demo_group(path, file), ArrayReader(file)
-        episodes = [
-            _read_episode(f"{path}, {name}", reader, data, name, wanted, recorded, convert) for name in names
-        ]
+        names = demo_names(file, filter_key)
+        task = check_recorded_task(file, wanted.task, poses=poses)
+        control = read_control(file) if poses else None
+        if control is not None and control.are_deltas:
+            raise ValueError(
+                f"{path}: expected absolute poses, got deltas, as its controller says; "
+                "recipes/convert_robomimic.py converts them"
+            )
+        data, reader = demo_group(file), ArrayReader(file)
+        episodes = [read_episode(reader, data, name, wanted, control) for name in names]
     widths = sorted({(state.shape[1], action.shape[1]) for state, action, _ in episodes})
     if len(widths) > 1:
         raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
@@ -204,7 +200,7 @@ def _read_numbers(
     starts = torch.tensor([0, *map(len, actions)]).cumsum(0)
     state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
     data = TensorDict({keys.STATE: state, keys.ACTION: action}, batch_size=[len(state)])
-    return names, Demonstrations(data, starts, torch.tensor(driven), replace(wanted, task=recorded.task))
+    return names, Demonstrations(data, starts, torch.tensor(driven), replace(wanted, task=task))
 
 
 def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -236,46 +232,6 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
         torch.cat([part.driven for part in parts]),
         contract,
     )
-
-
-def _read_episode(
-    where: str,
-    reader: ArrayReader,
-    data: h5py.Group,
-    name: str,
-    wanted: Contract,
-    recorded: RecordedObjects,
-    convert: Callable[[str, np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the state [T, Ds] and converted action [T, A] of one demonstration, f32, and how many steps were driven."""
-    demo, length = open_demo(where, data, name)
-    action = convert(f"{where}, actions", reader.numbers(where, demo, "actions", length))
-    state = [reader.numbers(where, demo, f"obs/{key}", length) for key in wanted.state_keys]
-    if OBJECTS in wanted.state_keys:
-        place = wanted.state_keys.index(OBJECTS)
-        state[place] = recorded.translate(where, state[place], wanted.convention)
-    driven = count_attribute(where, demo, "driven") if "driven" in demo.attrs else 0
-    if not 0 <= driven <= length:
-        raise ValueError(f"{where}, driven: expected 0 to {length} steps, got {driven}")
-    return np.concatenate(state, axis=1).astype(np.float32), action.astype(np.float32), driven
-
-
-def _absolute_poses(where: str, pose: np.ndarray, control: RecordedControl | None) -> np.ndarray:
-    """Return absolute actions [T, 10 * arms] of recorded poses [T, 7 * arms]."""
-    if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
-        raise ValueError(f"{where}: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
-    if control is not None and control.are_deltas(pose):
-        raise ValueError(
-            f"{where}: expected absolute poses, got deltas; recipes/convert_robomimic.py converts them"
-        )
-    try:
-        return pose_to_absolute(pose)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
-
-
-def _as_they_are(where: str, action: np.ndarray) -> np.ndarray:
-    return action
 
 
 def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:

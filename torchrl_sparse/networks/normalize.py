@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from torchrl_sparse.rotations import ABSOLUTE_DIM
 
-__all__ = ["Normalizer"]
+__all__ = ["MIN_RANGE", "Normalizer"]
 
 _POSITION = slice(0, 3)
-_MIN_RANGE = 1e-4
+MIN_RANGE = 1e-4
 """Dimensions that vary less are centred and not stretched: dividing by their range would amplify noise."""
 
 
@@ -79,7 +79,7 @@ class Normalizer(nn.Module):
         """
         _check_data(state, action, poses)
         if state_mode == "global":
-            scale = state.abs().max().clamp(min=_MIN_RANGE).reciprocal().expand(state.shape[1])
+            scale = state.abs().max().clamp(min=MIN_RANGE).reciprocal().expand(state.shape[1])
             offset = torch.zeros_like(scale)
         elif state_mode == "range":
             scale, offset = _range_map(state)
@@ -113,7 +113,7 @@ def _range_map(x: Tensor) -> tuple[Tensor, Tensor]:
     """Scale and offset that send each column's minimum to -1 and maximum to 1."""
     low, high = x.amin(0), x.amax(0)
     extent = high - low
-    scale = torch.where(extent < _MIN_RANGE, torch.ones_like(extent), 2 / extent.clamp(min=_MIN_RANGE))
+    scale = torch.where(extent < MIN_RANGE, torch.ones_like(extent), 2 / extent.clamp(min=MIN_RANGE))
     return scale, -(high + low) / 2 * scale
 
 

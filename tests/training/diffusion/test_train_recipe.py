@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.fixtures.demonstrations import describe, describe_state_task, hands
 from tests.training.runs import stop_and_go_on, train_unbroken
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-STATE = {"object": 10, "robot0_eef_pos": 3, "robot0_eef_quat_site": 4, "robot0_gripper_qpos": 2}
+STATE = {"object": 10, "robot0_gripper_qpos": 2}
 
 
 @pytest.fixture(scope="module")
@@ -19,9 +20,11 @@ def demos(tmp_path_factory):
         for index in range(4):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = 15
-            demo["actions"] = random.uniform(-1, 1, (15, 7))
+            demo["actions"] = actions = random.uniform(-1, 1, (15, 7))
+            demo["obs/robot0_eef_pos"], demo["obs/robot0_eef_quat_site"] = hands(actions)
             for key, size in STATE.items():
                 demo[f"obs/{key}"] = random.uniform(-1, 1, (15, size))
+        describe(file)
     return path
 
 
@@ -58,6 +61,7 @@ def test_what_is_left_open_is_as_published_for_the_task(tmp_path):
         demo = file.create_group("data/demo_0")
         demo.attrs["num_samples"] = 30
         demo["actions"], demo["obs/state"] = random.uniform(-3, 1, (30, 2)), random.uniform(0, 9, (30, 16))
+        describe_state_task(file, "BlockPush")
     small = ["network.n_layer=1", "network.n_emb=16", "network.n_head=2", "batch_size=4", "max_steps=1"]
     options = ["task=block_push", f"demos={path}", "train.val_ratio=0", *small]
     train_unbroken("train_policy", tmp_path / "run", options)

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.networks.normalize import MIN_RANGE
+
 __all__ = ["QuantileNormalizer"]
 
 _EPS = 1e-8
+_RARE = 100
+"""A channel whose whole range is so many times that between its quantiles is used rarely."""
 
 
 class QuantileNormalizer(nn.Module):
     """Maps the range between the 1 % and the 99 % quantile to [-1, 1], per dimension.
 
     Both are clipped to [-1, 1]. Gripper dimensions have no range: the policy says how open the gripper shall be, from 0
-    (closed) to 1, the environment takes -1 (open) or 1 (close).
+    (closed) to 1, the environment takes -1 (open) or 1 (close). What varies by less than 1e-4 is centred and not stretched, as
+    by `torchrl_sparse.networks.normalize.Normalizer`: the policy would see its rounding. Such an action stays within its range.
 
     Args:
         state_low, state_high: f32 [Ds], the quantiles.
@@ -59,11 +65,24 @@ class QuantileNormalizer(nn.Module):
 
     @classmethod
     def fit(cls, state: Tensor, action: Tensor, *, gripper: Sequence[int] = (6,)) -> QuantileNormalizer:
-        """Fit a normaliser to states [N, Ds] and actions [N, A], whose ``gripper`` dimensions are -1 (open) to 1 (close)."""
-        ranges = [torch.quantile(x.double(), q, dim=0) for x in (state, action) for q in (0.01, 0.99)]
+        """Fit a normaliser to states [N, Ds] and actions [N, A], whose ``gripper`` dimensions are -1 (open) to 1 (close).
+
+        Beyond the quantiles no output can command. An action that is used so rarely that they leave out 99 % of its
+        range, such as a turn in 5 of 1,000 steps, is mapped by its least and its largest number instead, with a warning.
+        """
         is_gripper = torch.zeros(action.shape[1], dtype=torch.bool)
         is_gripper[list(gripper)] = True
-        return cls(*ranges, is_gripper)
+        low, high = _quantiles(action)
+        least, largest = action.double().amin(0), action.double().amax(0)
+        rare = (largest - least >= MIN_RANGE) & (largest - least > _RARE * (high - low)) & ~is_gripper
+        if rare.any():
+            warnings.warn(
+                f"action: numbers {', '.join(map(str, rare.nonzero().flatten().tolist()))} vary in a few steps alone; they are "
+                "normalised by their least and largest values, not by their quantiles, so that they can still be commanded",
+                stacklevel=2,
+            )
+        low, high = torch.where(rare, least, low), torch.where(rare, largest, high)
+        return cls(*_quantiles(state), low, high, is_gripper)
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """Map states [..., Ds] from environment units to the policy's."""
@@ -80,8 +99,14 @@ class QuantileNormalizer(nn.Module):
         return torch.where(self.gripper, (1 - 2 * action).sign(), real)
 
 
+def _quantiles(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the 1 % and the 99 % quantile of each column."""
+    return torch.quantile(x.double(), 0.01, dim=0), torch.quantile(x.double(), 0.99, dim=0)
+
+
 def _to_unit(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    return 2 * (x - low) / (high - low + _EPS) - 1
+    stretched = 2 * (x - low) / (high - low + _EPS) - 1
+    return torch.where(high - low < MIN_RANGE, x - (high + low) / 2, stretched)
 
 
 def _check_range(name: str, low: Tensor, high: Tensor) -> None:
