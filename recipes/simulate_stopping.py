@@ -16,8 +16,7 @@ from torchrl_sparse.evaluation.results.stopping import save_stopping, simulate_s
 
 @recipe("simulate_stopping")
 def main(config: DictConfig) -> None:
-    design = config.max_episodes, config.looks
-    results = simulate_stopping(*design, config.trials, config.seed, config.dense_episodes)
+    results = simulate_stopping(config.max_episodes, config.looks, config.trials, config.seed)
     out = Path(config.out)
     save_stopping(results, out / "stopping.json")
     plot_stopping(results, out / "stopping.png")

@@ -117,7 +117,6 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("finalists", "windows", "population", "generations", "random_masks"), Count),
     "until": Literal["episodes", "decided"],
     **dict.fromkeys(("max_episodes", "looks", "trials", "eval_episodes", "probe_episodes"), Count),
-    "dense_episodes": Count | None,
     "seed": Whole,
     "evaluate_policy.seed": Whole | None,
     "horizon": Count | None,

@@ -33,7 +33,7 @@ from torchrl_sparse.evaluation.statistics.durations import (
     correlation,
     success_within,
 )
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, verdict
+from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, verdict
 from torchrl_sparse.evaluation.statistics.scores import mean_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
@@ -140,7 +140,6 @@ def build_results(
         {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
-        dense_episodes=design.dense_episodes,
         pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
         settings=None if settings is None else dict(settings),
     )
@@ -241,7 +240,7 @@ def compare_episodes(
     Args:
         name: of the method.
         episodes: its own.
-        dense: the dense policy's, in the order of the benchmark's seeds; perhaps more of them, see `pair_by_design`.
+        dense: the dense policy's; perhaps more of them, see `pair_by_design`.
         terms: of the comparison.
 
     Raises:
@@ -279,7 +278,10 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     confidence = design.confidence(n)
     solved = pairs.success_difference(terms.margin, confidence)
     times = pairs.time_ratio(horizon, terms.time_margin, confidence)
-    p_values = (design.p_value(abs(z), n) for z in terms.statistics(pairs))
+    p_values = [design.p_value(abs(z), n) for z in terms.statistics(pairs)]
+    if not any(map(any, pairs.solved)):  # as alike as two policies that do nothing
+        solved, times = replace(solved, verdict="undecided"), replace(times, verdict="undecided")
+        p_values = [0.5, 0.5]
     return {
         "paired_vs_dense": Difference.of(solved),
         "time_vs_dense": TimeDifference.of(times),
@@ -289,9 +291,11 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
 
 def _to_itself(n: int, terms: Terms) -> dict[str, Any]:
     """Dense equals itself by definition: nothing is estimated, and nothing is tested."""
-    solved = PairedDifference(0.0, (0.0, 0.0), terms.margin, "non-inferior", 0, 0, n)
     times = TimeRatio(1.0, (1.0, 1.0), terms.time_margin, "non-inferior", n)
-    return {"paired_vs_dense": Difference.of(solved), "time_vs_dense": TimeDifference.of(times)}
+    return {
+        "paired_vs_dense": Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior"),
+        "time_vs_dense": TimeDifference.of(times),
+    }
 
 
 def _speedup_interval(latency: Latency, dense: Latency) -> Interval | None:

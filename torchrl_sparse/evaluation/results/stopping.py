@@ -84,26 +84,23 @@ class StoppingResults:
     seed: int
     type_one: tuple[TypeOne, ...]
     savings: tuple[SavedEpisodes, ...]
-    dense_episodes: int | None = None
     pairs: tuple[EqualPair, ...] = ()
 
 
-def simulate_stopping(
-    max_episodes: int, looks: int, trials: int, seed: int = 0, dense_episodes: int | None = None
-) -> StoppingResults:
+def simulate_stopping(max_episodes: int, looks: int, trials: int, seed: int = 0) -> StoppingResults:
     """Simulate every case.
 
     Args:
-        max_episodes, looks, dense_episodes: of the `Design`.
+        max_episodes, looks: of the `Design`.
         trials: benchmarks of each case.
         seed: of all.
 
     Raises:
         ValueError: for a design that is none.
     """
-    design = Design(max_episodes, looks, dense_episodes)
+    design = Design(max_episodes, looks)
     type_one, saved, pairs = (tuple(cases(design, trials, seed)) for cases in (_type_one, _savings, _pairs))
-    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, dense_episodes, pairs)
+    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, pairs)
 
 
 def _type_one(design: Design, trials: int, seed: int) -> Iterator[TypeOne]:

@@ -11,11 +11,6 @@ STEP (arXiv:2503.10966), the anchor of sequential comparisons of policies, spend
 successes and the null of no difference; here episodes are paired, the null is a margin, and times are judged beside successes.
 N-SCORE (arXiv:2603.13616) bets on bounded scores and holds without a cap and without the normal approximation; a cap that is
 known makes the limits here closer. How the approximation holds with 30 looks is simulated (`recipes/simulate_stopping.py`).
-
-Dense may be played further than the methods that are compared with it, which makes their intervals closer
-(:mod:`torchrl_sparse.evaluation.statistics.overlap`). How far is part of the design: a number that followed from what was seen
-would choose the result. A look then knows more of what the last will know than its share of the cap, and looks are more alike
-than C supposes, so that the error is rather below 5 %; that is simulated too.
 """
 
 from __future__ import annotations
@@ -43,7 +38,6 @@ class Design:
     Attributes:
         max_episodes: the cap.
         looks: at most so many, the last at the cap. One look is the ordinary fixed number of episodes.
-        dense_episodes: of dense that are played in any case, and count in every comparison; None is no more than are paired.
 
     Raises:
         ValueError: if a number is below 1 or there are more looks than episodes.
@@ -57,18 +51,10 @@ class Design:
 
     max_episodes: int
     looks: int = 1
-    dense_episodes: int | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.looks <= self.max_episodes:
             raise ValueError(f"looks: expected 1 to max_episodes = {self.max_episodes}, got {self.looks}")
-        if self.dense_episodes is not None and self.dense_episodes < 1:
-            raise ValueError(f"dense_episodes: expected at least 1 or None, got {self.dense_episodes}")
-
-    @property
-    def num_seeds(self) -> int:
-        """How many seeds an evaluation may need."""
-        return max(self.max_episodes, self.dense_episodes or 0)
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
