@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -60,8 +60,8 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: naming the file, if one is of version 1 or of a task that is done by degrees, dense solved nothing in it, or its
-            log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
+        ValueError: naming the file, if one is of version 1 or of a task that is done by degrees, dense solved nothing in it, or
+            its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
@@ -99,12 +99,12 @@ def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:
     tasks = {results.task: _pairs(name, path, results) for path, results in found.items()}
     margin, time_margin = _margins(next(iter(found.values())))
     whole = aggregate_tasks(tasks, margin, time_margin)
-    (value, ci, p), (ratio, limits, time_p) = map(astuple, (whole.success, whole.time))
+    success, time = whole.success, whole.time
     return AggregateEntry(
-        Difference(value, ci, margin, verdict(ci, margin), whole.mcnemar_p),
-        TimeDifference(ratio, limits, time_margin, time_verdict(limits, time_margin)),
+        Difference(success.value, success.ci, margin, verdict(success.ci, margin), whole.mcnemar_p),
+        TimeDifference(time.value, time.ci, time_margin, time_verdict(time.ci, time_margin)),
         whole.episodes,
-        PValues(p, time_p),
+        PValues(success.p_value, time.p_value),
     )
 
 

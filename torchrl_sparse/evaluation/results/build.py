@@ -28,7 +28,6 @@ from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_by_desig
 from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
 from torchrl_sparse.evaluation.statistics.durations import (
     DEFAULT_TIME_MARGIN,
-    TimeRatio,
     allowed_steps,
     correlation,
     success_within,
@@ -251,7 +250,7 @@ def compare_episodes(
     steps = allowed_steps(terms.episode_horizon, terms.early_cut)
     shares = success_within(pairs.solved[0], ours, steps)
     return {
-        **(_to_itself(len(ours), terms) if name == DENSE else _to_dense(pairs, terms)),
+        **(_to_itself(terms) if name == DENSE else _to_dense(pairs, terms)),
         "restricted_mean_time": float(ours.mean()),
         "success_within": {str(step): share for step, share in shares.items()},
         "correlation_with_dense": correlation(ours, theirs),
@@ -280,7 +279,7 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     times = pairs.time_ratio(horizon, terms.time_margin, confidence)
     p_values = [design.p_value(abs(z), n) for z in terms.statistics(pairs)]
     if not any(map(any, pairs.solved)):  # as alike as two policies that do nothing
-        solved, times = replace(solved, verdict="undecided"), replace(times, verdict="undecided")
+        solved, times = (replace(one, verdict="undecided") for one in (solved, times))
         p_values = [0.5, 0.5]
     return {
         "paired_vs_dense": Difference.of(solved),
@@ -289,13 +288,11 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     }
 
 
-def _to_itself(n: int, terms: Terms) -> dict[str, Any]:
+def _to_itself(terms: Terms) -> dict[str, Any]:
     """Dense equals itself by definition: nothing is estimated, and nothing is tested."""
-    times = TimeRatio(1.0, (1.0, 1.0), terms.time_margin, "non-inferior", n)
-    return {
-        "paired_vs_dense": Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior"),
-        "time_vs_dense": TimeDifference.of(times),
-    }
+    solved = Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior")
+    times = TimeDifference(1.0, (1.0, 1.0), terms.time_margin, "non-inferior")
+    return {"paired_vs_dense": solved, "time_vs_dense": times}
 
 
 def _speedup_interval(latency: Latency, dense: Latency) -> Interval | None:

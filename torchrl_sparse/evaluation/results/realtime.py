@@ -21,11 +21,11 @@ from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
+    NO_VERDICT,
     count_text,
     difference_text,
     ratio_text,
     threads_text,
-    NO_VERDICT,
     verdict_text,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals

@@ -197,8 +197,8 @@ def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Diffe
 
 
 _MCNEMAR = (
-    "McNemar's p is how likely the episodes that one method alone solved are split as unevenly by a fair coin: exact, two-sided, "
-    "of no difference at all, whatever the margin"
+    "McNemar's p is how likely a fair coin splits the episodes that one method alone solved as unevenly: exact, two-sided, of "
+    "no difference at all, whatever the margin"
 )
 _STOPPED = ", and as of a fixed number of episodes."
 

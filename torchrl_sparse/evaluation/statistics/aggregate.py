@@ -7,9 +7,9 @@ yet, and the interval inverts a test whose variance grows with the distance from
     h² = t² (V + a h)
 
 where a is the most that one seed of any task moves the mean: of successes ``w / n``, of logarithms of ratios of times that over
-the mean time, times what a failure costs (see `durations`). h is the half width and t Student's quantile with ``Σ (n - 1)`` degrees
-of freedom. Pairs that all agree give ``±t² a``, never ±0; where failures are common, a h vanishes beside V. Nothing is resampled:
-draws from a few concordant pairs are all alike.
+the mean time, times what a failure costs (see `durations`). h is the half width and t Student's quantile with ``Σ (n - 1)``
+degrees of freedom. Pairs that all agree give ``±t² a``, never ±0; where failures are common, a h vanishes beside V. Nothing is
+resampled: draws from a few concordant pairs are all alike.
 
 Tasks that stopped when they were decided have wider quantiles, those of their look (`Design`), since their intervals hold
 whatever stopped them. `recipes/simulate_stopping.py` simulates the coverage, and tests enumerate it where pairs are few.
@@ -61,12 +61,17 @@ class Mean:
     Attributes:
         value: of successes the difference of rates, of times the geometric mean of the ratios.
         ci: its 95 % interval.
-        p_value: one-sided, of being on the other side of the margin.
+        tasks: of each its design, its pairs, and how many standard errors lie between the value and the margin.
     """
 
     value: float
     ci: tuple[float, float]
-    p_value: float
+    tasks: tuple[tuple[Design, int, float], ...]
+
+    @property
+    def p_value(self) -> float:
+        """One-sided, of being on the other side of the margin: the largest that the design of any task gives."""
+        return max(design.p_value(z, n) for design, n, z in self.tasks)
 
 
 @dataclass(frozen=True)
@@ -115,13 +120,13 @@ def aggregate_tasks(
         each = ours / ours.mean() - theirs / theirs.mean()
         lost = one_seed(ours, theirs, task.horizon) / min(ours.mean(), theirs.mean())
         times.append(_Part.of(each, lost, design, math.log(ours.mean() / theirs.mean())))
-    value, half, p_value = _combine(success, -margin)
+    value, half, tested = _combine(success, -margin)
     low, high = max(value - half, -1.0), min(value + half, 1.0)
-    log, spread, time_p = _combine(times, math.log(1 + time_margin))
+    log, spread, time_tested = _combine(times, math.log(1 + time_margin))
     won, lost, _ = map(sum, zip(*(discordant_pairs(*task.solved) for task in tasks.values()), strict=True))
     return Aggregate(
-        Mean(value, (low, high), p_value),
-        Mean(math.exp(log), (math.exp(log - spread), math.exp(log + spread)), time_p),
+        Mean(value, (low, high), tested),
+        Mean(math.exp(log), (math.exp(log - spread), math.exp(log + spread)), time_tested),
         mcnemar_p(won, lost),
         sum(counts.values()),
     )
@@ -144,8 +149,10 @@ class _Part:
         return cls(float(each.mean()) if mean is None else mean, variance, one_seed, len(each), design)
 
 
-def _combine(parts: Sequence[_Part], bound: float) -> tuple[float, float, float]:
-    """Return the mean of the parts' means, half the width of its interval, and the p-value of its lying beyond ``bound``."""
+def _combine(
+    parts: Sequence[_Part], bound: float
+) -> tuple[float, float, tuple[tuple[Design, int, float], ...]]:
+    """Return the mean of the parts' means, half the width of its interval, and how far ``bound`` is, as `Mean.tasks`."""
     weight, degrees = 1 / len(parts), sum(part.n - 1 for part in parts)
     quantiles = [float(stdtrit(degrees, ndtr(part.design.critical(part.n)))) for part in parts]
     mean = math.fsum(part.mean for part in parts) * weight
@@ -153,9 +160,6 @@ def _combine(parts: Sequence[_Part], bound: float) -> tuple[float, float, float]
     seed = max(t**2 * weight * part.one_seed for t, part in zip(quantiles, parts, strict=True))
     half = (seed + math.sqrt(seed**2 + 4 * variance)) / 2
     far = abs(mean - bound)
-    beyond = (
-        far / math.sqrt(variance + seed * far) if far else 0.0
-    )  # half widths of an interval that just excludes the bound
-    tails = [float(ndtri(stdtr(degrees, -beyond * t))) for t in quantiles]
-    p_value = max(part.design.p_value(-z, part.n) for z, part in zip(tails, parts, strict=True))
-    return mean, half, p_value
+    beyond = far / math.sqrt(variance + seed * far) if far else 0.0
+    z = (-float(ndtri(stdtr(degrees, -beyond * t))) for t in quantiles)
+    return mean, half, tuple((part.design, part.n, one) for part, one in zip(parts, z, strict=True))

@@ -128,27 +128,29 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
     return float(brentq(excess, -1.0, diff, xtol=1e-12)), float(brentq(excess, diff, 1.0, xtol=1e-12))
 
 
-def tango_z(won: int, lost: int, n: int, delta: float) -> float:
+def tango_z(won: ArrayLike, lost: ArrayLike, n: int, delta: float) -> NDArray | float:
     """Return Tango's score statistic: by how many standard errors the difference lies above ``delta``.
 
     `tango_interval` excludes ``delta`` where this is beyond its normal quantile.
 
     Args:
-        won, lost, n: see `tango_interval`.
+        won, lost: see `tango_interval`; of one comparison, or of many as arrays.
+        n: see `tango_interval`.
         delta: the hypothesis, strictly between -1 and 1 and not 0; minus the margin for non-inferiority.
 
     >>> round(tango_z(1, 7, 21, -0.026), 2), round(tango_z(0, 0, 73, -0.05), 2)
     (-1.96, 1.96)
     """
-    return ((won - lost) / n - delta) / math.sqrt(_pair_variance(won, lost, n, delta) / n)
+    won, lost = np.asarray(won), np.asarray(lost)
+    return ((won - lost) / n - delta) / np.sqrt(_pair_variance(won, lost, n, delta) / n)
 
 
-def _pair_variance(won: int, lost: int, n: int, delta: float) -> float:
+def _pair_variance(won: ArrayLike, lost: ArrayLike, n: int, delta: float) -> NDArray | float:
     """Return the variance of a pair's difference where ``delta`` is the true one, whose likeliest loss rate is Tango's."""
     a = 2 * n
     b = -won - lost + (2 * n - won + lost) * delta
     c = -lost * delta * (1 - delta)
-    loss_rate = (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
+    loss_rate = (np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
     return 2 * loss_rate + delta * (1 - delta)
 
 

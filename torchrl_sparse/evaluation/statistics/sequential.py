@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
@@ -95,6 +96,8 @@ class Design:
         """
         if z <= 0:
             return 0.5
+        if self.looks == 1:
+            return float(ndtr(-z))
         z = min(z, _LARGEST_Z)
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))
@@ -112,9 +115,14 @@ def _constant(times: tuple[float, ...]) -> float:
     return float(brentq(lambda constant: _crossing(constant, times) - _ERROR, 1.9, 4.0, xtol=1e-6))
 
 
+@cache
+def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.polynomial.legendre.leggauss(_NODES)
+
+
 def _crossing(constant: float, times: tuple[float, ...]) -> float:
     """Return how likely a Brownian motion is beyond ``±constant * t^shape`` at any of these times."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = _quadrature()
     before, mass, earlier = np.zeros(1), np.ones(1), 0.0
     for time in times:
         limit = constant * time**_SHAPE
