@@ -62,8 +62,8 @@ def main(config: DictConfig) -> None:
         config.methods, policy, num_updates=config.num_updates, planners=planners, calibration=calibration
     )
     actors = {name: make_executor(name, method, config.n_action_steps) for name, method in methods.items()}
-    design = make_design(config.until, config.episodes, config.max_episodes, config.dense_episodes)
-    seeds = evaluation_seeds(config.split, config.seed, design.num_seeds)
+    design = make_design(config.until, config.episodes, config.max_episodes)
+    seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
     margins = config.margin, config.time_margin
     terms = Terms(design, episode_horizon(make_env, seeds), task.early_cut, *margins, task.by_degrees)
     settings = {"task": config.task, "horizon": config.horizon}

@@ -56,8 +56,8 @@ def main(config: DictConfig) -> None:
     dense = load_policy(config)
     check_budgets(methods, dense.network.config.visual_spec, options)
     make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
-    design = make_design(config.until, config.episodes, config.max_episodes, config.dense_episodes)
-    seeds = evaluation_seeds(config.split, config.seed, design.num_seeds)
+    design = make_design(config.until, config.episodes, config.max_episodes)
+    seeds = evaluation_seeds(config.split, config.seed, design.max_episodes)
     terms = Terms(design, episode_horizon(make_env, seeds), task.early_cut, config.margin, config.time_margin)
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}

@@ -8,6 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from recipes.studies.simulate_stopping.simulated import (
+    Covered,
+    VerdictErrors,
+    simulate_aggregates,
+    simulate_errors,
+)
 from recipes.studies.simulate_stopping.simulation import (
     Population,
     Savings,
@@ -84,26 +90,26 @@ class StoppingResults:
     seed: int
     type_one: tuple[TypeOne, ...]
     savings: tuple[SavedEpisodes, ...]
-    dense_episodes: int | None = None
     pairs: tuple[EqualPair, ...] = ()
+    errors: tuple[VerdictErrors, ...] = ()
+    aggregates: tuple[Covered, ...] = ()
 
 
-def simulate_stopping(
-    max_episodes: int, looks: int, trials: int, seed: int = 0, dense_episodes: int | None = None
-) -> StoppingResults:
+def simulate_stopping(max_episodes: int, looks: int, trials: int, seed: int = 0) -> StoppingResults:
     """Simulate every case.
 
     Args:
-        max_episodes, looks, dense_episodes: of the `Design`.
+        max_episodes, looks: of the `Design`.
         trials: benchmarks of each case.
         seed: of all.
 
     Raises:
         ValueError: for a design that is none.
     """
-    design = Design(max_episodes, looks, dense_episodes)
+    design = Design(max_episodes, looks)
     type_one, saved, pairs = (tuple(cases(design, trials, seed)) for cases in (_type_one, _savings, _pairs))
-    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, dense_episodes, pairs)
+    errors, aggregates = simulate_errors(trials, seed), simulate_aggregates(trials, seed)
+    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, pairs, errors, aggregates)
 
 
 def _type_one(design: Design, trials: int, seed: int) -> Iterator[TypeOne]:
@@ -146,8 +152,8 @@ def save_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
 
 
 def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
-    """Return three tables: of false claims where a method is worse by the margin, of episodes saved, and of equal methods that
-    seem to differ."""
+    """Return the tables: of false claims at the margins, of episodes saved, of equal methods that seem to differ, of the
+    largest errors on a grid, and of the least coverage over several tasks."""
     claims = [
         {"like": one.task, "margin": one.margin, "non-inferior all the same": f"{one.rate:.1%}"}
         for one in results.type_one
@@ -172,4 +178,24 @@ def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
         }
         for one in results.pairs
     ]
-    return {"claims": claims, "saved": saved, "pairs": pairs}
+    errors = [
+        {
+            "episodes, at most": str(one.max_episodes),
+            "looks": str(one.looks),
+            "non-inferior all the same": f"{one.non_inferior:.1%}",
+            "dense's rate there": f"{one.rate:g}",
+            "correlation there": f"{one.correlation:g}",
+            "inferior": f"{one.inferior:.1%}",
+        }
+        for one in results.errors
+    ]
+    covered = [
+        {
+            "tasks, pairs of each": one.tasks,
+            "success covered": f"{one.success:.1%}",
+            "time covered": f"{one.time:.1%}",
+        }
+        for one in results.aggregates
+    ]
+    tables = {"claims": claims, "saved": saved, "pairs": pairs, "errors": errors, "aggregates": covered}
+    return {name: rows for name, rows in tables.items() if rows}

@@ -15,7 +15,6 @@ from torchrl_sparse.evaluation.statistics.intervals import (
     tango_interval,
     tango_z,
 )
-from torchrl_sparse.evaluation.statistics.overlap import Further
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["Population", "Savings", "claim_rates", "pair_errors", "savings"]
@@ -131,8 +130,8 @@ def pair_errors(population: Population, design: Design, trials: int, seed: int =
     """
     generator, errors = np.random.default_rng(seed), np.zeros(2)
     for _ in range(trials):
-        first, dense = population.draw(design.num_seeds, generator)
-        second, _ = population.draw(design.num_seeds, generator)
+        first, dense = population.draw(design.max_episodes, generator)
+        second, _ = population.draw(design.max_episodes, generator)
         n = min(_stop(_looks(method, dense, design, population), design)[0] for method in (first, second))
         first, second, horizon = first[:n], second[:n], population.horizon
         low, high = tango_interval(*discordant_pairs(first < horizon, second < horizon))
@@ -149,19 +148,16 @@ def _trials(population: Population, design: Design, trials: int, seed: int) -> I
     """Yield the looks of each benchmark."""
     generator = np.random.default_rng(seed)
     for _ in range(trials):
-        yield _looks(*population.draw(design.num_seeds, generator), design, population)
+        yield _looks(*population.draw(design.max_episodes, generator), design, population)
 
 
 def _looks(method: NDArray, dense: NDArray, design: Design, population: Population) -> Iterator[_Look]:
     """Yield the number of episodes and both statistics at each look."""
-    known, horizon = dense[: design.dense_episodes or 0], population.horizon
-    return ((n, _statistics(method[:n], dense[:n], known[n:], horizon)) for n in design.ends)
+    return ((n, _statistics(method[:n], dense[:n], population.horizon)) for n in design.ends)
 
 
-def _statistics(method: NDArray, dense: NDArray, more: NDArray, horizon: int) -> tuple[float, float]:
-    ours, theirs = method < horizon, dense < horizon
-    further = Further.of(ours, theirs, more < horizon)
+def _statistics(method: NDArray, dense: NDArray, horizon: int) -> tuple[float, float]:
     return (
-        tango_z(*discordant_pairs(ours, theirs), -DEFAULT_MARGIN, further),
-        time_z(method, dense, horizon, 1 + DEFAULT_TIME_MARGIN, more),
+        tango_z(*discordant_pairs(method < horizon, dense < horizon), -DEFAULT_MARGIN),
+        time_z(method, dense, horizon, 1 + DEFAULT_TIME_MARGIN),
     )

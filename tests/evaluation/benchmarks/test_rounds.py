@@ -63,29 +63,14 @@ def test_a_benchmark_that_was_killed_stops_where_it_would_have_stopped():
     assert play_rounds(RATES, killed, terms(20)) == play_rounds(RATES, Player(), terms(20))
 
 
-@pytest.mark.parametrize("looks", [1, 20])
-def test_dense_is_played_first_as_far_as_the_design_says_and_spares_the_others(looks):
-    player = Player()
-    known = Terms(Design(600, looks, dense_episodes=1000), episode_horizon=400)
-    episodes = play_rounds(RATES, player, known)
-    assert player.asked[0] == ("dense", 1000)
-    assert len(episodes["dense"]) == 1000
-    pairs_alone = play_rounds(RATES, Player(), Terms(Design(600, looks), episode_horizon=400))
-    counts = [{name: len(played) for name, played in some.items()} for some in (episodes, pairs_alone)]
-    assert all(counts[0][name] <= counts[1][name] for name in ("good", "close", "bad"))
-    if looks > 1:
-        assert counts[0]["good"] < counts[1]["good"]
-
-
 def test_dense_alone_is_played_to_the_end():
     assert len(play_rounds(["dense"], Player(), terms(20))["dense"]) == 1000
 
 
 def test_a_design_is_a_number_or_a_cap():
     assert make_design("decided", 5, 90).ends[-1] == 90
-    assert make_design("decided", 5, 90, 700) == Design(90, 9, 700)
-    assert make_design("episodes", 5, 90, 700) == Design(5, 1, 700)
-    assert (Design(90).num_seeds, Design(90, 1, 700).num_seeds) == (90, 700)
+    assert make_design("decided", 5, 90) == Design(90, 9)
+    assert make_design("episodes", 5, 90) == Design(5)
     assert make_design("decided", 5, 100).ends == tuple(range(10, 101, 10))  # not after every few episodes
     assert make_design("decided", 5, 7).ends == (7,)
     with pytest.raises(ValueError, match="until: expected episodes or decided, got 'bored'"):

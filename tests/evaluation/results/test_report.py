@@ -20,7 +20,6 @@ from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
-from torchrl_sparse.evaluation.statistics.overlap import Further
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 ABOUT = {"task": "lift", "split": "test", "seed": 3, "machine": MACHINE, "policy": POLICY}
@@ -200,19 +199,6 @@ def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_
     ours, theirs = [30, 60, 30, 60] * 5, [30, 30, 30, 60] * 5
     assert entry.time_vs_dense.ci95 == time_ratio(ours, theirs, 60, confidence=level).ci
     assert "looked at 2 times up to 40" in format_table(results)
-
-
-@pytest.mark.parametrize("looks", [1, 2])
-def test_episodes_of_dense_beyond_the_pairs_count_where_the_design_says_so(looks, tmp_path):
-    design = Design(20, looks, dense_episodes=40)
-    dense, slow = run([1, 1, 1, 0] * 10), run([1, 0, 1, 0] * 5)
-    results = build({"dense": dense, "slow": slow}, design)
-    entry, further = results.methods["slow"], Further.of([1, 0] * 10, [1, 1, 1, 0] * 5, [1, 1, 1, 0] * 5)
-    assert (entry.success.n, results.dense.success.n, results.dense_episodes) == (20, 40, 40)
-    assert entry.paired_vs_dense.ci95 == tango_interval(0, 5, 20, design.confidence(20), further)
-    assert "the first 40 of dense count in every comparison" in format_table(results)
-    assert "20 episodes cannot show non-inferiority" in format_table(results)  # not the 40 of dense
-    assert load_results(save_results(results, tmp_path / "results.json")) == results
 
 
 def test_worse_is_said_whatever_the_margin():

@@ -145,8 +145,8 @@ def test_the_recipe_measures_draws_and_goes_on(rendered, policy_folder, tmp_path
     found = read_episodes(log)
     first, *_, last = log.read_text().splitlines(keepends=True)
     log.write_text(first + last)
-    benchmark(policy_folder, tmp_path, "methods=[]", "pairs=[]", "videos=[]", "dense_episodes=3")
-    assert load_results(tmp_path / "results.json").dense_episodes == 3
+    benchmark(policy_folder, tmp_path, "methods=[]", "pairs=[]", "videos=[]", "episodes=3")
+    assert load_results(tmp_path / "results.json").dense.success.n == 3
     played = read_episodes(log)
     assert found.items() < played.items()
     assert len(played) == 3

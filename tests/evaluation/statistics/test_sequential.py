@@ -92,14 +92,12 @@ def test_designs_that_are_none_are_refused():
         DESIGN.critical(44)
 
 
-@pytest.mark.parametrize(("name", "dense_episodes"), [("stopping", None), ("stopping_further", 1300)])
-def test_published_simulations_are_what_their_commands_make(name, dense_episodes):
-    published = load_stopping(f"assets/statistics/{name}.json")
+def test_published_simulations_are_what_their_command_makes():
+    published = load_stopping("assets/statistics/stopping.json")
     assert (published.max_episodes, published.looks, published.trials) == (1300, 30, 2000)
-    assert published.dense_episodes == dense_episodes
     assert all(case.rate <= 0.05 for case in published.type_one)
     assert all(max(case.success, case.time) < 0.08 for case in published.pairs)
-    few = simulate_stopping(130, 3, 2, dense_episodes=dense_episodes)
+    few = simulate_stopping(130, 3, 2)
     for cases in ("savings", "pairs"):
         tasks = [[case.task for case in getattr(results, cases)] for results in (few, published)]
         assert tasks[0] == tasks[1] != []

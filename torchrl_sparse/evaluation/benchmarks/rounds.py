@@ -20,14 +20,13 @@ _BETWEEN = 10  # episodes from one look to the next, at least: each makes its en
 _UNTIL = ("episodes", "decided")
 
 
-def make_design(until: str, episodes: int, max_episodes: int, dense_episodes: int | None = None) -> Design:
+def make_design(until: str, episodes: int, max_episodes: int) -> Design:
     """Return when a benchmark looks at its episodes.
 
     Args:
         until: "episodes" for a fixed number, "decided" to go on until a method's verdicts are reached.
         episodes: that fixed number.
         max_episodes: cap of the others; part of the design, and so not to be raised once episodes were seen.
-        dense_episodes: see `Design`; likewise.
 
     Raises:
         ValueError: for another ``until``, or a number below 1.
@@ -40,8 +39,8 @@ def make_design(until: str, episodes: int, max_episodes: int, dense_episodes: in
     if until not in _UNTIL:
         raise ValueError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
     if until == "episodes":
-        return Design(episodes, dense_episodes=dense_episodes)
-    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)), dense_episodes)
+        return Design(episodes)
+    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))
 
 
 def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> int:
@@ -58,7 +57,7 @@ def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> i
 def play_rounds(
     names: Iterable[str], play: Callable[[str, int], list[EpisodeResult]], terms: Terms
 ) -> dict[str, list[EpisodeResult]]:
-    """Play every method until its verdict is reached or the cap is, and dense as far as any of them or as the design says.
+    """Play every method until its verdict is reached or the cap is, and dense as far as any of them.
 
     Nothing but the episodes decides, look by look, so a benchmark that was killed stops where it would have stopped.
 
@@ -70,8 +69,8 @@ def play_rounds(
     Returns:
         name -> its episodes, in the order in which methods were played, dense first.
     """
-    design, known = terms.design, terms.design.dense_episodes
-    episodes = {DENSE: play(DENSE, known) if known else []}
+    design = terms.design
+    episodes: dict[str, list[EpisodeResult]] = {DENSE: []}
     for name in names:
         if name == DENSE:
             continue

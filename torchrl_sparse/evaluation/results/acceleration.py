@@ -19,6 +19,7 @@ from torchrl_sparse.evaluation.results.parts import (
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry
 from torchrl_sparse.evaluation.results.text import (
+    NO_VERDICT,
     NONE_SOLVED,
     count_text,
     difference_text,
@@ -86,6 +87,11 @@ class Played:
     def judged(self) -> Difference:
         """What it is judged by: success, or the score of a task that is done by degrees."""
         return self.score.vs_dense if self.score else self.paired_vs_dense
+
+    @property
+    def did_nothing(self) -> bool:
+        """Whether it solved no episode, or scored nothing in any."""
+        return not (self.score.mean if self.score else self.success.k)
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
@@ -196,7 +202,7 @@ def verdict_line(acceleration: Acceleration) -> str:
     told = f"It solved {count_text(ours.success)}, dense {count_text(dense.success)}"
     if ours.score and dense.score:
         told = f"Its score is {_score_text(ours.score)}, dense's {_score_text(dense.score)}"
-    if not dense.success.k and not dense.score:
+    if dense.did_nothing:
         return f"{chosen} {NONE_SOLVED}"
     if ours.is_right:
         return f"{chosen} {told}: non-inferior to dense in {' and in '.join(ours.verdicts)}."
@@ -233,5 +239,8 @@ def _episode_cells(name: str, played: Played | None, dense: Played) -> Mapping[s
     if name == DENSE:
         return dict.fromkeys(columns, "") | {columns[0]: told}
     judged, time = played.judged, played.time_vs_dense
-    texts = (told, difference_text(judged), verdict_text(judged), ratio_text(time), verdict_text(time))
+    verdicts = verdict_text(judged), verdict_text(time)
+    if dense.did_nothing:
+        verdicts = NO_VERDICT, NO_VERDICT
+    texts = (told, difference_text(judged), verdicts[0], ratio_text(time), verdicts[1])
     return dict(zip(columns, texts, strict=False))

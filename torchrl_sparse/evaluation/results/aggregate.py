@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import NormalDist
 from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
-from torchrl_sparse.evaluation.results.parts import Difference, TimeDifference
+from torchrl_sparse.evaluation.results.parts import Difference, PValues, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
-from torchrl_sparse.evaluation.results.text import points_text, ratio_text, verdict_text
+from torchrl_sparse.evaluation.results.text import NONE_SOLVED, p_text, points_text, ratio_text, verdict_text
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
-from torchrl_sparse.evaluation.statistics.bootstrap import aggregate_tasks
+from torchrl_sparse.evaluation.statistics.aggregate import TaskPairs, aggregate_tasks
 from torchrl_sparse.evaluation.statistics.durations import time_verdict
 from torchrl_sparse.evaluation.statistics.intervals import verdict
 from torchrl_sparse.evaluation.statistics.multiplicity import holm
+from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -34,43 +33,54 @@ __all__ = [
 
 @dataclass(frozen=True)
 class AggregateEntry:
-    """A method over all tasks: mean difference of success rates, geometric mean of the ratios of times, and its pairs."""
+    """A method over all tasks: mean difference of success rates, geometric mean of the ratios of times, its pairs, and the
+    p-values of both verdicts."""
 
     paired_vs_dense: Difference
     time_vs_dense: TimeDifference
     episodes: int
+    p_values: PValues
 
 
 @dataclass(frozen=True)
 class AggregateResults:
     """The content of an ``aggregate.json``: the tasks, the split of their seeds, and the methods that all of them tried."""
 
-    aggregate: Literal[1]
+    aggregate: Literal[2]
     tasks: tuple[str, ...]
     split: Split
     methods: dict[str, AggregateEntry]
 
 
 def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
-    """Put the results of several tasks together, stratified: intervals draw seeds anew within each task.
+    """Put the results of several tasks together; see `torchrl_sparse.evaluation.statistics.aggregate`.
 
     Args:
         paths: of a ``results.json`` of version 2 of each task, with ``episodes/`` beside it.
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: if a file is of version 1, a task or a split is there twice, or no method is in all of them.
+        ValueError: naming the file, if one is of version 1 or of a task that is done by degrees, dense solved nothing in it, or
+            its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
         if not isinstance(results, Results):
             raise ValueError(f"{path}: schema: expected 2 to aggregate, got {results.schema}")
+        if results.by_degrees:
+            raise ValueError(
+                f"{path}: expected a task that success and time decide, got {results.task}, by degrees"
+            )
+        if results.dense_did_nothing:
+            raise ValueError(f"{path}: {NONE_SOLVED}")
     tasks, splits = (
         [results.task for results in found.values()],
         {results.split for results in found.values()},
     )
     if len(set(tasks)) != len(tasks) or len(splits) != 1:
         raise ValueError(f"aggregate: expected different tasks of one split, got {tasks} of {sorted(splits)}")
+    if len(margins := {_margins(results) for results in found.values()}) != 1:
+        raise ValueError(f"aggregate: expected the same margins in all files, got {sorted(margins)}")
     shared = [
         name
         for name in next(iter(found.values())).methods
@@ -78,7 +88,7 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     ]
     if not shared:
         raise ValueError(f"aggregate: expected a method whose times all of {tasks} have, got none")
-    return AggregateResults(1, tuple(tasks), splits.pop(), {name: _entry(name, found) for name in shared})
+    return AggregateResults(2, tuple(tasks), splits.pop(), {name: _entry(name, found) for name in shared})
 
 
 def _has_times(results: Results, name: str) -> bool:
@@ -86,26 +96,38 @@ def _has_times(results: Results, name: str) -> bool:
 
 
 def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:
-    successes, times = {}, {}
-    for path, results in found.items():
-        seeds = range(results.first_seed, results.first_seed + results.methods[name].success.n)
-        ours, theirs = (_episodes(path, method, seeds) for method in (name, DENSE))
-        pairs = pair_episodes(name, ours, DENSE, theirs)
-        successes[results.task] = [*zip(*pairs.solved, strict=True)]
-        times[results.task] = [*zip(*pairs.times(results.episode_horizon), strict=True)]
-    whole = aggregate_tasks(successes, times)
-    dense = next(iter(found.values())).dense
-    margin, time_margin = dense.paired_vs_dense.margin, dense.time_vs_dense.margin
+    tasks = {results.task: _pairs(name, path, results) for path, results in found.items()}
+    margin, time_margin = _margins(next(iter(found.values())))
+    whole = aggregate_tasks(tasks, margin, time_margin)
+    success, time = whole.success, whole.time
     return AggregateEntry(
-        Difference(whole.success, whole.success_ci, margin, verdict(whole.success_ci, margin)),
-        TimeDifference(whole.time, whole.time_ci, time_margin, time_verdict(whole.time_ci, time_margin)),
+        Difference(success.value, success.ci, margin, verdict(success.ci, margin), whole.mcnemar_p),
+        TimeDifference(time.value, time.ci, time_margin, time_verdict(time.ci, time_margin)),
         whole.episodes,
+        PValues(success.p_value, time.p_value),
     )
 
 
-def _episodes(path: Path, name: str, seeds: range) -> list[EpisodeResult]:
-    log = read_episodes(path.parent / "episodes" / f"{name}.jsonl")
-    return [episode for episode in log if episode.seed in seeds]
+def _pairs(name: str, path: Path, results: Results) -> TaskPairs:
+    n, stopping = results.methods[name].success.n, results.until_decided
+    ours, theirs = (_episodes(path, method, results.first_seed, n) for method in (name, DENSE))
+    pairs = pair_episodes(name, ours, DENSE, theirs)
+    design = Design(stopping.max_episodes, stopping.looks) if stopping else None
+    return TaskPairs(pairs.solved, pairs.times(results.episode_horizon), results.episode_horizon, design)
+
+
+def _margins(results: Results) -> tuple[float, float]:
+    return results.dense.paired_vs_dense.margin, results.dense.time_vs_dense.margin
+
+
+def _episodes(path: Path, name: str, first: int, n: int) -> list[EpisodeResult]:
+    log = path.parent / "episodes" / f"{name}.jsonl"
+    found = [episode for episode in read_episodes(log) if first <= episode.seed < first + n]
+    if len(found) != n:
+        raise ValueError(
+            f"{log}: expected the {n} episodes from seed {first} that {path.name} counts, got {len(found)}"
+        )
+    return found
 
 
 def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
@@ -117,6 +139,7 @@ def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
             "pairs": str(entry.episodes),
             "vs dense, points": points_text(entry.paired_vs_dense.diff, entry.paired_vs_dense.ci95),
             "verdict": verdict_text(entry.paired_vs_dense, f"{name} success" in lasting),
+            "McNemar's p": p_text(entry.paired_vs_dense.mcnemar_p),
             "time vs dense": ratio_text(entry.time_vs_dense),
             "time verdict": verdict_text(entry.time_vs_dense, f"{name} time" in lasting),
         }
@@ -130,21 +153,9 @@ def num_verdicts(results: AggregateResults) -> int:
 
 
 def _p_values(results: AggregateResults) -> dict[str, float]:
-    """Return by verdict how probable a value as far from its margin is at it, as normal as the bootstrap's interval is wide."""
-    p_values = {}
-    for name, entry in results.methods.items():
-        success, time = entry.paired_vs_dense, entry.time_vs_dense
-        p_values[f"{name} success"] = _tail(success.diff + success.margin, *success.ci95)
-        limits = map(math.log, time.ci95)
-        p_values[f"{name} time"] = _tail(math.log(time.ratio / (1 + time.margin)), *limits)
-    return p_values
-
-
-def _tail(distance: float, low: float, high: float) -> float:
-    error = (high - low) / (2 * NormalDist().inv_cdf(0.975))
-    if not error:
-        return 0.0 if distance else 0.5
-    return NormalDist().cdf(-abs(distance) / error)
+    """Return the p-value of each verdict."""
+    success = {f"{name} success": entry.p_values.success for name, entry in results.methods.items()}
+    return success | {f"{name} time": entry.p_values.time for name, entry in results.methods.items()}
 
 
 def load_aggregate(path: str | os.PathLike) -> AggregateResults:

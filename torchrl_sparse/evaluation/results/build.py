@@ -28,12 +28,11 @@ from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_by_desig
 from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
 from torchrl_sparse.evaluation.statistics.durations import (
     DEFAULT_TIME_MARGIN,
-    TimeRatio,
     allowed_steps,
     correlation,
     success_within,
 )
-from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, PairedDifference, verdict
+from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, verdict
 from torchrl_sparse.evaluation.statistics.scores import mean_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
@@ -140,7 +139,6 @@ def build_results(
         {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
         until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
-        dense_episodes=design.dense_episodes,
         pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
         settings=None if settings is None else dict(settings),
     )
@@ -241,7 +239,7 @@ def compare_episodes(
     Args:
         name: of the method.
         episodes: its own.
-        dense: the dense policy's, in the order of the benchmark's seeds; perhaps more of them, see `pair_by_design`.
+        dense: the dense policy's; perhaps more of them, see `pair_by_design`.
         terms: of the comparison.
 
     Raises:
@@ -252,7 +250,7 @@ def compare_episodes(
     steps = allowed_steps(terms.episode_horizon, terms.early_cut)
     shares = success_within(pairs.solved[0], ours, steps)
     return {
-        **(_to_itself(len(ours), terms) if name == DENSE else _to_dense(pairs, terms)),
+        **(_to_itself(terms) if name == DENSE else _to_dense(pairs, terms)),
         "restricted_mean_time": float(ours.mean()),
         "success_within": {str(step): share for step, share in shares.items()},
         "correlation_with_dense": correlation(ours, theirs),
@@ -279,7 +277,10 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     confidence = design.confidence(n)
     solved = pairs.success_difference(terms.margin, confidence)
     times = pairs.time_ratio(horizon, terms.time_margin, confidence)
-    p_values = (design.p_value(abs(z), n) for z in terms.statistics(pairs))
+    p_values = [design.p_value(abs(z), n) for z in terms.statistics(pairs)]
+    if not any(map(any, pairs.solved)):  # as alike as two policies that do nothing
+        solved, times = (replace(one, verdict="undecided") for one in (solved, times))
+        p_values = [0.5, 0.5]
     return {
         "paired_vs_dense": Difference.of(solved),
         "time_vs_dense": TimeDifference.of(times),
@@ -287,11 +288,11 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     }
 
 
-def _to_itself(n: int, terms: Terms) -> dict[str, Any]:
+def _to_itself(terms: Terms) -> dict[str, Any]:
     """Dense equals itself by definition: nothing is estimated, and nothing is tested."""
-    solved = PairedDifference(0.0, (0.0, 0.0), terms.margin, "non-inferior", 0, 0, n)
-    times = TimeRatio(1.0, (1.0, 1.0), terms.time_margin, "non-inferior", n)
-    return {"paired_vs_dense": Difference.of(solved), "time_vs_dense": TimeDifference.of(times)}
+    solved = Difference(0.0, (0.0, 0.0), terms.margin, "non-inferior")
+    times = TimeDifference(1.0, (1.0, 1.0), terms.time_margin, "non-inferior")
+    return {"paired_vs_dense": solved, "time_vs_dense": times}
 
 
 def _speedup_interval(latency: Latency, dense: Latency) -> Interval | None:

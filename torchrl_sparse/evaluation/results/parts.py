@@ -77,22 +77,26 @@ class Difference:
     """Success minus dense success on the same seeds, with Tango's 95 % interval and the verdict against a margin.
 
     The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
+    ``mcnemar_p`` is the exact two-sided p-value of no difference at all, see `torchrl_sparse.evaluation.statistics.intervals`;
+    None of dense, of scores and in older files.
     """
 
     diff: float
     ci95: Interval
     margin: float
     verdict: Verdict
+    mcnemar_p: float | None = None
 
     def __post_init__(self) -> None:
         require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
         check_interval(self.ci95)
+        require(self.mcnemar_p is None or 0 <= self.mcnemar_p <= 1, "mcnemar_p", "0 to 1", self.mcnemar_p)
         require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
 
     @classmethod
     def of(cls, paired: PairedDifference) -> Difference:
         """Keep what a file holds of a comparison."""
-        return cls(paired.diff, paired.ci, paired.margin, paired.verdict)
+        return cls(paired.diff, paired.ci, paired.margin, paired.verdict, paired.mcnemar_p)
 
     @property
     def worse(self) -> bool:

@@ -21,6 +21,7 @@ from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
+    NO_VERDICT,
     count_text,
     difference_text,
     ratio_text,
@@ -226,12 +227,17 @@ def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection
 
 
 def _told(point: RealtimePoint, mean: str, lasting: Collection[str]) -> tuple[str, ...]:
-    correlation = point.correlation_with_dense
+    correlation, difference, time = (
+        point.correlation_with_dense,
+        point.paired_vs_dense,
+        point.time_vs_dense,
+    )
+    nothing = not point.success.k and not difference.diff  # by either
     return (
-        verdict_text(point.paired_vs_dense, "success" in lasting),
+        NO_VERDICT if nothing else verdict_text(difference, "success" in lasting),
         mean,
-        ratio_text(point.time_vs_dense),
-        verdict_text(point.time_vs_dense, "time" in lasting),
+        ratio_text(time),
+        NO_VERDICT if nothing else verdict_text(time, "time" in lasting),
         "" if correlation is None else f"{correlation:.2f}",
     )
 

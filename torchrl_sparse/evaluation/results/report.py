@@ -21,11 +21,13 @@ from torchrl_sparse.evaluation.results.schema import (
 )
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
+    NO_VERDICT,
     NONE_SOLVED,
     count_text,
     difference_text,
     mean_text,
     milliseconds_text,
+    p_text,
     ratio_text,
     threads_text,
     verdict_text,
@@ -60,7 +62,13 @@ def format_table(results: AnyResults) -> str:
 def results_rows(results: AnyResults) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text."""
     lasting = survivors(results)
-    return [_table_row(name, method, lasting) for name, method in results.methods.items()]
+    rows = [_table_row(name, method, lasting) for name, method in results.methods.items()]
+    if results.dense_did_nothing:
+        rows[1:] = [row | dict.fromkeys(_VERDICTS & row.keys(), NO_VERDICT) for row in rows[1:]]
+    return rows
+
+
+_VERDICTS = {"verdict", "time verdict"}
 
 
 def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dict[str, str]:
@@ -74,6 +82,7 @@ def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dic
         **({"score": mean_text(score.mean, score.ci95)} if score else {}),
         "vs dense, points": "" if baseline else difference_text(method.judged),
         "verdict": "baseline" if baseline else verdict_text(method.judged, survives),
+        "McNemar's p": p_text(method.judged.mcnemar_p),
         **(_time_cells(name, method, lasting or ()) if isinstance(method, MethodEntry) and not score else {}),
         "pruned": f"{100 * method.prune_rate:.1f} %",
         **tokens,
@@ -136,9 +145,9 @@ def format_pairs(
 
     >>> once = [EpisodeResult(0, True, 8, 1, 1.0, 0.0)]
     >>> print(format_pairs({"a": once, "b": once}, [("a", "b")]))
-    | method   | against   |   success |   difference, points | verdict   |
-    |:---------|:----------|----------:|---------------------:|:----------|
-    | a        | b         |     1 : 1 |  +0.0 [-79.3, +79.3] | undecided |
+    | method   | against   |   success |   difference, points | verdict   |   McNemar's p |
+    |:---------|:----------|----------:|---------------------:|:----------|--------------:|
+    | a        | b         |     1 : 1 |  +0.0 [-79.3, +79.3] | undecided |          1.00 |
     """
     return markdown_table(pair_rows(episodes, pairs, margin))
 
@@ -183,7 +192,15 @@ def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Diffe
         "success": f"{solved[0]} : {solved[1]}",
         "difference, points": difference_text(difference),
         "verdict": verdict_text(difference),
+        "McNemar's p": p_text(difference.mcnemar_p),
     }
+
+
+_MCNEMAR = (
+    "McNemar's p is how likely a fair coin splits the episodes that one method alone solved as unevenly: exact, two-sided, of "
+    "no difference at all, whatever the margin"
+)
+_STOPPED = ", and as of a fixed number of episodes."
 
 
 def results_note(results: AnyResults) -> str:
@@ -204,6 +221,7 @@ def results_note(results: AnyResults) -> str:
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
         "below 0, whatever the margin.",
+        *(() if scored else [_MCNEMAR + (_STOPPED if getattr(results, "until_decided", None) else ".")]),
         *(_time_lines(results) if isinstance(results, Results) and not scored else []),
         *(_comparison_lines(results) if isinstance(results, Results) else []),
         f"Dense: {policy.params:,} parameters, {steps}. FLOPs are "
@@ -223,7 +241,7 @@ def results_note(results: AnyResults) -> str:
             f"{n} episodes cannot show non-inferiority at this margin even without one differing episode: "
             f"{episodes_needed(margin)} are needed."
         )
-    if not dense.success.k and not scored:
+    if results.dense_did_nothing:
         lines.append(NONE_SOLVED)
     return "\n".join(lines)
 
@@ -238,14 +256,12 @@ def _episodes_text(results: AnyResults) -> str:
     n = _num_pairs(results)
     if not isinstance(results, Results):
         return f"{n} paired episodes a method (seed {results.seed})"
-    seeds, known, more = f"{results.split} seeds from {results.first_seed}", results.dense_episodes, ""
-    if known is not None:
-        more = f"; the first {known} of dense count in every comparison, paired or not"
+    seeds = f"{results.split} seeds from {results.first_seed}"
     if (stopping := results.until_decided) is None:
-        return f"{n} paired episodes a method ({seeds}){more}"
+        return f"{n} paired episodes a method ({seeds})"
     return (
         f"paired episodes ({seeds}) until a method's verdicts are reached, looked at {stopping.looks} times up to "
-        f"{stopping.max_episodes}; intervals of differences are as much wider as that takes{more}"
+        f"{stopping.max_episodes}; intervals of differences are as much wider as that takes"
     )
 
 

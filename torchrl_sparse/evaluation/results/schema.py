@@ -170,6 +170,11 @@ class _Methods:
         return self.dense.score is not None
 
     @property
+    def dense_did_nothing(self) -> bool:
+        """Whether dense solved no episode, or scored nothing in any, so that no verdict means anything."""
+        return not (self.dense.score.mean if self.dense.score else self.dense.success.k)
+
+    @property
     def dense(self) -> MethodEntry:
         """The dense policy's entry."""
         return self.methods[DENSE]
@@ -209,8 +214,6 @@ class Results(_Methods):
         methods: name -> entry.
         early_cut: steps of the task's pre-registered early cut; None for a task without one.
         until_decided: where methods have as many episodes as their verdicts took; None where all have the same.
-        dense_episodes: of dense that were played in any case and count in every comparison, see `Design`; None where it has no
-            more than are paired.
         pairs: methods against each other; None where none were asked for.
         settings: what else the methods depend on, such as the options of pruners and controllers, and the shares at which
             methods match another's tokens; None in older files.
@@ -226,12 +229,11 @@ class Results(_Methods):
     methods: dict[str, MethodEntry]
     early_cut: int | None = None
     until_decided: Stopping | None = None
-    dense_episodes: int | None = None
     pairs: tuple[PairedEntry, ...] | None = None
     settings: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        self._check_methods(same_episodes=self.until_decided is None and self.dense_episodes is None)
+        self._check_methods(same_episodes=self.until_decided is None)
         for pair in self.pairs or ():
             known = {pair.method, pair.against} <= self.methods.keys()
             require(known, "pairs", f"two of {', '.join(self.methods)}", [pair.method, pair.against])

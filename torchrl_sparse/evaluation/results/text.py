@@ -6,10 +6,12 @@ from torchrl_sparse.evaluation.results.parts import Difference, Interval, Succes
 
 __all__ = [
     "NONE_SOLVED",
+    "NO_VERDICT",
     "count_text",
     "difference_text",
     "mean_text",
     "milliseconds_text",
+    "p_text",
     "percent_text",
     "points_text",
     "ratio_text",
@@ -22,6 +24,9 @@ NONE_SOLVED = (
     "executed, as it was trained?"
 )
 """What is said of episodes that tell methods apart by nothing."""
+
+NO_VERDICT = "dense solved none"
+"""What stands in place of each verdict then."""
 
 
 def count_text(success: Success) -> str:
@@ -64,6 +69,17 @@ def points_text(diff: float, interval: Interval) -> str:
     """
     low, high = (f"{100 * limit:+.1f}" for limit in interval)
     return f"{100 * diff:+.1f} [{low}, {high}]"
+
+
+def p_text(p: float | None) -> str:
+    """Return a p-value to two digits; nothing where there is none.
+
+    >>> p_text(0.0703125), p_text(1.0), p_text(3e-7), p_text(None)
+    ('0.070', '1.00', '<0.001', '')
+    """
+    if p is None:
+        return ""
+    return "<0.001" if p < 1e-3 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def ratio_text(difference: TimeDifference) -> str:

@@ -16,7 +16,6 @@ from torchrl_sparse.evaluation.statistics.intervals import (
     paired_difference,
     tango_z,
 )
-from torchrl_sparse.evaluation.statistics.overlap import Further
 from torchrl_sparse.evaluation.statistics.scores import difference_interval, difference_z
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
@@ -30,12 +29,10 @@ class EpisodePairs:
     Attributes:
         method: episodes of the first.
         other: episodes of the second.
-        more: of the second on further seeds, which count too, see `torchrl_sparse.evaluation.statistics.overlap`.
     """
 
     method: Sequence[EpisodeResult]
     other: Sequence[EpisodeResult]
-    more: Sequence[EpisodeResult] = ()
 
     @property
     def solved(self) -> tuple[list[bool], list[bool]]:
@@ -48,28 +45,24 @@ class EpisodePairs:
 
     def success_difference(self, margin: float, confidence: float = 0.95) -> PairedDifference:
         """Compare what both solved; see `paired_difference`."""
-        more = [episode.success for episode in self.more]
-        return paired_difference(*self.solved, margin, confidence, more)
+        return paired_difference(*self.solved, margin, confidence)
 
     def time_ratio(self, horizon: int, margin: float, confidence: float = 0.95) -> TimeRatio:
         """Compare how long both took; see `torchrl_sparse.evaluation.statistics.durations.time_ratio`."""
-        return time_ratio(*self.times(horizon), horizon, margin, confidence, _times(self.more, horizon))
+        return time_ratio(*self.times(horizon), horizon, margin, confidence)
 
     def score_difference(self, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
         """Compare the scores of both; see `difference_interval`."""
-        ours, theirs, more = map(_scores, (self.method, self.other, self.more))
-        return difference_interval(ours, theirs, more, confidence)
+        return difference_interval(_scores(self.method), _scores(self.other), confidence)
 
     def statistics(self, horizon: int, margin: float, time_margin: float) -> tuple[float, float]:
         """Return by how many standard errors successes and times are better than their margins."""
-        further = Further.of(*self.solved, [episode.success for episode in self.more])
-        times = time_z(*self.times(horizon), horizon, 1 + time_margin, _times(self.more, horizon))
-        return tango_z(*discordant_pairs(*self.solved), -margin, further), times
+        times = time_z(*self.times(horizon), horizon, 1 + time_margin)
+        return tango_z(*discordant_pairs(*self.solved), -margin), times
 
     def score_statistic(self, margin: float) -> float:
         """Return by how many standard errors the scores are better than their margin."""
-        ours, theirs, more = map(_scores, (self.method, self.other, self.more))
-        return difference_z(ours, theirs, -margin, more)
+        return difference_z(_scores(self.method), _scores(self.other), -margin)
 
 
 def pair_episodes(
@@ -77,7 +70,6 @@ def pair_episodes(
     episodes: Sequence[EpisodeResult],
     other: str,
     others: Sequence[EpisodeResult],
-    more: Sequence[EpisodeResult] = (),
 ) -> EpisodePairs:
     """Put the episodes of two methods beside each other.
 
@@ -85,7 +77,6 @@ def pair_episodes(
         name, other: of the methods, for errors.
         episodes: of the first, in any order.
         others: of the second, on the same seeds.
-        more: of the second on further seeds.
 
     Raises:
         ValueError: if they ran on different seeds, or a seed ran twice.
@@ -94,11 +85,7 @@ def pair_episodes(
     if ours.keys() != theirs.keys():
         odd = sorted(ours.keys() ^ theirs.keys())
         raise ValueError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
-    if repeated := ours.keys() & _by_seed(more).keys():
-        raise ValueError(
-            f"{name}: expected further episodes of {other!r} on other seeds, got {sorted(repeated)[:10]}"
-        )
-    return EpisodePairs([*ours.values()], [theirs[seed] for seed in ours], [*more])
+    return EpisodePairs([*ours.values()], [theirs[seed] for seed in ours])
 
 
 def pair_by_design(
@@ -108,24 +95,21 @@ def pair_by_design(
     others: Sequence[EpisodeResult],
     design: Design,
 ) -> EpisodePairs:
-    """Put a method's episodes beside those of another on the same seeds and those of its further ones that count too.
+    """Put a method's episodes beside those of another on the same seeds.
 
     Args:
         name, other: of the methods, for errors.
         episodes: of the first.
-        others: of the second, in the order of the benchmark's seeds; more of them only where the design has several looks or
-            says how many they are.
-        design: how many of the second's count, whether they are paired or not.
+        others: of the second; more of them only where the design has several looks, after which methods stop.
+        design: of the benchmark.
 
     Raises:
         ValueError: if the seeds do not fit.
     """
-    if design.looks == 1 and design.dense_episodes is None:
-        return pair_episodes(name, episodes, other, others)
-    seeds = {episode.seed for episode in episodes}
-    paired = [episode for episode in others if episode.seed in seeds]
-    more = [episode for episode in others[: design.dense_episodes or 0] if episode.seed not in seeds]
-    return pair_episodes(name, episodes, other, paired, more)
+    if design.looks > 1:
+        seeds = {episode.seed for episode in episodes}
+        others = [episode for episode in others if episode.seed in seeds]
+    return pair_episodes(name, episodes, other, others)
 
 
 def _times(episodes: Sequence[EpisodeResult], horizon: int) -> NDArray[np.float64]:

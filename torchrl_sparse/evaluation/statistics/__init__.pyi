@@ -1,7 +1,8 @@
-from .bootstrap import (
+from .aggregate import (
+    TaskPairs as TaskPairs,
     aggregate_tasks as aggregate_tasks,
-    median_ratio_interval as median_ratio_interval,
 )
+from .bootstrap import median_ratio_interval as median_ratio_interval
 from .durations import (
     restricted_times as restricted_times,
     success_within as success_within,
@@ -14,6 +15,7 @@ from .fidelity import (
 )
 from .intervals import (
     episodes_needed as episodes_needed,
+    mcnemar_p as mcnemar_p,
     paired_difference as paired_difference,
     tango_interval as tango_interval,
     verdict as verdict,

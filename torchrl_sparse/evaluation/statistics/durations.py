@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
-from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level
-from torchrl_sparse.evaluation.statistics.overlap import Means, checked_pairs
+from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level, checked_pairs
 
 __all__ = [
     "DEFAULT_TIME_MARGIN",
     "TimeRatio",
     "allowed_steps",
     "correlation",
+    "one_seed",
     "restricted_times",
     "success_within",
     "time_ratio",
@@ -89,7 +89,6 @@ def time_ratio(
     horizon: int,
     margin: float = DEFAULT_TIME_MARGIN,
     confidence: float = 0.95,
-    more: ArrayLike = (),
 ) -> TimeRatio:
     """Compare the restricted mean times of two methods on the same seeds.
 
@@ -99,7 +98,6 @@ def time_ratio(
         horizon: the largest that a time can be.
         margin: of the verdict, a share of the other's time.
         confidence: two-sided level, strictly between 0 and 1.
-        more: times of the other on further seeds; see `torchrl_sparse.evaluation.statistics.overlap`.
 
     Raises:
         ValueError: if the lengths differ or are zero, or a number is out of range.
@@ -109,12 +107,21 @@ def time_ratio(
     (1.0, 'non-inferior', [0.91, 1.09])
     """
     check_level(confidence)
-    means, z2 = Means.of(method, other, more), float(ndtri((1 + confidence) / 2)) ** 2
-    y, x, shared = means.method, means.other, z2 * means.other_variance
-    own = means.own_variance + z2 * _one_seed(method, other, horizon) ** 2
-    ci = _fieller(x * x - shared, x * y - means.slope * shared, y * y - z2 * own - means.slope**2 * shared)
+    z2 = float(ndtri((1 + confidence) / 2)) ** 2
+    (y, x), variances = _moments(method, other)
+    of_method, of_other, shared = (z2 * variance for variance in variances)
+    own = of_method + (z2 * one_seed(method, other, horizon)) ** 2
+    ci = _fieller(x * x - of_other, x * y - shared, y * y - own)
     low, high = (min(max(limit, 1 / horizon), float(horizon)) for limit in ci)
-    return TimeRatio(y / x, (low, high), margin, time_verdict((low, high), margin), means.n)
+    return TimeRatio(y / x, (low, high), margin, time_verdict((low, high), margin), len(np.asarray(method)))
+
+
+def _moments(method: ArrayLike, other: ArrayLike) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Return both means, and their variances and covariance, [n] pairs each."""
+    method, other = checked_pairs(method, other)
+    y, x = float(method.mean()), float(other.mean())
+    a, b, scale = method - y, other - x, max(len(method) - 1, 1) * len(method)
+    return (y, x), (float(a @ a) / scale, float(b @ b) / scale, float(a @ b) / scale)
 
 
 def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
@@ -125,13 +132,13 @@ def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
     return (b - root) / a, (b + root) / a
 
 
-def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float, more: ArrayLike = ()) -> float:
+def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> float:
     """Return how many standard errors the method is faster than ``ratio`` times the other; negative where it is slower.
 
     The two-sided interval of `time_ratio` excludes ``ratio`` where this is beyond its normal quantile.
 
     Args:
-        method, other, horizon, more: see `time_ratio`.
+        method, other, horizon: see `time_ratio`.
         ratio: the hypothesis, 1 + margin for non-inferiority.
 
     Raises:
@@ -140,15 +147,15 @@ def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float, more
     >>> round(time_z([30.0] * 500, [30.0] * 500, 400, 1.1), 2)
     2.01
     """
-    means = Means.of(method, other, more)
-    gain, spread = ratio * means.other - means.method, means.variance(ratio)
-    floor = _one_seed(method, other, horizon) ** 2
+    (y, x), (of_method, of_other, shared) = _moments(method, other)
+    gain, spread = ratio * x - y, max(of_method - 2 * ratio * shared + ratio**2 * of_other, 0.0)
+    floor = one_seed(method, other, horizon) ** 2
     # The variance holds z² itself: floor * z⁴ + spread * z² = gain².
     z2 = (math.sqrt(spread * spread + 4 * floor * gain * gain) - spread) / (2 * floor)
     return math.copysign(math.sqrt(z2), gain)
 
 
-def _one_seed(method: ArrayLike, other: ArrayLike, horizon: int) -> float:
+def one_seed(method: ArrayLike, other: ArrayLike, horizon: int) -> float:
     """Return what a seed costs the mean time that one method solves in the mean time and the other not at all, steps."""
     method, other = checked_pairs(method, other)
     solved = np.concatenate([method[method < horizon], other[other < horizon]])

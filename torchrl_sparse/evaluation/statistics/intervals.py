@@ -14,18 +14,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
-from scipy.special import ndtri
-
-from torchrl_sparse.evaluation.statistics.overlap import Further, checked_pairs
+from scipy.special import bdtr, ndtri
 
 __all__ = [
     "DEFAULT_MARGIN",
     "PairedDifference",
     "Verdict",
     "check_level",
+    "checked_pairs",
     "discordant_pairs",
     "episodes_needed",
+    "mcnemar_p",
     "paired_difference",
     "tango_interval",
     "tango_z",
@@ -35,7 +37,6 @@ __all__ = [
 
 Verdict = Literal["non-inferior", "inferior", "undecided"]
 DEFAULT_MARGIN = 0.05
-_PAIRS_ALONE = Further()
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,7 @@ class PairedDifference:
     """Success of a method minus success of the one that it is compared with, on the same seeds.
 
     Attributes:
-        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse. Of the pairs, or as further
-            episodes correct it.
+        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse.
         ci: two-sided confidence interval of ``diff``.
         margin: the non-inferiority margin of ``verdict``, a positive difference of rates.
         verdict: see :func:`verdict`.
@@ -60,6 +60,11 @@ class PairedDifference:
     won: int
     lost: int
     n: int
+
+    @property
+    def mcnemar_p(self) -> float:
+        """Exact two-sided p-value of no difference at all, whatever the margin; see the function."""
+        return mcnemar_p(self.won, self.lost)
 
 
 def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -85,9 +90,7 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     return low if k else 0.0, high if k < n else 1.0  # which rounding would miss
 
 
-def tango_interval(
-    won: int, lost: int, n: int, confidence: float = 0.95, further: Further = _PAIRS_ALONE
-) -> tuple[float, float]:
+def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Return Tango's score interval of ``(won - lost) / n``, the difference of two paired proportions.
 
     Args:
@@ -95,7 +98,6 @@ def tango_interval(
         lost: pairs in which only the second member succeeds.
         n: all pairs, concordant ones included, at least 1.
         confidence: two-sided level, strictly between 0 and 1.
-        further: what episodes of the second member alone say beside the pairs.
 
     Raises:
         ValueError: if the counts or the level are out of range.
@@ -111,45 +113,60 @@ def tango_interval(
     z2 = float(ndtri((1 + confidence) / 2)) ** 2
     # Where the estimated variance is zero, the equation below also holds at the estimate itself, which is
     # no limit of the interval; its other roots have closed forms there.
-    if further == _PAIRS_ALONE:
-        if won + lost == 0:
-            return -z2 / (n + z2), z2 / (n + z2)
-        if won == n:
-            return (n - z2) / (n + z2), 1.0
-        if lost == n:
-            return -1.0, (z2 - n) / (n + z2)
-    diff = min(max((won - lost) / n + further.shift, -1.0), 1.0)
+    if won + lost == 0:
+        return -z2 / (n + z2), z2 / (n + z2)
+    if won == n:
+        return (n - z2) / (n + z2), 1.0
+    if lost == n:
+        return -1.0, (z2 - n) / (n + z2)
+    diff = (won - lost) / n
 
     def excess(delta: float) -> float:
         """Return the squared score statistic minus z², times its variance: negative inside the interval."""
-        return n * (diff - delta) ** 2 - z2 * further.left(_pair_variance(won, lost, n, delta))
+        return n * (diff - delta) ** 2 - z2 * _pair_variance(won, lost, n, delta)
 
     return float(brentq(excess, -1.0, diff, xtol=1e-12)), float(brentq(excess, diff, 1.0, xtol=1e-12))
 
 
-def tango_z(won: int, lost: int, n: int, delta: float, further: Further = _PAIRS_ALONE) -> float:
+def tango_z(won: ArrayLike, lost: ArrayLike, n: int, delta: float) -> NDArray | float:
     """Return Tango's score statistic: by how many standard errors the difference lies above ``delta``.
 
     `tango_interval` excludes ``delta`` where this is beyond its normal quantile.
 
     Args:
-        won, lost, n, further: see `tango_interval`.
+        won, lost: see `tango_interval`; of one comparison, or of many as arrays.
+        n: see `tango_interval`.
         delta: the hypothesis, strictly between -1 and 1 and not 0; minus the margin for non-inferiority.
 
     >>> round(tango_z(1, 7, 21, -0.026), 2), round(tango_z(0, 0, 73, -0.05), 2)
     (-1.96, 1.96)
     """
-    diff, variance = (won - lost) / n + further.shift, further.left(_pair_variance(won, lost, n, delta))
-    return (diff - delta) / math.sqrt(variance / n)
+    won, lost = np.asarray(won), np.asarray(lost)
+    return ((won - lost) / n - delta) / np.sqrt(_pair_variance(won, lost, n, delta) / n)
 
 
-def _pair_variance(won: int, lost: int, n: int, delta: float) -> float:
+def _pair_variance(won: ArrayLike, lost: ArrayLike, n: int, delta: float) -> NDArray | float:
     """Return the variance of a pair's difference where ``delta`` is the true one, whose likeliest loss rate is Tango's."""
     a = 2 * n
     b = -won - lost + (2 * n - won + lost) * delta
     c = -lost * delta * (1 - delta)
-    loss_rate = (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
+    loss_rate = (np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
     return 2 * loss_rate + delta * (1 - delta)
+
+
+def mcnemar_p(won: int, lost: int) -> float:
+    """Return the exact two-sided p-value of McNemar's test: how likely discordant pairs are split as unevenly by a fair coin.
+
+    Given their number, the pairs that only one solved are Binomial(won + lost, 1/2) where both methods are as good (Q. McNemar,
+    Psychometrika 12, 1947). Twice the smaller tail, at most 1; as the coin is fair, the sum over all splits that are as
+    unlikely is the same. It is of a number of pairs that was fixed: a sequential design's looks are not counted.
+
+    >>> mcnemar_p(1, 7), mcnemar_p(0, 0), mcnemar_p(3, 3)
+    (0.0703125, 1.0, 1.0)
+    """
+    if won < 0 or lost < 0:
+        raise ValueError(f"discordant pairs: expected won, lost >= 0, got won={won}, lost={lost}")
+    return min(2 * float(bdtr(min(won, lost), won + lost, 0.5)), 1.0)
 
 
 def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
@@ -174,7 +191,6 @@ def paired_difference(
     other: Sequence[bool],
     margin: float = DEFAULT_MARGIN,
     confidence: float = 0.95,
-    more: Sequence[bool] = (),
 ) -> PairedDifference:
     """Compare two methods on the same seeds; entry *i* of both sequences belongs to the same seed.
 
@@ -182,7 +198,6 @@ def paired_difference(
         method, other: whether each solved an episode.
         margin: of the verdict.
         confidence: two-sided level, strictly between 0 and 1.
-        more: the other's on further seeds; see `torchrl_sparse.evaluation.statistics.overlap`.
 
     Raises:
         ValueError: if the lengths differ or are zero.
@@ -192,9 +207,8 @@ def paired_difference(
     (-0.25, 1, 'undecided')
     """
     won, lost, n = discordant_pairs(method, other)
-    further = Further.of(method, other, more)
-    ci = tango_interval(won, lost, n, confidence, further)
-    return PairedDifference((won - lost) / n + further.shift, ci, margin, verdict(ci, margin), won, lost, n)
+    ci = tango_interval(won, lost, n, confidence)
+    return PairedDifference((won - lost) / n, ci, margin, verdict(ci, margin), won, lost, n)
 
 
 def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int, int, int]:
@@ -208,6 +222,16 @@ def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int
     """
     ours, theirs = checked_pairs(method, other)
     return int((ours > theirs).sum()), int((theirs > ours).sum()), len(ours)
+
+
+def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
+    """Return both as f64 [n], or raise ValueError if they are no pairs."""
+    method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    if method.shape != other.shape or method.ndim != 1 or not len(method):
+        raise ValueError(
+            f"pairs need as many episodes of both, and at least one, got {method.size} and {other.size}"
+        )
+    return method, other
 
 
 def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) -> int:

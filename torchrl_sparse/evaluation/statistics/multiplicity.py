@@ -23,7 +23,7 @@ def holm(
         error: of the whole family.
 
     Raises:
-        ValueError: if there are fewer comparisons than p-values.
+        ValueError: if there are fewer comparisons than p-values, or a p-value is none.
 
     >>> sorted(holm({"a": 0.001, "b": 0.012, "c": 0.02}))
     ['a', 'b', 'c']
@@ -33,6 +33,9 @@ def holm(
     family = len(p_values) if comparisons is None else comparisons
     if family < len(p_values):
         raise ValueError(f"comparisons: expected at least {len(p_values)}, got {family}")
+    for name, p in p_values.items():
+        if not 0 <= p <= 1:
+            raise ValueError(f"{name}: expected a p-value of 0 to 1, got {p}")
     survivors: set[str] = set()
     for name, p in sorted(p_values.items(), key=lambda entry: entry[1]):
         if p > error / (family - len(survivors)):

@@ -11,11 +11,6 @@ STEP (arXiv:2503.10966), the anchor of sequential comparisons of policies, spend
 successes and the null of no difference; here episodes are paired, the null is a margin, and times are judged beside successes.
 N-SCORE (arXiv:2603.13616) bets on bounded scores and holds without a cap and without the normal approximation; a cap that is
 known makes the limits here closer. How the approximation holds with 30 looks is simulated (the study `simulate_stopping`).
-
-Dense may be played further than the methods that are compared with it, which makes their intervals closer
-(:mod:`torchrl_sparse.evaluation.statistics.overlap`). How far is part of the design: a number that followed from what was seen
-would choose the result. A look then knows more of what the last will know than its share of the cap, and looks are more alike
-than C supposes, so that the error is rather below 5 %; that is simulated too.
 """
 
 from __future__ import annotations
@@ -25,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
@@ -43,7 +39,6 @@ class Design:
     Attributes:
         max_episodes: the cap.
         looks: at most so many, the last at the cap. One look is the ordinary fixed number of episodes.
-        dense_episodes: of dense that are played in any case, and count in every comparison; None is no more than are paired.
 
     Raises:
         ValueError: if a number is below 1 or there are more looks than episodes.
@@ -57,18 +52,10 @@ class Design:
 
     max_episodes: int
     looks: int = 1
-    dense_episodes: int | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.looks <= self.max_episodes:
             raise ValueError(f"looks: expected 1 to max_episodes = {self.max_episodes}, got {self.looks}")
-        if self.dense_episodes is not None and self.dense_episodes < 1:
-            raise ValueError(f"dense_episodes: expected at least 1 or None, got {self.dense_episodes}")
-
-    @property
-    def num_seeds(self) -> int:
-        """How many seeds an evaluation may need."""
-        return max(self.max_episodes, self.dense_episodes or 0)
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
@@ -109,6 +96,8 @@ class Design:
         """
         if z <= 0:
             return 0.5
+        if self.looks == 1:
+            return float(ndtr(-z))
         z = min(z, _LARGEST_Z)
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))
@@ -126,9 +115,14 @@ def _constant(times: tuple[float, ...]) -> float:
     return float(brentq(lambda constant: _crossing(constant, times) - _ERROR, 1.9, 4.0, xtol=1e-6))
 
 
+@cache
+def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.polynomial.legendre.leggauss(_NODES)
+
+
 def _crossing(constant: float, times: tuple[float, ...]) -> float:
     """Return how likely a Brownian motion is beyond ``±constant * t^shape`` at any of these times."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = _quadrature()
     before, mass, earlier = np.zeros(1), np.ones(1), 0.0
     for time in times:
         limit = constant * time**_SHAPE
