@@ -2,9 +2,9 @@
 
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 
-``method=tts targets.turns=4`` also learns what is recalled of earlier queries, ``method=l2c reuse=block`` what needs no
-observation, with SAG's objective or, with ``objective=noise rate=0.45 train.norm=l2 targets.source=data``, L2C's own. Stop it
-at any moment; the same command resumes it, equal to the last bit. `load_planner` reads ``pruner`` and its mean, ``fixed.json``.
+``method=l2c reuse=block`` learns what needs no observation, with SAG's objective or, with ``objective=noise rate=0.45
+train.norm=l2 targets.source=data``, L2C's own. Stop it at any moment; the same command resumes it, equal to the last bit.
+`load_planner` reads ``pruner`` and its mean, ``fixed.json``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from torchrl_sparse.training.pruner.config import PrunerConfig
 from torchrl_sparse.training.pruner.export import export_planner, exported
 from torchrl_sparse.training.pruner.fit import fit_to_masks, spread_logits
 from torchrl_sparse.training.pruner.gates import make_gates
-from torchrl_sparse.training.pruner.recalls import check_turns, pruner_trainer
 from torchrl_sparse.training.pruner.rollouts import closed_loop_queries
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
@@ -63,8 +62,7 @@ def make_trainer(config: DictConfig) -> PrunerTrainer:
     options = PrunerConfig(**OmegaConf.to_container(config.train, resolve=True))
     sizes = {**config.network, "rate_input": options.rate_range is not None}
     gates = make_gates(config.method, policy, seed=options.seed, **sizes)
-    check_turns(gates, config.targets.turns)  # which take minutes to make
-    return pruner_trainer(gates, policy, calibration_set(policy, config), options)
+    return PrunerTrainer(gates, policy, calibration_set(policy, config), options)
 
 
 def initial_schedules(config: DictConfig) -> list[str]:
@@ -92,9 +90,8 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     with progress("targets", "window") as show:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
-        for name, only in (("source", "teacher"), ("turns", 1)):
-            if (got := config.targets[name]) != only:
-                raise ValueError(f"targets.{name}: expected {only!r} with rollouts, got {got!r}")
+        if (source := config.targets.source) != "teacher":
+            raise ValueError(f"targets.source: expected 'teacher' with rollouts, got {source!r}")
         queries = closed_loop_queries(policy, config.task, config.rollouts, *initial_schedules(config)[:1])
         with progress("targets", "query") as show:
             targets = add_queries(policy, targets, queries, seed=config.targets.seed, on_progress=show)
@@ -104,7 +101,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
 
 def begin(trainer: PrunerTrainer, masks: list[Tensor], config: DictConfig) -> None:
     """Fit the gates to the masks of ``init``, or spread their logits; else leave them as they are."""
-    queries = trainer.train_set.reshape(-1)
+    queries = trainer.train_set
     if config.spread:
         spread_logits(trainer.gates, queries, config.spread)
     if not masks:

@@ -5,6 +5,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl_sparse.blocks.recall import Recall
 
 from torchrl_sparse import (
     ActionAwareController,
@@ -17,7 +18,6 @@ from torchrl_sparse import (
     WarmStart,
     keys,
 )
-from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.control.roll_forward import RollForward, StateModel
 from torchrl_sparse.control.selectors import CoherentChunk
 from torchrl_sparse.control.temporal_ensemble import TemporalEnsemble

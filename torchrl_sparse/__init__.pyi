@@ -6,7 +6,6 @@ from .blocks import (
     Dense as Dense,
     Planner as Planner,
     PlanSpec as PlanSpec,
-    Recall as Recall,
     SAGPruner as SAGPruner,
     SchedulePlanner as SchedulePlanner,
     StaticPlanner as StaticPlanner,

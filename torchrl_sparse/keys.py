@@ -35,9 +35,6 @@ constant                          shape, dtype           meaning
 ``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
 ``KNOWN``                         f32 [*B, H, A]         normalised actions that a query is drawn to in every step
 ``PULL``                          f32 [*B, H, 1]         how far, for each of them: 0 is not at all, 1 all the way
-``RECALL``                        bool [*B, K, 3L]       pruned cells that reuse what the query before returned there
-``QUERY``                         i64 [*B, 1]            queries of the episode before this one, for planners that count them
-``FEATURES``                      f32 [*B, K, 3L, H, d]  what each block last computed in each step since the episode began
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
 ``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
                                                          the decoder, L (all of them) was never pruned
@@ -101,9 +98,6 @@ START = ("diffusion", "start")
 NUM_STEPS = ("diffusion", "num_steps")
 KNOWN = ("diffusion", "known")
 PULL = ("diffusion", "pull")
-RECALL = ("diffusion", "recall")
-QUERY = ("diffusion", "query")
-FEATURES = ("diffusion", "features")
 
 KEEP_MASK = ("tokens", "keep_mask")
 TOKEN_DEPTH = ("tokens", "depth")

@@ -8,7 +8,7 @@ import torch
 from torchrl_sparse import SAGPruner, StaticPlanner, load_planner
 from torchrl_sparse.blocks.planner import PlanSpec
 from torchrl_sparse.blocks.sag import PrunerInfo, PrunerNetwork
-from torchrl_sparse.blocks.saved import PLANNERS
+from torchrl_sparse.blocks.saved import PLANNERS, saved_planners
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 
 
@@ -52,6 +52,19 @@ def test_a_class_of_another_package_takes_one_line(tmp_path, monkeypatch):
     planner = load_planner(tmp_path / "until.json")
     planner.bind(PlanSpec(4, 1, "any"))
     assert planner.masks(torch.zeros(1, 2, 5))[0, :, 0].tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("format", ["torchrl_sparse.recall/1", "torchrl_sparse.tts/1"])
+def test_a_planner_that_reused_features_of_earlier_calls_is_refused_by_name(tmp_path, format):
+    folder = tmp_path / "tts"
+    folder.mkdir()
+    for path in (tmp_path / "recalling.json", folder / "config.json"):
+        path.write_text(json.dumps({"format": format}))
+    for path, file in ((tmp_path / "recalling.json", "recalling.json"), (folder, "config.json")):
+        message = rf"{file}: format: '{format}' reuses features of earlier policy calls, which this version cannot run"
+        with pytest.raises(ValueError, match=message):
+            load_planner(path)
+    assert saved_planners(tmp_path) == []
 
 
 @pytest.mark.parametrize("content", ["{}", '{"format": null}', '{"format": ["a"]}'])

@@ -70,7 +70,7 @@ def fail(monkeypatch, capsys):
         ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
-        ("train_pruner", ["method=nope"], "method: expected one of sag, tts, l2c, got 'nope'"),
+        ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
     ],
 )
 def test_a_mistake_is_one_line_and_nothing_is_written(fail, tmp_path, recipe, options, message):

@@ -44,16 +44,19 @@ def test_a_query_is_recorded_with_the_chunk_before_it():
     assert queries[keys.LAST_CHUNK][[1, 2, 4, 5], 0, 0].tolist() == [0, 3, 0, 3]
 
 
+TOTAL = ("test", "total")
+
+
 class Remembering(TensorDictModuleBase):
     """Adds up what it was asked in an episode, under a key of its own."""
 
-    in_keys = ["step", keys.ELAPSED, keys.FEATURES]
-    out_keys = [keys.FEATURES, keys.CHUNK]
+    in_keys = ["step", keys.ELAPSED, TOTAL]
+    out_keys = [TOTAL, keys.CHUNK]
 
     def forward(self, td):
-        before = keys.recall(td, keys.FEATURES, (1,), 0.0)
+        before = keys.recall(td, TOTAL, (1,), 0.0)
         total = td["step"] + before.masked_fill(td[keys.ELAPSED] == 0, 0.0)
-        td[keys.FEATURES] = total
+        td[TOTAL] = total
         return td.set(keys.CHUNK, total[..., None])
 
 
@@ -63,7 +66,7 @@ def test_what_a_policy_leaves_to_itself_is_not_recorded():
     policy.device = torch.device("cpu")
     actor = ChunkExecutor(policy, n_action_steps=1)
     queries = record_queries(actor, lambda seeds: CountingEnv(), [1])
-    assert keys.FEATURES not in queries.keys(True, True)
+    assert TOTAL not in queries.keys(True, True)
     assert torch.equal(answer(policy, queries)[keys.CHUNK], queries[keys.CHUNK])
     assert queries[keys.CHUNK].flatten().tolist() == [0, 1, 3, 6, 10, 15, 21]
 
@@ -84,14 +87,14 @@ def test_a_policy_that_remembers_is_asked_in_turn():
 
 
 def test_what_was_recorded_counts_and_is_asked_at_once():
-    queries = recorded().set(keys.FEATURES, torch.full((6, 1), 100.0))
+    queries = recorded().set(TOTAL, torch.full((6, 1), 100.0))
     assert answer(Remembering(), queries)[keys.CHUNK].flatten().tolist() == [1, 102, 103, 4, 105, 106]
 
 
 def test_queries_go_round():
     policy, totals = Remembering(), []
     for _, query in zip(range(8), in_turn(policy, cycle(recorded().unbind(0))), strict=False):
-        totals.append(policy(query)[keys.FEATURES].item())
+        totals.append(policy(query)[TOTAL].item())
     assert totals == [1, 3, 6, 4, 9, 15, 1, 3]
 
 

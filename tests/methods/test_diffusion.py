@@ -88,7 +88,7 @@ def test_a_warm_start_is_written_behind_its_sampler(make):
 def test_how_often_and_for_how_many_chunks_is_written_behind_any_method(make):
     for text, every, samples in (
         ("ddpm_82_14_every2_of8", 2, 8),
-        ("recall2_every1", 1, 1),
+        ("uniform2_every1", 1, 1),
         ("dense_of4", 8, 4),
     ):
         actor = make_executor(text, make(text), n_action_steps=8)
@@ -103,13 +103,6 @@ def test_a_chunk_is_not_executed_beyond_its_end(make):
         ValueError, match="methods: dense_every9: expected at most the 5 actions of a chunk, got 9"
     ):
         make_executor("dense_every9", make("dense_every9"), n_action_steps=2)
-
-
-def test_recalling_is_written_as_uniform_caching_is(make):
-    made = make("recall3_ddpm10")
-    assert (made.plan.interval, made.num_inference_steps) == (3, 10)
-    assert make("recall2").num_inference_steps == 20
-    assert keys.FEATURES in made.out_keys
 
 
 def test_a_method_may_bring_its_own_controller(monkeypatch):

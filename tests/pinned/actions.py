@@ -31,6 +31,8 @@ _OBSERVATIONS = json.loads(Path(__file__).with_name("observations.json").read_te
 _IN_TORCH = {"lift", "pusht", "lift_image"}
 # Not of the policy's planner; and what rounded weights answer depends on the instruction set.
 _EXECUTED_OR_ROUNDED = re.compile(r"_every\d|_of\d|:")
+# Rows of tables alone: methods that reused features of earlier policy calls.
+_REMOVED = re.compile(r"recall\d+|recalling|tts(_fixed)?")
 # Results alone: of other training seeds, of a policy that knows four ways, of one of less training, of what another began from.
 _WITHOUT_WEIGHTS = (
     "lift/seeds",
@@ -99,13 +101,10 @@ def is_kept(folder: Path) -> bool:
 
 
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
-    """The engines that a method is asked in: not PyTorch's where it recalls earlier queries, or is much as another case is."""
+    """The engines that a method is asked in: not PyTorch's where it is much as another case is."""
     if method in _AS_DENSE or folder.name not in _IN_TORCH:
         return ("native",)
-    planner = folder / f"{method}.json"
-    planner = planner if planner.exists() else folder / method / "config.json"
-    format = json.loads(planner.read_text(encoding="utf-8"))["format"] if planner.exists() else method
-    return ("native",) if re.match(r"(torchrl_sparse\.)?(recall|tts)", format) else ENGINES
+    return ENGINES
 
 
 def shipped_methods(folder: Path) -> list[str]:
@@ -113,7 +112,7 @@ def shipped_methods(folder: Path) -> list[str]:
     tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
     tables = [table for table in tables if is_kept(table.parent) and policy_of(table.parent) == folder]
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
-    named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name)}
+    named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name) and not _REMOVED.match(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
     if is_vla(folder):
         return sorted(named | {path.name for path in files})

@@ -17,10 +17,6 @@ from .planner import (
     PlanSpec as PlanSpec,
     StaticPlanner as StaticPlanner,
 )
-from .recall import (
-    Recall as Recall,
-    RecallSchedule as RecallSchedule,
-)
 from .sag import (
     PrunerInfo as PrunerInfo,
     PrunerNetwork as PrunerNetwork,
@@ -35,5 +31,4 @@ from .schedule import (
     CacheSchedule as CacheSchedule,
     SchedulePlanner as SchedulePlanner,
 )
-from .tts import TTSPruner as TTSPruner
 from .uniform import Uniform as Uniform

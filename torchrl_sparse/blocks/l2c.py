@@ -39,7 +39,7 @@ class StaticGates(nn.Module):
         torch.Size([7, 4, 6])
     """
 
-    rate_input = recalls = False
+    rate_input = False
     is_static = True
 
     def __init__(self, num_steps: int, num_blocks: int) -> None:

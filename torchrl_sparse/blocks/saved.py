@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from torchrl_sparse.blocks import recall, schedule, tts
+from torchrl_sparse.blocks import schedule
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.blocks.sag import planner as sag
 from torchrl_sparse.storage.json import read_json
@@ -21,10 +21,10 @@ __all__ = ["PLANNERS", "load_planner", "save_beside", "saved_planners"]
 PLANNERS: dict[str, type[Planner]] = {
     schedule.FORMAT: schedule.SchedulePlanner,
     sag.FORMAT: sag.SAGPruner,
-    recall.FORMAT: recall.RecallSchedule,
-    tts.FORMAT: tts.TTSPruner,
 }
 """Format of a planner's file -> the class whose ``from_pretrained`` reads it."""
+
+_REMOVED = ("torchrl_sparse.recall/1", "torchrl_sparse.tts/1")  # reused features of earlier policy calls
 
 
 def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Planner:
@@ -46,6 +46,11 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
     path = Path(path)
     file = path / "config.json" if path.is_dir() else path
     found = read_json(file, dict[str, Any]).get("format")
+    if found in _REMOVED:
+        raise ValueError(
+            f"{file}: format: {found!r} reuses features of earlier policy calls, which this version cannot run; "
+            f"expected one of {list(PLANNERS)}"
+        )
     if not isinstance(found, str) or found not in PLANNERS:
         raise ValueError(f"{file}: format: expected one of {list(PLANNERS)}, got {found!r}")
     planner = PLANNERS[found].from_pretrained(path)
@@ -61,7 +66,7 @@ def saved_planners(folder: str | os.PathLike) -> list[str]:
     """Return the names of the planners in a folder, sorted: ``NAME.json`` or ``NAME/`` of a format in :data:`PLANNERS`.
 
     >>> saved_planners("assets/lift")[4:]
-    ['bac_unified', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
+    ['bac_unified', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched']
     """
     files = {path.stem: path for path in Path(folder).glob("*.json")}
     files |= {path.parent.name: path for path in Path(folder).glob("*/config.json")}

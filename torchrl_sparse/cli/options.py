@@ -113,7 +113,7 @@ OPTIONS: dict[str, Any] = {
     "seed": Whole,
     "evaluate_policy.seed": Whole | None,
     "horizon": Count | None,
-    **dict.fromkeys(("steps", "turns"), Count),
+    "steps": Count,
     "n_action_steps": Count | None,
     "control_freq": Positive,
     "latencies": list[NotNegative],  # none: each method at its own

@@ -62,8 +62,8 @@ def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictB
 def in_turn(policy: TensorDictModuleBase, queries: Iterable[TensorDictBase]) -> Iterator[TensorDictBase]:
     """Yield what ``policy`` reads of one recorded query after the other, in TensorDicts of their own.
 
-    What it leaves to its own next query, such as features to recall, was not recorded of another policy. It is taken from the
-    TensorDict that was yielded before, which the policy has to have answered in place by then.
+    What it leaves to its own next query, such as scores of visual tokens, was not recorded of another policy. It is taken
+    from the TensorDict that was yielded before, which the policy has to have answered in place by then.
     """
     before, left = None, []
     for query in queries:

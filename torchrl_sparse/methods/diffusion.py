@@ -12,7 +12,6 @@ matches the pattern of one, or names a saved planner, ``NAME.json`` or ``NAME/``
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
-``recall2``          every second step of the queries after an episode's first, others as in the one before
 ``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
 ``ddpm5_logsnr_rtc`` a sampler, whose queries are drawn to what is left of the last chunk
 ==================== ===========================================================================================
@@ -35,7 +34,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_sparse.blocks.bac import SCHEDULES
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
-from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
@@ -134,22 +132,12 @@ def _uniform(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 
 def _uniform_and_last(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    interval, sampler = _interval_and_sampler(inputs, "uniform")
-    return Uniform(interval, last=True), sampler
-
-
-def _interval_and_sampler(inputs: MethodInputs, prefix: str) -> tuple[int, Sampler]:
     """Take interval and, where it is written, sampler of the name."""
-    interval, _, chain = inputs.name.removeprefix(prefix).partition("_")
+    interval, _, chain = inputs.name.removeprefix("uniform").partition("_")
     sampler = inputs.sampler
     if chain:
         sampler = sampler.variant_named(chain)
-    return int(interval), sampler
-
-
-def _recall(inputs: MethodInputs) -> tuple[Planner, Sampler]:
-    interval, sampler = _interval_and_sampler(inputs, "recall")
-    return Recall(interval), sampler
+    return Uniform(int(interval), last=True), sampler
 
 
 def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
@@ -182,7 +170,6 @@ METHODS: dict[str, Method] = {
     "uniform<interval>[_<sampler>]": Method(
         _uniform_and_last, pattern=rf"uniform[1-9]\d*(_{CHAIN_PATTERN})?"
     ),
-    "recall<interval>[_<sampler>]": Method(_recall, pattern=rf"recall[2-9]\d*(_{CHAIN_PATTERN})?"),
     "bac": Method(_bac, color="#0072B2"),
     "bac_blockwise": Method(_bac, color="#D55E00"),
     "bac_unified": Method(_bac, color="#CC79A7"),

@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS, random_mask
-from torchrl_sparse.blocks.engine.reference import denoise, denoise_recalling
+from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.sag.relaxed import (
-    Recalled,
     denoise_relaxed,
     gumbel_gate,
     step_errors,
@@ -85,50 +84,8 @@ def test_a_detached_gate_learns_from_its_own_place_alone(network, sampler, doubl
         assert gate.grad[cell].item() == pytest.approx(slope, rel=1e-4, abs=1e-6)
 
 
-def some_memory(network, query):
-    like = query[0]
-    shape = len(like), NUM_STEPS, NUM_BLOCKS, network.horizon, network.n_emb
-    return torch.randn(shape, generator=torch.Generator().manual_seed(2)).to(like)
-
-
-@pytest.mark.parametrize("reuse", ["block", "type"])
-@pytest.mark.parametrize("options", [{}, {"explore": 0.3}, {"checkpointed": True, "detached": True}])
-def test_what_is_recalled_has_the_values_of_the_reference(network, sampler, query, reuse, options):
-    mask, recalled, memory = random_mask(5, rate=0.7), random_mask(5, rate=0.5), some_memory(network, query)
-    expected, _ = denoise_recalling(network, sampler, *query, mask, mask & recalled, memory, reuse=reuse)
-    recalls = Recalled(recalled.float(), memory)
-    actions = denoise_relaxed(
-        network, sampler, *query, mask.float(), reuse=reuse, recalled=recalls, **options
-    )
-    torch.testing.assert_close(actions, expected, rtol=0, atol=1e-5)
-    assert not torch.allclose(expected, denoise(network, sampler, *query, mask, reuse=reuse), atol=1e-3)
-
-
-@pytest.mark.parametrize("reuse", ["block", "type"])
-def test_both_gates_of_a_cell_that_may_recall_have_the_gradient_of_the_mixture(
-    network, sampler, double_query, reuse
-):
-    """Against automatic differentiation of the naive chain, of which finite differences are tested above."""
-    mask, recalled, memory = (
-        random_mask(5, rate=0.6), random_mask(5, rate=0.5), some_memory(network, double_query),
-    )  # fmt: skip
-    gradients = []
-    for relaxed in (True, False):
-        gate, recall = gate_of(mask), gate_of(recalled)
-        query = network, sampler, *double_query, gate
-        if relaxed:
-            actions = denoise_relaxed(*query, reuse=reuse, recalled=Recalled(recall, memory))
-        else:
-            actions = mixed_chain(*query, reuse, recalled=(recall, memory))
-        actions.square().sum().backward()
-        gradients.append((gate.grad, recall.grad))
-    for found, expected in zip(*gradients, strict=True):
-        assert (expected[:, 1:] != 0).any()
-        torch.testing.assert_close(found[:, 1:], expected[:, 1:], rtol=1e-7, atol=1e-10)
-
-
-def mixed_chain(network, sampler, noise, cond, gate, reuse, kept=None, replay=False, recalled=None):
-    """`kept` takes what each block keeps for reuse, or gives it, with `replay`; `recalled` is a gate and a memory."""
+def mixed_chain(network, sampler, noise, cond, gate, reuse, kept=None, replay=False):
+    """`kept` takes what each block keeps for reuse, or gives it, with `replay`."""
     slots = {"block": NUM_BLOCKS, "type": 3}[reuse]
     latest, sample, cleans = [None] * slots, noise[:, 0], ()
     for k, timestep in enumerate(sampler.timesteps.tolist()):
@@ -137,12 +94,7 @@ def mixed_chain(network, sampler, noise, cond, gate, reuse, kept=None, replay=Fa
             fresh, slot = network.block(block, x, memory), block % slots
             pruned = gate[:, k, block, None, None]
             output = fresh if k == 0 else pruned * latest[slot] + (1 - pruned) * fresh
-            added = output
-            if recalled is not None and k > 0:
-                gates, before = (cells[:, k, block] for cells in recalled)
-                chosen = gates[:, None, None]
-                added = (1 - pruned) * fresh + pruned * ((1 - chosen) * latest[slot] + chosen * before)
-            x = x + added
+            x = x + output
             if kept is not None and not replay:
                 kept.append(output)
             latest[slot] = kept.pop(0) if replay else output

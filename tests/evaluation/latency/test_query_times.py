@@ -8,7 +8,6 @@ from tensordict import TensorDict
 
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, TransformerForDiffusion, keys
 from torchrl_sparse.blocks.planner import Planner
-from torchrl_sparse.blocks.recall import Recall
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 
 QUERIES = TensorDict({"history": {"state": torch.arange(3.0).view(3, 1, 1).expand(3, 2, 5).clone()}}, [3])
@@ -58,15 +57,26 @@ def test_the_planner_is_timed_within_its_queries(policy):
     assert keys.PRUNE_MASK not in QUERIES.keys(include_nested=True)
 
 
-def test_queries_that_recall_are_timed_with_what_they_recall(policy):
-    class Noting(Recall):
-        numbers = []
+def test_a_policy_is_timed_with_what_it_left_itself(policy):
+    class Counting(Planner):
+        """Counts the queries of an episode, under a key of its own."""
 
-        def masks(self, cond, query):
-            self.numbers.append(query.item())
-            return super().masks(cond, query)
+        in_keys = [*Planner.in_keys, keys.ELAPSED, "count"]
+        out_keys = [*Planner.out_keys, "count"]
+        counts = []
 
-    policy.plan = Noting(2)
+        def options(self, tensordict, rows):
+            count = keys.recall(tensordict, "count", (1,), 0) + 1
+            tensordict["count"] = count.masked_fill(tensordict[keys.ELAPSED] == 0, 0)
+            self.counts.append(tensordict["count"].item())
+            return {}
+
+        def masks(self, cond):
+            return torch.zeros(
+                len(cond), self.spec.num_inference_steps, self.spec.num_blocks, dtype=torch.bool
+            )
+
+    policy.plan = Counting()
     queries = QUERIES.clone().set(keys.ELAPSED, torch.tensor([[0], [8], [8]]))
-    time_queries({"recalling": policy}, queries, repeats=3, threads=1)
-    assert policy.plan.numbers == [0, 1, 2, 0, 1, 2]  # three to warm up
+    time_queries({"counting": policy}, queries, repeats=3, threads=1)
+    assert policy.plan.counts == [0, 1, 2, 0, 1, 2]  # three to warm up

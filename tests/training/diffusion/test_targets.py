@@ -78,11 +78,11 @@ def test_an_empty_calibration_set_is_refused(policy, demos, share):
 def test_targets_of_a_policy_with_cameras_are_of_what_these_show(make_image_policy, make_image_demos):
     policy = make_image_policy()
     demos = make_image_demos(policy)
-    targets = make_targets(policy, demos, share=1.0, n_action_steps=4, turns=2)
-    assert targets[keys.COND].shape == (len(targets), 2, 2, 128 + 3)
+    targets = make_targets(policy, demos, share=1.0, n_action_steps=4)
+    assert targets[keys.COND].shape == (len(targets), 2, 128 + 3)
     states = policy.normalizer.normalize_state(demos.data[keys.STATE])
     with torch.no_grad():
-        for query in targets[::5].reshape(-1):
+        for query in targets[::5]:
             rows = [(states == step).all(dim=1).nonzero().item() for step in query[keys.COND][:, 128:]]
             seen = policy.vision(
                 {name: demos.data["observation", name][rows] for name in policy.vision.cameras}

@@ -39,6 +39,6 @@ def test_a_pruner_is_trained_on_all_or_on_the_state_alone(
 
 def test_something_else_to_read_is_refused(make_image_policy):
     with pytest.raises(ValueError, match="reads: expected 'all' or 'state', got 'cameras'"):
-        make_gates("tts", make_image_policy(), reads="cameras")
+        make_gates("sag", make_image_policy(), reads="cameras")
     with pytest.raises(ValueError, match="network: expected nothing of l2c, which has no network, got width"):
         make_gates("l2c", make_image_policy(), width=8)

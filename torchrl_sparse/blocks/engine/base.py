@@ -12,7 +12,7 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Engine", "Overhead", "RecallingEngine", "check_input", "check_query"]
+__all__ = ["Engine", "Overhead", "check_input", "check_query"]
 
 
 class Overhead(NamedTuple):
@@ -81,31 +81,6 @@ class Engine(Protocol):
 
     def overhead_macs(self) -> Overhead:
         """Return those outside the blocks."""
-        ...
-
-
-class RecallingEngine(Engine, Protocol):
-    """An engine whose queries may reuse what earlier ones computed, see :mod:`torchrl_sparse.blocks.engine.recall`."""
-
-    def denoise_recalling(
-        self,
-        noise: Tensor,
-        cond: Tensor,
-        mask: Tensor,
-        recalled: Tensor,
-        memory: Tensor,
-        reuse: Reuse = "block",
-    ) -> tuple[Tensor, Tensor]:
-        """Return normalised actions f32 [B, H, A] and the memory f32 [B, K, 3L, H, d] that the query leaves to the next.
-
-        Args:
-            noise, cond, mask, reuse: see :meth:`denoise`.
-            recalled: bool [B, K, 3L], the pruned cells that recall.
-            memory: what was computed last in each cell, f32 [B, K, 3L, H, d]; it is not written to.
-
-        Raises:
-            ValueError: as ``denoise`` does, if a cell is recalled that is not pruned, or if the memory has another shape.
-        """
         ...
 
 

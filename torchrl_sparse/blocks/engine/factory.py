@@ -30,7 +30,6 @@ class EngineEntry(NamedTuple):
     Attributes:
         make: makes it for a network and a sampler; raises ValueError where it does not apply.
         applies: says whether it can run a network on this machine, and if not, why.
-        recalls: whether what it makes is a `RecallingEngine`.
 
     Examples:
         >>> ENGINES["mine"] = EngineEntry(ReferenceEngine)  # any class that offers what `Engine` says
@@ -41,46 +40,32 @@ class EngineEntry(NamedTuple):
 
     make: Callable[[TransformerForDiffusion, Sampler], Engine]
     applies: Applies = _always
-    recalls: bool = False
 
 
 # By name; "auto" takes the first that applies, so that those that round come last.
 ENGINES: dict[str, EngineEntry] = {
-    "native": EngineEntry(NativeEngine, native_supports, recalls=True),
+    "native": EngineEntry(NativeEngine, native_supports),
     "torch": EngineEntry(TorchEngine),
-    "reference": EngineEntry(ReferenceEngine, recalls=True),
-    "native_bf16": EngineEntry(partial(NativeEngine, weights="bfloat16"), native_supports, recalls=True),
-    "native_int8": EngineEntry(partial(NativeEngine, weights="int8"), native_supports, recalls=True),
+    "reference": EngineEntry(ReferenceEngine),
+    "native_bf16": EngineEntry(partial(NativeEngine, weights="bfloat16"), native_supports),
+    "native_int8": EngineEntry(partial(NativeEngine, weights="int8"), native_supports),
 }
 
 
-def check_engine(name: str, recalls: bool = False) -> None:
-    """Raise ValueError unless ``name`` is in :data:`ENGINES`, or ``"auto"``; with ``recalls``, unless that engine recalls.
-
-    The PyTorch engine does not: its programs add a run of pruned blocks as one sum of outputs of this query, and what a row
-    recalls is in no such sum.
-    """
-    names = ["auto", *_able(recalls)]
+def check_engine(name: str) -> None:
+    """Raise ValueError unless ``name`` is in :data:`ENGINES`, or ``"auto"``."""
+    names = ["auto", *ENGINES]
     if name not in names:
-        whose = " with a planner that recalls" if recalls else ""
-        raise ValueError(f"engine: expected one of {names}{whose}, got {name!r}")
+        raise ValueError(f"engine: expected one of {names}, got {name!r}")
 
 
-def _able(recalls: bool) -> list[str]:
-    return [name for name, entry in ENGINES.items() if entry.recalls or not recalls]
-
-
-def make_engine(
-    name: EngineName, network: TransformerForDiffusion, sampler: Sampler, *, recalls: bool = False
-) -> Engine:
+def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
     """Make the engine ``name`` for ``network`` and ``sampler``.
 
-    ``"auto"`` takes the first of :data:`ENGINES` that applies: native on a CPU where it was built, else torch, or, with
-    ``recalls``, the reference.
+    ``"auto"`` takes the first of :data:`ENGINES` that applies: native on a CPU where it was built, else torch.
 
     Raises:
-        ValueError: on an unknown name, or if the engine cannot run the network here or does not recall where it is to; the
-            message says why.
+        ValueError: on an unknown name, or if the engine cannot run the network here; the message says why.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -91,9 +76,9 @@ def make_engine(
         >>> make_engine("torch", network, Sampler("ddim", 10)).name
         'torch'
     """
-    check_engine(name, recalls)
+    check_engine(name)
     if name == "auto":
-        name = next(name for name in _able(recalls) if ENGINES[name].applies(network)[0])
+        name = next(name for name, entry in ENGINES.items() if entry.applies(network)[0])
     applies, reason = ENGINES[name].applies(network)
     if not applies:
         raise ValueError(f"{name} engine: {reason}")
@@ -118,17 +103,17 @@ class EngineSlot:
         self._made: tuple[Any, Engine | None] = (None, None)
         self._stale = False
 
-    def get(self, network: TransformerForDiffusion, sampler: Sampler, *, recalls: bool = False) -> Engine:
-        """Return the engine for ``network`` and ``sampler``, a `RecallingEngine` if it is to recall.
+    def get(self, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
+        """Return the engine for ``network`` and ``sampler``.
 
         Raises:
-            ValueError: if the chosen engine cannot run the network, or does not recall.
+            ValueError: if the chosen engine cannot run the network.
         """
         parameter = network.pos_emb
-        wanted = (network, sampler, recalls, parameter.device, parameter.dtype)
+        wanted = (network, sampler, parameter.device, parameter.dtype)
         made_for, engine = self._made  # read and replaced in one go: other threads may do the same
         if engine is None or made_for != wanted:
-            engine = make_engine(self.name, network, sampler, recalls=recalls)
+            engine = make_engine(self.name, network, sampler)
             if self._stale:  # what engines of a network share is older than this one
                 engine.refresh()
             self._made, self._stale = (wanted, engine), False
@@ -138,17 +123,16 @@ class EngineSlot:
         """Make the engine anew in the next query, from the weights that the network has then."""
         self._made, self._stale = (None, None), True
 
-    def describe(self, network: TransformerForDiffusion, sampler: Sampler, *, recalls: bool = False) -> str:
+    def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
         """Say which engine runs and on what; if ``"auto"`` had to pass over others, why."""
-        engine = self.get(network, sampler, recalls=recalls)
+        engine = self.get(network, sampler)
         text = f"{engine.name}: {engine.detail}"
         if self.name != "auto":
             return text
         for name, entry in ENGINES.items():
             if name == engine.name:
                 break
-            reason = "it does not recall" if recalls and not entry.recalls else entry.applies(network)[1]
-            text += f" (not {name}: {reason})"
+            text += f" (not {name}: {entry.applies(network)[1]})"
         return text
 
     def __getstate__(self) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import Overhead, check_query
-from torchrl_sparse.blocks.engine.recall import Memory, check_memory
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, fixed_macs, num_buffers
@@ -19,14 +18,7 @@ from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = [
-    "ComputedRows",
-    "FeatureRecorder",
-    "ReferenceEngine",
-    "denoise",
-    "denoise_recalling",
-    "first_memory",
-]
+__all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
 
 
 class FeatureRecorder:
@@ -65,7 +57,6 @@ def denoise(
     reuse: Reuse = "block",
     guide: Guide | None = None,
     record: Callable[[int, int, Tensor], None] | None = None,
-    replace: Callable[[int, int, Tensor], Tensor] | None = None,
 ) -> Tensor:
     """Denoise a batch of action chunks, skipping what ``mask`` prunes.
 
@@ -86,7 +77,6 @@ def denoise(
             last-writer-wins) or ``"single"``.
         guide: what every step's clean prediction is drawn to, see `Guide`; None draws nothing.
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
-        replace: called likewise before that; returns what is added instead, and buffers keep what was there.
 
     Returns:
         normalised actions [B, H, A].
@@ -117,8 +107,6 @@ def denoise(
             slot = block % len(latest)
             output = _block_output(network, block, x, memory, computed.at(step, block), latest[slot])
             latest[slot] = output
-            if replace is not None:
-                output = replace(step, block, output)
             x = x + output
             if record is not None:
                 record(step, block, output)
@@ -127,42 +115,6 @@ def denoise(
         sample = sampler.step(eps, step, before, noise_k, cleans, guide)
         cleans = sampler.remember(cleans, eps, step, before, guide)
     return sample
-
-
-def denoise_recalling(
-    network: TransformerForDiffusion,
-    sampler: Sampler,
-    noise: Tensor,
-    cond: Tensor,
-    mask: Tensor,
-    recalled: Tensor,
-    memory: Tensor,
-    *,
-    reuse: Reuse = "block",
-) -> tuple[Tensor, Tensor]:
-    """Denoise with cells that recall earlier queries, see :mod:`torchrl_sparse.blocks.engine.recall`.
-
-    Args:
-        network, sampler, noise, cond, mask, reuse: as of :func:`denoise`.
-        recalled: bool [B, K, 3L], the pruned cells that recall.
-        memory: what was computed last in each cell, f32 [B, K, 3L, H, d]; it is not written to.
-
-    Returns:
-        normalised actions [B, H, A], and the memory that this query leaves to the next.
-
-    Raises:
-        ValueError: as ``denoise`` does, if a cell is recalled that is not pruned, or if the memory has another shape.
-    """
-    check_memory(memory, mask, network)
-    kept = Memory(mask, recalled, memory)
-    return denoise(network, sampler, noise, cond, mask, reuse=reuse, replace=kept), kept.outputs
-
-
-def first_memory(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Tensor:
-    """Return what a query that computes everything leaves to the next, the ``memory`` of :func:`denoise_recalling`."""
-    recorder = FeatureRecorder()
-    denoise(network, sampler, noise, cond, record=recorder)
-    return recorder.features().permute(2, 1, 0, 3, 4)
 
 
 def _block_output(
@@ -227,20 +179,6 @@ class ReferenceEngine:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.denoise`; gradients flow."""
         check_weights(self._network)
         return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse, guide=guide)
-
-    def denoise_recalling(
-        self,
-        noise: Tensor,
-        cond: Tensor,
-        mask: Tensor,
-        recalled: Tensor,
-        memory: Tensor,
-        reuse: Reuse = "block",
-    ) -> tuple[Tensor, Tensor]:
-        """See :meth:`~torchrl_sparse.blocks.engine.base.RecallingEngine.denoise_recalling`; gradients flow."""
-        check_weights(self._network)
-        query = noise, cond, mask, recalled, memory
-        return denoise_recalling(self._network, self._sampler, *query, reuse=reuse)
 
     def refresh(self) -> None:
         """Do nothing: no weights are kept between queries."""

@@ -43,7 +43,6 @@ class PrunerNetwork(nn.Module):
         hidden: of the MLP.
         n_layer, n_head: of the transformer encoder over the coordinates.
         rate_input: whether the target prune rate is an input.
-        recalls: whether there is a third logit, of recalling an earlier query, see :mod:`torchrl_sparse.blocks.tts`.
         unseen: leading columns of the observations that are not read, as those of the cameras' features.
 
     Raises:
@@ -69,12 +68,11 @@ class PrunerNetwork(nn.Module):
         n_layer: int = 1,
         n_head: int = 4,
         rate_input: bool = False,
-        recalls: bool = False,
         unseen: int = 0,
     ) -> None:
         super().__init__()
         self.timesteps, self.num_blocks, self.cond_shape = list(timesteps), num_blocks, tuple(cond_shape)
-        self.rate_input, self.recalls, self.unseen = rate_input, recalls, unseen
+        self.rate_input, self.unseen = rate_input, unseen
         self.config: dict[str, Any] = {
             "timesteps": self.timesteps,
             "num_blocks": num_blocks,
@@ -86,9 +84,9 @@ class PrunerNetwork(nn.Module):
             "n_head": n_head,
             "rate_input": self.rate_input,
         }
-        _check(**self.config, recalls=recalls, unseen=unseen)
-        # Files do not name what their pruner has not.
-        self.config |= {name: value for name, value in (("recalls", recalls), ("unseen", unseen)) if value}
+        _check(**self.config, unseen=unseen)
+        if unseen:  # files do not name what their pruner has not
+            self.config["unseen"] = unseen
         self.register_buffer("coordinates", self._coordinates(SinusoidalPosEmb(width)), persistent=False)
         self.token = nn.Linear(2 * width, width)
         layer = nn.TransformerEncoderLayer(
@@ -103,19 +101,19 @@ class PrunerNetwork(nn.Module):
             nn.ReLU(inplace=True),
             nn.Linear(hidden, hidden),
             nn.ReLU(inplace=True),
-            nn.Linear(hidden, 2 + recalls),
+            nn.Linear(hidden, 2),
         )
         self._forget()
 
     def forward(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Return logits (keep, prune) f32 [B, K, 3L, 2], with ``recalls`` (keep, prune, recall) [B, K, 3L, 3].
+        """Return logits (keep, prune) f32 [B, K, 3L, 2].
 
         Args:
             cond: encoded observations f32 [B, To, D].
             rate: target prune rates f32 [B, 1]; with ``rate_input``, and only then.
         """
         logits = self.mlp(self._fused(cond, rate))
-        return logits.view(len(cond), len(self.timesteps), self.num_blocks, logits.shape[-1])
+        return logits.view(len(cond), len(self.timesteps), self.num_blocks, 2)
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Return f32 [B, K, 3L], by how much pruning is preferred to keeping, at less cost than both logits.
@@ -129,15 +127,6 @@ class PrunerNetwork(nn.Module):
         logits = hidden @ (last.weight[1] - last.weight[0]) + (last.bias[1] - last.bias[0])
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
 
-    def recall_logits(self, cond: Tensor) -> Tensor:
-        """Return f32 [B, K, 3L], positive where a cell recalls if it is pruned; for networks with ``recalls``.
-
-        Compiled code computes it where it computes `prune_logits`.
-        """
-        if (native := self._compiled(cond, recall=True)) is not None:
-            return native.logits(cond.flatten(1))
-        return self(cond)[..., 2]
-
     def prune_masks(self, cond: Tensor) -> Tensor:
         """Return bool [B, K, 3L], where pruning is preferred, the first step left out; for networks without a rate as input."""
         if (native := self._compiled(cond)) is not None:
@@ -146,22 +135,21 @@ class PrunerNetwork(nn.Module):
         masks[:, 0] = False
         return masks
 
-    def _compiled(self, cond: Tensor, recall: bool = False) -> NativePruner | None:
-        """Return the compiled MLP of a decision, to prune or to recall, or None where PyTorch has to compute."""
+    def _compiled(self, cond: Tensor) -> NativePruner | None:
+        """Return the compiled MLP, or None where PyTorch has to compute."""
         if self.training or torch.is_grad_enabled() or not _is_f32_on_cpu(cond):
             return None
-        if recall not in self._native and self._can_be_native():
-            self._native[recall] = NativePruner(self.mlp_weights(recall))
-        return self._native.get(recall)
+        if self._native is None and self._can_be_native():
+            self._native = NativePruner(self.mlp_weights())
+        return self._native
 
-    def mlp_weights(self, recall: bool = False) -> PrunerWeights:
-        """Return the weights of all that depends on the observation, for compiled code; it decides to prune or to recall."""
+    def mlp_weights(self) -> PrunerWeights:
+        """Return the weights of all that depends on the observation, for compiled code."""
         _, middle, _, last = self.mlp
         fuse, middle, last = ((layer.weight, layer.bias) for layer in (self.fuse_obs, middle, last))
         obs = self._weight_of_all(), self.obs.bias
         cells = self.cells().view(len(self.timesteps), self.num_blocks, -1)
-        sides = [torch.stack([torch.zeros_like(some[2]), some[2]]) if recall else some[:2] for some in last]
-        return PrunerWeights(obs, fuse, cells, middle, tuple(sides))
+        return PrunerWeights(obs, fuse, cells, middle, last)
 
     def _weight_of_all(self) -> Tensor:
         """Return the first weight with zeros for what is not read, so that compiled code takes the observation as it lies."""
@@ -199,7 +187,7 @@ class PrunerNetwork(nn.Module):
 
     def _forget(self) -> None:
         self._cells: Tensor | None = None
-        self._native: dict[bool, NativePruner] = {}
+        self._native: NativePruner | None = None
 
     def train(self, mode: bool = True) -> PrunerNetwork:
         self._forget()
@@ -214,7 +202,7 @@ class PrunerNetwork(nn.Module):
         super()._load_from_state_dict(*args)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cells": None, "_native": {}}
+        return {**self.__dict__, "_cells": None, "_native": None}
 
     @property
     def macs_per_query(self) -> int:
@@ -244,7 +232,6 @@ def _check(
     cond_shape: list,
     num_blocks: int,
     rate_input: bool,
-    recalls: bool,
     unseen: int,
     **sizes: int,
 ) -> None:
@@ -252,9 +239,8 @@ def _check(
         raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
     if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
         raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
-    for name, flag in (("rate_input", rate_input), ("recalls", recalls)):
-        if not isinstance(flag, bool):
-            raise ValueError(f"{name}: expected true or false, got {reprlib.repr(flag)}")
+    if not isinstance(rate_input, bool):
+        raise ValueError(f"rate_input: expected true or false, got {reprlib.repr(rate_input)}")
     check_size("timesteps", len(timesteps), _MAX_CELLS)
     check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
     check_size("width", sizes["width"], _MAX_TOKEN)

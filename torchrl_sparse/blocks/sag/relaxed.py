@@ -9,17 +9,11 @@ so that the gradient of a gate says how the final actions would change if its bl
 through what later blocks then reuse. SAG and Learning-to-Cache are trained with it. The release of SAG's successor
 (TTS, arXiv:2605.13316) keeps what it reuses without its gradient, ``tau <- detach(out_b)``: a gate then learns from what
 reusing does at its own place alone, not from what computing it would do for the blocks that reuse it (``detached``).
-
-TTS also lets a pruned block choose what it reuses. With a second gate ``R`` and ``m_b``, what an earlier query computed there
-(:mod:`torchrl_sparse.blocks.engine.recall`)::
-
-    out_b = (1 - M) d_b + M ((1 - R) tau + R m_b)      tau <- (1 - M) d_b + M tau
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -31,7 +25,7 @@ from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Recalled", "denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
+__all__ = ["denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
 
 
 def straight_through_gate(logits: Tensor) -> Tensor:
@@ -67,23 +61,6 @@ def _spare_first(gate: Tensor) -> Tensor:
     return torch.cat([torch.zeros_like(gate[..., :1, :]), gate[..., 1:, :]], dim=-2)
 
 
-@dataclass(frozen=True)
-class Recalled:
-    """What pruned blocks recall of the queries before.
-
-    Attributes:
-        gate: f32 [B, K, 3L] of 0 and 1 (1 = recalled, where the block is pruned), row 0 all 0.
-        memory: what was computed last in each cell, f32 [B, K, 3L, H, d]; gets no gradient.
-    """
-
-    gate: Tensor
-    memory: Tensor
-
-    def at(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return gate and memory of a step, [B, 3L] and [B, 3L, H, d]."""
-        return self.gate[:, step], self.memory[:, step]
-
-
 def denoise_relaxed(
     network: TransformerForDiffusion,
     sampler: Sampler,
@@ -95,7 +72,6 @@ def denoise_relaxed(
     explore: float = 1.0,
     checkpointed: bool = False,
     detached: bool = False,
-    recalled: Recalled | None = None,
 ) -> Tensor:
     """Return normalised actions [B, H, A], differentiable with respect to the gates.
 
@@ -108,13 +84,12 @@ def denoise_relaxed(
         checkpointed: recompute each denoising step in the backward pass instead of keeping its activations:
             the memory of one step instead of K, for about a third more time.
         detached: keep outputs for reuse without their gradient, see the module.
-        recalled: which pruned blocks recall earlier queries; None has none do it.
 
     Raises:
         ValueError: as ``denoise`` does.
     """
     options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed, "detached": detached}
-    *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, **options, recalled=recalled)
+    *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, **options)
     return actions
 
 
@@ -165,7 +140,6 @@ def _chain(
     checkpointed: bool,
     detached: bool,
     cut: bool = False,
-    recalled: Recalled | None = None,
 ) -> Iterator[tuple[Tensor, tuple[Tensor, ...], Tensor]]:
     """Yield the sample before each denoising step, the clean predictions that the step reads, and the sample after it."""
     pruned = gate.detach().bool()
@@ -182,7 +156,7 @@ def _chain(
             sample = sample.detach()
             cleans, buffers = (tuple(tensor.detach() for tensor in kept) for kept in (cleans, buffers))
         run = _Step(network, sampler, k, cond, _transition_noise(noise, k), computed, slots, detached)
-        arguments = (sample, gate[:, k], cleans, buffers, *(recalled.at(k) if recalled else ()))
+        arguments = (sample, gate[:, k], cleans, buffers)
         after, new_cleans, buffers = (
             checkpoint(run, *arguments, use_reentrant=False) if checkpointed else run(*arguments)
         )
@@ -209,29 +183,18 @@ class _Step:
         self._computed, self._slots, self._detached = computed, slots, detached
 
     def __call__(
-        self,
-        sample: Tensor,
-        gate: Tensor,
-        cleans: tuple[Tensor, ...],
-        buffers: tuple[Tensor, ...],
-        recall: Tensor | None = None,
-        recalled: Tensor | None = None,
+        self, sample: Tensor, gate: Tensor, cleans: tuple[Tensor, ...], buffers: tuple[Tensor, ...]
     ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Return the next sample, and clean predictions and buffers after the step; ``gate`` and ``recall`` are [B, 3L]."""
+        """Return the next sample, and clean predictions and buffers after the step; ``gate`` is [B, 3L]."""
         network, latest = self._network, list(buffers) or [None] * self._slots
         memory = network.memory(int(self._sampler.timesteps[self._k]), self._cond)
         x = network.embed(sample)
         for block in range(network.num_blocks):
             slot = block % self._slots
-            rows, kept = self._computed.at(self._k, block), latest[slot]
+            rows = self._computed.at(self._k, block)
             fresh = self._fresh(block, x, memory, rows)
-            pruned, reused = gate[:, block, None, None], kept
-            if recall is not None and kept is not None:
-                reused = torch.lerp(kept, recalled[:, block], recall[:, block, None, None])
-            output = _mix(fresh, rows, pruned, reused)
+            output = _mix(fresh, rows, gate[:, block, None, None], latest[slot])
             x = x + output
-            if reused is not kept:  # buffers never hold what was recalled
-                output = _mix(fresh, rows, pruned, kept)
             latest[slot] = output.detach() if self._detached else output
         eps = network.head_out(x)
         after = self._sampler.step(eps, self._k, sample, self._noise, cleans)

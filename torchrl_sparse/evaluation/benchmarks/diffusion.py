@@ -48,7 +48,7 @@ def default_methods(planners: Path) -> list[str]:
     """Return the methods that need no file, and every planner that is saved in a folder.
 
     >>> default_methods(Path("assets/lift"))[5:]
-    ['bac_blockwise', 'bac', 'bac_ddpm10', 'bac_m6', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched', 'tts', 'tts_fixed']
+    ['bac_blockwise', 'bac', 'bac_ddpm10', 'bac_m6', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched']
     """
     return list(dict.fromkeys([*_ALWAYS, *saved_planners(planners)]))
 
@@ -152,7 +152,7 @@ def draw_methods(
     plot_pareto(results, out / "pareto.png")
     plot_success_within(results, out / "success_within.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
-    # The first query of an episode has nothing to recall.
+    # The first query of an episode has no last chunk to begin from.
     masks = {name: answer(method, queries[:2])[keys.PRUNE_MASK][-1] for name, method in methods.items()}
     for name, mask in masks.items():
         ratio = results.methods[name].flops.ratio_to_dense

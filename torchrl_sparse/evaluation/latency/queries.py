@@ -29,7 +29,8 @@ def time_queries(
     """Time recorded queries [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
 
     Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods that
-    recall have what they left themselves in the one before. Those in ``samples`` are asked it so many times at once.
+    carry something from query to query have what they left themselves in the one before. Those in ``samples`` are asked it so
+    many times at once.
     """
     samples = samples or {}
     inputs = {

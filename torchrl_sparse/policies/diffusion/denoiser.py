@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.base import Engine
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot, check_engine
-from torchrl_sparse.blocks.engine.reference import denoise, denoise_recalling
+from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
@@ -19,7 +19,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["NOISES", "ActionDenoiser", "check_noise", "check_recalling"]
+__all__ = ["NOISES", "ActionDenoiser", "check_noise"]
 
 NOISES = {"torch": sample_noise, "philox": philox_noise}
 """What a seed stands for -> the function that draws it: PyTorch's generator, with which everything here was measured, or
@@ -33,20 +33,12 @@ def check_noise(name: str) -> str:
     return name
 
 
-def check_recalling(engine: EngineName, start: str) -> None:
-    """Raise ValueError unless a planner that recalls can run: in an engine that does, with queries that begin from noise."""
-    if start:
-        raise ValueError(f"start: expected None with a planner that recalls, got {start}")
-    check_engine(engine, recalls=True)
-
-
 class ActionDenoiser(TensorDictModuleBase):
     """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost.
 
     Attributes:
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
         guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
-        recalls: whether they say what to reuse of the queries before, see :mod:`torchrl_sparse.blocks.engine.recall`.
         planning_flops: of the planner, which are counted with the loop's.
     """
 
@@ -60,7 +52,7 @@ class ActionDenoiser(TensorDictModuleBase):
         super().__init__()
         self.network = network
         self.normalizer = normalizer
-        self.warm = self.guided = self.recalls = False
+        self.warm = self.guided = False
         self.planning_flops = 0
         self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
@@ -71,8 +63,7 @@ class ActionDenoiser(TensorDictModuleBase):
     @property
     def in_keys(self):
         own = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
-        recalls = [keys.RECALL, keys.FEATURES] if self.recalls else []
-        return [*own, *self._begin_keys(), *self._guide_keys(), *recalls]
+        return [*own, *self._begin_keys(), *self._guide_keys()]
 
     def _begin_keys(self) -> list:
         return [keys.START, keys.NUM_STEPS] if self.warm else []
@@ -82,20 +73,20 @@ class ActionDenoiser(TensorDictModuleBase):
 
     @property
     def out_keys(self):
-        return [keys.CHUNK, keys.FLOPS, *([keys.FEATURES] if self.recalls else ())]
+        return [keys.CHUNK, keys.FLOPS]
 
     def choose(self, engine: EngineName) -> None:
         """Take another engine from the next query on; ValueError as `check_engine`."""
-        check_engine(engine, self.recalls)
+        check_engine(engine)
         self.engine = EngineSlot(engine)
 
     def describe(self) -> str:
         """Say which engine runs and on what, and why not a faster one."""
-        return self.engine.describe(self.network, self.sampler, recalls=self.recalls)
+        return self.engine.describe(self.network, self.sampler)
 
     def current_engine(self) -> Engine:
         """Return the engine that queries run in now."""
-        return self.engine.get(self.network, self.sampler, recalls=self.recalls)
+        return self.engine.get(self.network, self.sampler)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
@@ -107,33 +98,13 @@ class ActionDenoiser(TensorDictModuleBase):
         noise = NOISES[self.noise](seed, self.sampler.num_inference_steps, shape)
         dtype = self.network.pos_emb.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
-        if self.recalls:
-            actions, flops = self._recall(tensordict, noise, cond, mask, rules.reshape(-1))
-        else:
-            guide = Guide(*guided) if guided else None
-            actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), guide, *begin)
+        guide = Guide(*guided) if guided else None
+        actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), guide, *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         if self.planning_flops:
             flops = flops + self.planning_flops
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
-
-    def _recall(
-        self, tensordict: TensorDictBase, noise: Tensor, cond: Tensor, mask: Tensor, rules: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return what `_denoise` does, and keep what this query computed for those after it."""
-        network, batch = self.network, tensordict.batch_size
-        shape = (*mask.shape[1:], network.horizon, network.n_emb)
-        before = _flat(keys.recall(tensordict, keys.FEATURES, shape, 0.0, cond.dtype), batch)
-        recalled = _flat(keys.read(tensordict, keys.RECALL), batch)
-        (code,) = set(rules.tolist()) or {0}
-        query = noise, cond, mask, recalled, before
-        if network.training or cond.requires_grad:
-            actions, memory = denoise_recalling(network, self.sampler, *query, reuse=REUSE_RULES[code])
-        else:
-            actions, memory = self.current_engine().denoise_recalling(*query, REUSE_RULES[code])
-        tensordict.set(keys.FEATURES, memory.reshape(*batch, *shape))
-        return actions, mask_flops(NetworkSizes.of(network), mask)
 
     def static_flops(self, mask: Tensor) -> float:
         """Count the FLOPs of a query under a planner's mask [K, 3L], once: the planner never writes to it."""
@@ -219,7 +190,7 @@ class ActionDenoiser(TensorDictModuleBase):
             sampler, slot = self._tail(number)
         if self.network.training or cond.requires_grad:
             return denoise(self.network, sampler, noise, cond, mask, reuse=reuse, guide=guide)
-        return slot.get(self.network, sampler, recalls=self.recalls).denoise(noise, cond, mask, reuse, guide)
+        return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse, guide)
 
     def refresh(self) -> None:
         """Read all weights anew in the next query."""

@@ -90,7 +90,7 @@ def _exported_plan(plan: Planner, network: TransformerForDiffusion) -> ExportedP
     if plan.is_static:
         mask = plan.masks(torch.zeros(1, network.n_obs_steps, network.cond_dim))[0]
         return ExportedPlan(slots, mask if mask.any() else None)
-    if not isinstance(plan, SAGPruner) or plan.network.recalls:
+    if not isinstance(plan, SAGPruner):
         raise ValueError(
             f"plan: expected one that does not look at the observation, or a SAGPruner, got {type(plan).__name__}"
         )

@@ -27,7 +27,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.fingerprint import networks_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise, check_recalling
+from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
@@ -141,14 +141,12 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
         check_trained(sampler, self.sampler)
-        if recalls := keys.RECALL in plan.out_keys:
-            check_recalling(self.engine, start.name)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
         self.module["denoise"].sampler = sampler
         denoise = self.module["denoise"]
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
-        denoise.recalls, denoise.planning_flops = recalls, plan.flops
+        denoise.planning_flops = plan.flops
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]

@@ -12,7 +12,7 @@ Eq. 5, with e for the end of what is left of the old chunk)::
 RTC was made for flows and moves each step along a gradient through the network. Here the clean prediction itself is drawn,
 ``clean + pull (old - clean)``, as inpainting by replacement does (RePaint, arXiv:2201.09865): the sample that the network sees
 next agrees with the actions that are certain, and it denoises the others to fit them. That is one sum a step, runs in every
-engine with every planner but `Recall`, and leaves the first d actions as they are played. What it does without is the
+engine with every planner, and leaves the first d actions as they are played. What it does without is the
 gradient's pull on the other actions within a step, so more than one step is needed for them to follow.
 """
 

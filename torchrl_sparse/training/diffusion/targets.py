@@ -44,7 +44,6 @@ def make_targets(
     share: float = 0.05,
     source: Literal["teacher", "data"] = "teacher",
     n_action_steps: int = 8,
-    turns: int = 1,
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TensorDict:
@@ -57,18 +56,15 @@ def make_targets(
         source: of the actions: ``"teacher"``, the answer of the dense policy on the same noise; ``"data"``, the demonstrated
             ones, as published. A regression to data averages over modes; the teacher's answer does not.
         n_action_steps: actions executed of a chunk; decides how far windows reach over an episode's end.
-        turns: windows in a row, ``n_action_steps`` apart, as the queries of an episode are. Those whose episode ends too soon
-            are left out.
         seed: fixes the sample and its noise.
         on_progress: called with (windows answered, all).
 
     Returns:
         [N], where the policy is: ``("diffusion", "cond")`` f32 [N, To, D], ``("diffusion", "seed")`` i64 [N, 1], ``"target"``
-        f32 [N, H, A], normalised; with several ``turns``, [N, turns].
+        f32 [N, H, A], normalised.
 
     Raises:
-        ValueError: if the share leaves no window, no episode has so many turns, or the demonstrations mean something else than
-            what the policy observes.
+        ValueError: if the share leaves no window, or the demonstrations mean something else than what the policy observes.
     """
     network, normalizer = policy.network, policy.normalizer
     check_contract(policy, demos.contract)
@@ -82,9 +78,7 @@ def make_targets(
         )
     generator = torch.Generator().manual_seed(seed)
     drawn = rows[torch.randperm(len(rows), generator=generator)[:size]]
-    drawn = _in_turns(demos, drawn, network.n_obs_steps, n_action_steps, turns)
-    windows = demos.windows(drawn.flatten(0, 1), network.n_obs_steps)
-    size = len(windows)
+    windows = demos.windows(drawn, network.n_obs_steps)
     targets = TensorDict(
         {
             keys.COND: encode_windows(policy, windows),
@@ -95,25 +89,7 @@ def make_targets(
     ).to(policy.device)
     if source == "teacher":
         targets["target"] = dense_answers(policy, targets, on_progress)
-    return targets if turns == 1 else targets.view(-1, turns)
-
-
-def _in_turns(
-    demos: Demonstrations, rows: Tensor, n_obs_steps: int, n_action_steps: int, turns: int
-) -> Tensor:
-    """Return the windows i64 [S, turns, H] of successive queries, the first of them those ``rows`` [W, H] that have as many."""
-    present = rows[:, n_obs_steps - 1, None] + n_action_steps * torch.arange(
-        turns
-    )  # it is in the episode in any case
-    episode = torch.searchsorted(demos.starts, present[:, 0].contiguous(), right=True) - 1
-    first, last = demos.starts[episode], demos.starts[episode + 1] - 1
-    lasting = present[:, -1] <= last
-    if not lasting.any():
-        raise ValueError(
-            f"turns: expected an episode with {turns} queries {n_action_steps} actions apart, got none"
-        )
-    windows = present[..., None] + torch.arange(rows.shape[1]) - (n_obs_steps - 1)
-    return windows.clamp(first[:, None, None], last[:, None, None])[lasting]
+    return targets
 
 
 def add_queries(
@@ -201,5 +177,4 @@ def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
         raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
     if differing := describe_differences(found, made_for):
         raise ValueError(f"{path}: made with other settings: {differing}; choose another out or move it away")
-    batch = tensors["target"].shape[:-2]
-    return TensorDict(tensors, batch_size=batch).unflatten_keys("/")
+    return TensorDict(tensors, batch_size=[len(tensors["target"])]).unflatten_keys("/")

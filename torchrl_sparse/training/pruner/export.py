@@ -7,11 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_sparse.blocks.recall import RecallSchedule
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.schedule import CacheSchedule
-from torchrl_sparse.blocks.tts import TTSPruner
-from torchrl_sparse.training.pruner.recalls import RecallTrainer
 from torchrl_sparse.training.pruner.trainer import PrunerTrainer
 
 __all__ = ["export_planner", "exported"]
@@ -22,7 +19,7 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
 
     That is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
     objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the
-    schedule of their mean mask, the ablation, beside it: ``fixed.json``. Of gates that recall both do.
+    schedule of their mean mask, the ablation, beside it: ``fixed.json``.
 
     Args:
         trainer: the gates, and what they were trained for.
@@ -31,8 +28,6 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
     """
     folder, config, policy = Path(folder), trainer.config, trainer.policy
     settings = {**asdict(config), **settings, "updates": trainer.step}
-    if trainer.gates.recalls:
-        return _export_recalling(trainer, folder, settings)
     is_static = trainer.gates.is_static
     static_name = "l2c_noise" if config.objective == "noise" else "l2c"
     schedule = CacheSchedule.from_mask(
@@ -48,22 +43,7 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
         schedule.save_pretrained(path)
         return path
     schedule.save_pretrained(folder / "fixed.json")
-    SAGPruner(trainer.gates, _info(trainer, settings)).save_pretrained(folder / "pruner")
-    return folder / "pruner"
-
-
-def _export_recalling(trainer: RecallTrainer, folder: Path, settings: dict[str, Any]) -> Path:
-    mask = trainer.fixed_mask()
-    made_for = trainer.policy.plan.spec
-    fixed = RecallSchedule(mask, trainer.fixed_recalls(mask), made_for, trainer.config.reuse, settings)
-    fixed.save_pretrained(folder / "fixed.json")
-    TTSPruner(trainer.gates, _info(trainer, settings)).save_pretrained(folder / "pruner")
-    return folder / "pruner"
-
-
-def _info(trainer: PrunerTrainer, settings: dict[str, Any]) -> PrunerInfo:
-    config, policy = trainer.config, trainer.policy
-    return PrunerInfo(
+    info = PrunerInfo(
         policy=policy.fingerprint,
         sampler=policy.sampler.name,
         rate=config.rate,
@@ -71,6 +51,8 @@ def _info(trainer: PrunerTrainer, settings: dict[str, Any]) -> PrunerInfo:
         reuse=config.reuse,
         settings=settings,
     )
+    SAGPruner(trainer.gates, info).save_pretrained(folder / "pruner")
+    return folder / "pruner"
 
 
 def exported(folder: str | Path) -> list[str]:

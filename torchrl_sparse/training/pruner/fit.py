@@ -81,8 +81,8 @@ def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, s
     what tells two observations apart is far smaller than 1, and every layer makes it smaller. Once the logits of the cells have
     grown apart, as when gates are fitted to a mask, no observation changes a sign, and what changes nothing is never learned.
     Here the first layers are scaled so that observation and coordinates have an equal say, with mean 0 and deviation 1 in
-    each unit of the first hidden layer, and the last so that logits have mean 0 and deviation ``spread`` (those of recalling
-    the mean alone). All of them stay the layers that they were.
+    each unit of the first hidden layer, and the last so that logits have mean 0 and deviation ``spread``. All of them stay
+    the layers that they were.
 
     Args:
         gates: those that read the observation.
@@ -101,8 +101,6 @@ def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, s
     last = gates.mlp[-1]
     last.weight *= spread / gates.prune_logits(cond, rate)[:, 1:].std(dim=0).mean()
     last.bias[1] -= gates.prune_logits(cond, rate)[:, 1:].mean()
-    if gates.recalls:
-        last.bias[2] -= gates.recall_logits(cond)[:, 1:].mean()
     gates.train(gates.training)  # forget what followed from the weights
 
 

@@ -21,12 +21,10 @@ class Gates(Protocol):
     Attributes:
         rate_input: whether the target prune rate is an input.
         is_static: whether they decide the same for every observation.
-        recalls: whether they also say what is recalled of earlier queries, with ``recall_logits(cond)``.
     """
 
     rate_input: bool
     is_static: bool
-    recalls: bool
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
         """Return f32 [B, K, 3L] for encoded observations f32 [B, To, D] and, if it is an input, rates f32 [B, 1]."""
@@ -47,17 +45,13 @@ def _sag(policy: DiffusionPolicy, rate_input: bool, *, reads: str = "all", **siz
     )
 
 
-def _tts(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> PrunerNetwork:
-    return _sag(policy, rate_input, recalls=True, **sizes)
-
-
 def _l2c(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> StaticGates:
     if sizes:
         raise ValueError(f"network: expected nothing of l2c, which has no network, got {', '.join(sizes)}")
     return StaticGates(policy.num_inference_steps, policy.num_blocks)
 
 
-GATES: dict[str, Callable[..., nn.Module]] = {"sag": _sag, "tts": _tts, "l2c": _l2c}
+GATES: dict[str, Callable[..., nn.Module]] = {"sag": _sag, "l2c": _l2c}
 """Method -> function of (policy, rate_input, **sizes) that makes its `Gates`."""
 
 
@@ -67,8 +61,7 @@ def make_gates(
     """Return untrained gates for a policy, where it is.
 
     Args:
-        method: a key of `GATES`: ``"sag"``, which reads the observation, ``"tts"``, which also says what earlier queries
-            are recalled for, or ``"l2c"``, which does not look.
+        method: a key of `GATES`: ``"sag"``, which reads the observation, or ``"l2c"``, which does not.
         policy: the policy, with the sampler that will be pruned.
         rate_input: whether SAG's pruner takes the target prune rate as an input.
         seed: of the weights.

@@ -23,13 +23,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import noise_errors
 from torchrl_sparse.blocks.sag.planner import rate_threshold
-from torchrl_sparse.blocks.sag.relaxed import (
-    Recalled,
-    denoise_relaxed,
-    gumbel_gate,
-    step_errors,
-    straight_through_gate,
-)
+from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -58,13 +52,10 @@ class PrunerTrainer(Trainer):
 
     Attributes:
         weight: cost of each block, f32 [3L], as ``config.cost`` counts it.
-        batch_dims: dimensions of ``targets``: one, of queries that know nothing of each other.
 
     Raises:
         ValueError: if calibration set, configuration and gates do not fit each other.
     """
-
-    batch_dims = 1
 
     def __init__(
         self, gates: Gates, policy: DiffusionPolicy, targets: TensorDict, config: PrunerConfig
@@ -81,11 +72,6 @@ class PrunerTrainer(Trainer):
         if (asked := max(config.rate_range or (config.rate,))) > highest:
             kept = "every other step" if config.objective == "noise" else "the first step"
             raise ValueError(f"rate: expected at most {highest:g}, since {kept} is kept, got {asked}")
-        if targets.batch_dims != self.batch_dims:
-            expected = "1" if self.batch_dims == 1 else "2 or more"
-            raise ValueError(
-                f"turns: expected {expected} for such gates, got targets of shape {list(targets.shape)}"
-            )
         if len(targets) < 2:
             raise ValueError(f"targets: expected at least 2 observations, got {len(targets)}")
         self.gates, self.policy = gates, policy
@@ -156,7 +142,7 @@ class PrunerTrainer(Trainer):
     def fixed_mask(self) -> Tensor:
         """Return the mean of the masks of all training observations, bool [K, 3L]: the cells that the gates prune most often,
         as many as they prune on average. L2C's result, and SAG's ablation that does not read the observation."""
-        cond = self.train_set.reshape(-1)[keys.COND]
+        cond = self.train_set[keys.COND]
         masks = (self._masks(part) for part in cond.split(ANSWER_BATCH))
         return mean_mask(sum(mask.sum(dim=0) for mask in masks) / len(cond))
 
@@ -209,13 +195,8 @@ class PrunerTrainer(Trainer):
         elif self.config.gradient == "step":
             error = step_errors(*self._query(batch, gate), **self._relaxed_options())
         else:
-            error = self._chain_errors(batch, gate)
+            error = denoise_relaxed(*self._query(batch, gate), **self._relaxed_options()) - batch["target"]
         return self._norm(error)
-
-    def _chain_errors(self, batch: TensorDict, gate: Tensor, recalled: Recalled | None = None) -> Tensor:
-        """Return the errors of the whole chain's actions, [B, H, A]."""
-        actions = denoise_relaxed(*self._query(batch, gate), **self._relaxed_options(), recalled=recalled)
-        return actions - batch["target"]
 
     def _query(self, batch: TensorDict, gate: Tensor) -> tuple:
         """Return what a query of the policy is made of: network, sampler, noise, condition and gates or mask."""

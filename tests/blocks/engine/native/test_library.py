@@ -31,9 +31,10 @@ def test_a_missing_or_broken_library_is_a_reason_and_one_warning(tmp_path, monke
         library.library.cache_clear()
 
 
-def test_a_library_of_other_sources_is_refused(monkeypatch):
-    """Its structures would be read wrongly, without a word."""
-    monkeypatch.setattr(library, "Model", ctypes.c_int32)
+@pytest.mark.parametrize(("name", "other"), [("Model", ctypes.c_int32), ("_INTERFACE", 1)])
+def test_a_library_of_other_sources_is_refused(monkeypatch, name, other):
+    """Its structures would be read wrongly and its functions called with other arguments, without a word."""
+    monkeypatch.setattr(library, name, other)
     assert "was built from other sources; install" in library._load(Path(library.__file__).parent)
 
 

@@ -78,12 +78,6 @@ struct Guide {
     const float* pull;     // [horizon], 0 to 1
 };
 
-// What the queries before this one computed last in every cell, see recall.py; null where nothing is recalled.
-struct Recall {
-    const uint8_t* cells;  // [steps][3 * layers]: 1 for each pruned cell that adds what is in outputs
-    float* outputs;        // [steps][3 * layers][horizon][width]: computed cells are written, and so left to the next query
-};
-
 // The MLP of a pruner, see pruner.py. A cell is a block of a denoising step.
 struct Pruner {
     Matrix obs, middle;  // observation -> what it adds to every cell; cell -> its second hidden layer
@@ -726,19 +720,7 @@ struct Query {
         product(b.hidden, b.ldh, m.horizon, layer.down, share(layer.down), d, b.ld);
     }
 
-    // x += what an earlier query computed; no output of this query is read or changed.
-    void recall(const float* output) const {
-        for (int t = 0; t < m.horizon; t++)
-            for (int j = 0; j < m.width; j++) b.x[t * b.ld + j] += output[t * m.width + j];
-    }
-
-    // Leaves this thread's rows of what a block added to the next query.
-    void keep(int block, float* output) const {
-        const float* const d = b.latest + (size_t)(block % slots) * m.horizon * b.ld;
-        for (int t = rows.first; t < rows.last; t++) copy(d + t * b.ld, m.width, output + t * m.width);
-    }
-
-    // x += what a block adds. `read`: whether outputs of blocks have been reused, or blocks recalled, since the block before.
+    // x += what a block adds. `read`: whether outputs of blocks have been reused since the block before.
     void compute(int step, int block, bool read) const {
         float* const d = b.latest + (size_t)(block % slots) * m.horizon * b.ld;
         const int index = block / 3, kind = block % 3;
@@ -826,12 +808,8 @@ struct Query {
         m.history ? advance<true, GUIDED>(step, noise, guide) : advance<false, GUIDED>(step, noise, guide);
     }
 
-    void run(const uint8_t* pruned, const float* noise, const float* cond, const Guide& guide, const Recall& past,
-             float* actions) const {
+    void run(const uint8_t* pruned, const float* noise, const float* cond, const Guide& guide, float* actions) const {
         const int lda = stride(m.action_dim), size = m.horizon * m.action_dim, blocks = 3 * m.layers;
-        const size_t cell = (size_t)m.horizon * m.width;
-        const uint8_t* recalled = past.cells;
-        float* outputs = past.outputs;
         encode(cond);
         Matrix constant = m.embed;  // of a step without a computed block: what all of them add goes into the bias
         constant.bias = b.constant;
@@ -841,41 +819,34 @@ struct Query {
         if (m.history)
             for (int i = 0; i < 2 * m.horizon * lda; i++) b.cleans[i] = 0;
         for (int step = 0; step < m.steps; step++, pruned += blocks) {
-            const bool empty = run_end(pruned, recalled, 0, blocks) == blocks;
+            const bool empty = run_end(pruned, 0, blocks) == blocks;
             if (empty && !known) reuse(m.embed.bias, b.width, b.constant, b.width, 0, blocks);
             known = empty;
             read = read || empty;
             whole_product(b.sample, lda, m.horizon, empty ? constant : m.embed, b.x, b.ld);
             for (int block = empty ? blocks : 0, end; block < blocks; block = end + 1) {
-                end = run_end(pruned, recalled, block, blocks);
+                end = run_end(pruned, block, blocks);
                 if (end > block) reuse(b.x, b.ld, b.x, b.ld, block, end);
                 read = read || end > block;
                 if (end == blocks) break;
-                if (pruned[end]) {
-                    recall(outputs + end * cell);
-                    read = true;  // by a thread that is behind: here nobody waits
-                    continue;
-                }
                 compute(step, end, read), read = false;
-                if (outputs) keep(end, outputs + end * cell);
             }
-            if (outputs) recalled += blocks, outputs += blocks * cell;
             const float* const gaussian = step + 1 < m.steps ? noise + (size_t)(step + 1) * size : nullptr;
             guide.actions ? finish<true>(step, gaussian, guide) : finish<false>(step, gaussian, guide);
         }
         for (int t = rows.first; t < rows.last; t++) copy(b.sample + t * lda, m.action_dim, actions + t * m.action_dim);
     }
 
-    // The first block from `block` on that is computed or recalled: pruned ones before it add a sum of what is there already.
-    static int run_end(const uint8_t* pruned, const uint8_t* recalled, int block, int blocks) {
-        while (block < blocks && pruned[block] && !(recalled && recalled[block])) block++;
+    // The first block from `block` on that is computed: pruned ones before it add a sum of what is there already.
+    static int run_end(const uint8_t* pruned, int block, int blocks) {
+        while (block < blocks && pruned[block]) block++;
         return block;
     }
 };
 
 void denoise(const Model& m, const Member& who, const uint8_t* pruned, int slots, const float* noise, const float* cond,
-             const Guide& guide, const Recall& past, float* actions, float* own, float* shared) {
-    Query(m, slots, who, own, shared).run(pruned, noise, cond, guide, past, actions);
+             const Guide& guide, float* actions, float* own, float* shared) {
+    Query(m, slots, who, own, shared).run(pruned, noise, cond, guide, actions);
 }
 
 void run_blocks(const Model& m, const Member& who, int kind, float* own, float* shared) {

@@ -8,7 +8,7 @@ the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import byref
 from functools import partial
@@ -23,7 +23,6 @@ from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instru
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
-from torchrl_sparse.blocks.engine.recall import check_memory, check_recall
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
@@ -131,36 +130,6 @@ class NativeEngine:
             ValueError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
         """
         check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
-        drawn = [] if guide is None else [part.contiguous() for part in guide]
-        return self._denoise(noise, cond, mask, reuse, [part.data_ptr() for part in drawn] or [None, None])
-
-    def denoise_recalling(
-        self,
-        noise: Tensor,
-        cond: Tensor,
-        mask: Tensor,
-        recalled: Tensor,
-        memory: Tensor,
-        reuse: Reuse = "block",
-    ) -> tuple[Tensor, Tensor]:
-        """See :meth:`torchrl_sparse.blocks.engine.base.RecallingEngine.denoise_recalling`; ValueError as :meth:`denoise`."""
-        check_query(self._network, self._sampler, noise, cond, mask, reuse)
-        check_recall(recalled, mask)
-        check_memory(memory, mask, self._network)
-        recalled, memory = recalled.contiguous(), memory.clone(memory_format=torch.contiguous_format)
-        past = [recalled.data_ptr(), memory.data_ptr()]
-        return self._denoise(noise, cond, mask, reuse, past=past), memory
-
-    def _denoise(
-        self,
-        noise: Tensor,
-        cond: Tensor,
-        mask: Tensor | None,
-        reuse: Reuse,
-        guide: Sequence[int | None] = (None, None),
-        past: Sequence[int | None] = (None, None),
-    ) -> Tensor:
-        """Run a query that was checked, with the addresses of what it is drawn to and of what it recalls."""
         self._check(mask)
         packed, slots = self._current(), num_buffers(reuse, self._dense.shape[1])
         if mask is None:
@@ -170,8 +139,10 @@ class NativeEngine:
         if not len(cond):
             return actions
         mask, noise, cond = mask.contiguous(), noise.contiguous(), cond.contiguous()
+        drawn = [None, None] if guide is None else [part.contiguous() for part in guide]
+        guides = [None if part is None else part.data_ptr() for part in drawn]
         threads = self._num_threads(len(cond))
-        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guide, *past, actions.data_ptr()
+        query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guides, actions.data_ptr()
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
             library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())

@@ -23,12 +23,13 @@ INSTRUCTION_SETS = (
     "portable",
     *_OF_MACHINE.get(platform.machine(), ("avx2", "avx512", "avx512_bf16", "amx")),
 )
+_INTERFACE = 2  # counted up, here and in native.cpp, whenever the arguments of a function change
 # Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),
-    "sparse_model_size": (c_int64, []),
+    "sparse_interface": (c_int64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
-    "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 8]),
+    "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_normalise": (c_int32, [c_void_p, c_int32, c_int32, *[c_void_p] * 2]),
     "sparse_answer": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_blocks": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p]),
@@ -56,7 +57,7 @@ def _load(folder: Path) -> ctypes.CDLL | str:
         found = _declare(ctypes.CDLL(str(path)))
     except (OSError, AttributeError) as error:
         return f"{path.name} cannot be loaded ({error}); install the package again"
-    if found.sparse_model_size() != ctypes.sizeof(Model):
+    if found.sparse_interface() != _INTERFACE << 32 | ctypes.sizeof(Model):
         return f"{path.name} was built from other sources; install the package again"
     return found
 

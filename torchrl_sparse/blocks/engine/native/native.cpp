@@ -19,7 +19,6 @@ struct Batch {
     const size_t mask;  // from a row's to the next; 0 if all have the same
     const float *const noise, *const cond;
     const Guide guide;  // of the first row
-    const Recall past;  // likewise
     float *const actions, *const scratch;
     const size_t piece = Buffers(m, slots, nullptr, nullptr).size;
     std::atomic<int32_t> next{0};
@@ -27,10 +26,8 @@ struct Batch {
     void query(const Member& who, ptrdiff_t row, float* own, float* shared) const {
         const ptrdiff_t chunk = (ptrdiff_t)m.horizon * m.action_dim;
         const Guide drawn = guide.actions ? Guide{guide.actions + row * chunk, guide.pull + row * m.horizon} : guide;
-        const ptrdiff_t cells = (ptrdiff_t)m.steps * 3 * m.layers, outputs = cells * m.horizon * m.width;
-        const Recall recall = past.outputs ? Recall{past.cells + row * cells, past.outputs + row * outputs} : past;
         level.denoise(m, who, pruned + row * mask, slots, noise + row * m.steps * chunk,
-                      cond + row * m.obs_steps * m.cond_dim, drawn, recall, actions + row * chunk, own, shared);
+                      cond + row * m.obs_steps * m.cond_dim, drawn, actions + row * chunk, own, shared);
     }
 
     // Rows go to one thread each, the next to whichever is free; those that are left and fewer than threads, to all together.
@@ -93,21 +90,24 @@ extern "C" {
 
 int32_t sparse_levels() { return levels(); }
 
-// For the caller to compare with its own: a library that was built from other sources reads other structures.
-int64_t sparse_model_size() { return (int64_t)sizeof(Model); }
+// For the caller to compare with its own: a library that was built from other sources has other functions and structures.
+// library.py counts INTERFACE up whenever the arguments of a function change.
+int64_t sparse_interface() {
+    constexpr int64_t INTERFACE = 2;
+    return INTERFACE << 32 | (int64_t)sizeof(Model);
+}
 
 // Floats that each thread needs as scratch, which must start on a cache line (64 bytes).
 int64_t sparse_scratch(const Model* m, int32_t slots) { return (int64_t)Buffers(*m, slots, nullptr, nullptr).size; }
 
 // For each of n rows: pruned [steps][3 * layers], noise [steps][horizon][action_dim], cond [obs_steps][cond_dim] -> actions
 // [horizon][action_dim]. The latest outputs are kept in `slots` places: one for each block, 3 (one for each type), or 1.
-// guide [horizon][action_dim] and pull [horizon] of each row are what its clean predictions are drawn to, unless they are null;
-// recalled and outputs are its Recall, unless they are.
+// guide [horizon][action_dim] and pull [horizon] of each row are what its clean predictions are drawn to, unless they are null.
 void sparse_denoise(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
-                    const float* noise, const float* cond, const float* guide, const float* pull, const uint8_t* recalled,
-                    float* outputs, float* actions, float* scratch) {
+                    const float* noise, const float* cond, const float* guide, const float* pull, float* actions,
+                    float* scratch) {
     const size_t mask = (size_t)m->steps * 3 * m->layers;
-    Batch batch{LEVELS[level], *m, n, slots, pruned, mask, noise, cond, {guide, pull}, {recalled, outputs}, actions, scratch};
+    Batch batch{LEVELS[level], *m, n, slots, pruned, mask, noise, cond, {guide, pull}, actions, scratch};
     auto task = [&](const Member& who) { batch.work(who); };
     run(threads, task);
 }
@@ -121,7 +121,7 @@ int32_t sparse_normalise(const Units* units, int32_t n, int32_t dim, const float
 // environment, with one mask for all rows; actions are written too.
 void sparse_answer(int32_t level, int32_t threads, const Model* m, int32_t n, const uint8_t* pruned, int32_t slots,
                    const float* noise, const Units* units, const float* cond, float* actions, float* chunks, float* scratch) {
-    Batch batch{LEVELS[level], *m, n, slots, pruned, 0, noise, cond, {}, {}, actions, scratch};
+    Batch batch{LEVELS[level], *m, n, slots, pruned, 0, noise, cond, {}, actions, scratch};
     auto task = [&](const Member& who) { batch.work(who); };
     run(threads, task);
     const size_t past = m->obs_steps - 1, steps = m->horizon - past, dim = m->action_dim;

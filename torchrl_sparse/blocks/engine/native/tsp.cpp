@@ -341,8 +341,7 @@ int tsp_query(tsp_policy* policy, const float* history, uint64_t seed, float* ch
     if (!normalise(p.units, history, h.obs_steps, h.cond_dim, p.features)) return TSP_NOT_FINITE;
     philox::fill(seed, (size_t)h.steps * h.horizon * h.action_dim, p.noise);
     if (h.plan == PRUNER) decide(p);
-    LEVELS[p.level].denoise(p.model, Member{}, p.mask, h.slots, p.noise, p.features, Guide{}, Recall{}, p.actions, p.scratch,
-                            p.scratch);
+    LEVELS[p.level].denoise(p.model, Member{}, p.mask, h.slots, p.noise, p.features, Guide{}, p.actions, p.scratch, p.scratch);
     const int32_t past = h.obs_steps - 1;
     unnormalise(p.units, p.actions + (size_t)past * h.action_dim, h.horizon - past, h.action_dim, chunk);
     return TSP_OK;
