@@ -5,7 +5,6 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import Compose, InitTracker, TransformedEnv
-from torchrl_sparse.blocks.recall import Recall
 
 from torchrl_sparse import (
     ActionAwareController,
@@ -26,8 +25,11 @@ from torchrl_sparse.envs.transforms import state_history
 from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
+from torchrl_sparse.policies.diffusion.realtime_chunking import RealtimeChunking
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.tokens.frame_difference import FrameDifferencePruner
 from torchrl_sparse.tokens.specprune import SpecPrune
+from torchrl_sparse.tokens.vla_cache import VLACachePruner
 
 SIZE = 28  # pixels
 SEEDS = ((0, 2), (1, 3))  # of two environments
@@ -120,10 +122,10 @@ def diffusion_policy(**parts):
     return policy
 
 
-def vision_policy():
+def vision_policy(pruner=None):
     torch.manual_seed(0)
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny(image_size=SIZE, state_dim=2, action_dim=1, chunk_size=4)))
-    policy.pruner = SpecPrune(budget=1, dynamic=False, look_back=2)
+    policy.pruner = pruner or SpecPrune(budget=1, dynamic=False, look_back=2)
     return Told(policy)
 
 
@@ -145,11 +147,13 @@ EXECUTORS = {
     "ensemble": lambda: ChunkExecutor(TemporalEnsemble(counting_policy(4), coeff=0.0), 2),
     "selector": lambda: ChunkExecutor(sampling_policy(), 3, num_samples=3, selector=CoherentChunk()),
     "warm start": lambda: ChunkExecutor(diffusion_policy(start=WarmStart(1)), 3),
-    "recall": lambda: ChunkExecutor(diffusion_policy(plan=Recall(2)), 3),
+    "guided": lambda: RealtimeExecutor(diffusion_policy(start=RealtimeChunking()), hold(), 3, latency=0.1),
     "ahead": lambda: RealtimeExecutor(RollForward(diffusion_policy(), state_model()), hold(), 3, latency=0.1),
     "tokens": lambda: ChunkExecutor(
         vision_policy(), 3, ActionAwareController(warmup_steps=2, coarse=1, fine=2)
     ),
+    "frame difference": lambda: ChunkExecutor(vision_policy(FrameDifferencePruner()), 3),
+    "vla cache": lambda: ChunkExecutor(vision_policy(VLACachePruner(threshold=-1.0)), 3),
 }
 
 

@@ -24,7 +24,10 @@ from torchrl_sparse import keys
 MAKERS = [partial(make_count_env, seeds) for seeds in SEEDS]
 BATCH, BATCHES = 22, 2  # 11 steps of each environment: no multiple of a chunk
 BY_RULE = {"chunks": expected_chunks, "realtime": expected_realtime, "ensemble": expected_ensemble}
-SENT = ("chunks", "realtime", "recall", "tokens")  # through collectors that start processes for each of them
+QUICK = ("chunks", "realtime", "tokens")
+SENT = [  # through collectors that start processes for each of them, half a minute of a core in all
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXECUTORS
+]
 ALIVE = []  # collectors, which close their environment as they are forgotten, even if told not to
 COMPARED = [keys.EPISODE_SEED, keys.EPISODE_STEP, keys.ACTION, keys.QUERIED]
 OPTIONS = {"frames_per_batch": BATCH, "auto_register_policy_transforms": True}

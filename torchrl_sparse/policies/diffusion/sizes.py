@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey
 
 from torchrl_sparse import keys
-from torchrl_sparse.carried import COUNT, Entry, carried_keys
+from torchrl_sparse.carried import Entry, carried_keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -55,12 +55,6 @@ class PolicySizes:
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
         """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
-        network, vision = self.network, self.vision
-        memory = (self.num_inference_steps, self.num_blocks, self.horizon, network.n_emb)
-        frames = (self.n_obs_steps, 0 if vision is None else vision.feature_dim)
-        known = {
-            keys.QUERY: COUNT,
-            keys.FEATURES: Entry(memory, network.pos_emb.dtype),
-            keys.FRAME_FEATURES: Entry(frames),
-        }
+        frames = (self.n_obs_steps, 0 if self.vision is None else self.vision.feature_dim)
+        known = {keys.FRAME_FEATURES: Entry(frames)}
         return {key: known[key] for key in carried_keys(self) if key in known}
