@@ -100,6 +100,11 @@ def is_kept(folder: Path) -> bool:
     return not any(folder.is_relative_to(ASSETS / results) for results in _WITHOUT_WEIGHTS)
 
 
+def is_removed(method: str) -> bool:
+    """Whether results and episodes are all that is left of a method."""
+    return _REMOVED.match(method) is not None
+
+
 def engines_of(folder: Path, method: str) -> tuple[str, ...]:
     """The engines that a method is asked in: not PyTorch's where it is much as another case is."""
     if method in _AS_DENSE or folder.name not in _IN_TORCH:
@@ -112,7 +117,7 @@ def shipped_methods(folder: Path) -> list[str]:
     tables = [*folder.rglob("results*.json"), *folder.glob("realtime.json")]
     tables = [table for table in tables if is_kept(table.parent) and policy_of(table.parent) == folder]
     named = {name for table in tables for name in json.loads(table.read_text(encoding="utf-8"))["methods"]}
-    named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name) and not _REMOVED.match(name)}
+    named = {name for name in named if not _EXECUTED_OR_ROUNDED.search(name) and not is_removed(name)}
     files = {path for path in folder.glob("*.json") if path.name != "config.json"} - {*tables}
     if is_vla(folder):
         return sorted(named | {path.name for path in files})
