@@ -29,7 +29,6 @@ constant                          shape, dtype           meaning
 ``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
-``REUSE``                         i64 [*B, 1]            the rule by which pruned blocks reuse, an index of ``REUSE_RULES``
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``START``                         f32 [*B, H, A]         normalised actions that a query begins from, if not from noise
 ``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
@@ -92,7 +91,6 @@ COND = ("diffusion", "cond")
 FRAME_FEATURES = ("diffusion", "frame_features")
 SEED = ("diffusion", "seed")
 PRUNE_MASK = ("diffusion", "prune_mask")
-REUSE = ("diffusion", "reuse")
 PRUNE_RATE = ("diffusion", "prune_rate")
 START = ("diffusion", "start")
 NUM_STEPS = ("diffusion", "num_steps")

@@ -7,9 +7,8 @@ from tensordict import TensorDict
 
 from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
 from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.mask import REUSE_RULES
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner, tensors_fingerprint
-from torchrl_sparse.keys import COND, PRUNE_MASK, REUSE
+from torchrl_sparse.keys import COND, PRUNE_MASK
 
 SPEC = PlanSpec(NUM_STEPS, NUM_LAYERS, policy="a policy")
 
@@ -71,16 +70,16 @@ def test_any_batch_shape_gives_each_observation_its_own_mask(planner, batch):
 
 def test_keys_are_declared():
     assert list(Dense().in_keys) == [COND]
-    assert list(RestAtRest(1.0).out_keys) == [PRUNE_MASK, REUSE]
+    assert list(RestAtRest(1.0).out_keys) == [PRUNE_MASK]
 
 
-def test_every_observation_gets_the_rule_of_the_planner():
+def test_a_reuse_that_is_no_rule_is_refused():
     planner = RestAtRest(1.0)
-    planner.bind(SPEC)
-    planner.reuse = "type"
-    rules = planner(observations(2, 3))[REUSE]
-    assert rules.shape == (2, 3, 1)
-    assert {REUSE_RULES[rule] for rule in rules.flatten()} == {"type"}
+    planner.reuse = "types"
+    with pytest.raises(
+        ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\], got 'types'"
+    ):
+        planner.bind(SPEC)
 
 
 def test_dense_prunes_nothing_and_its_rows_can_be_written_one_by_one():

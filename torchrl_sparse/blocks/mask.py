@@ -59,7 +59,7 @@ REUSED_COLOR = "#E9E9EC"
 """Of pruned blocks in figures."""
 
 Reuse = Literal["block", "type", "single"]
-REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)  # a TensorDict holds a rule as its index here
+REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)
 
 
 def block_name(column: int) -> str:
@@ -133,6 +133,7 @@ def num_buffers(reuse: Reuse, num_blocks: int) -> int:
     >>> num_buffers("type", num_blocks=24)
     3
     """
+    check_reuse(reuse)
     return {"block": num_blocks, "type": len(BLOCK_TYPES), "single": 1}[reuse]
 
 

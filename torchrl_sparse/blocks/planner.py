@@ -1,4 +1,4 @@
-"""Planners: TensorDict modules that write the prune mask of a query and its reuse rule, and nothing else.
+"""Planners: TensorDict modules that write the prune mask of a query and nothing else, and have one reuse rule.
 
 A planner of one's own subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
 does not) and writes one method; ``policy.plan = Mine()`` is all that using it takes. One that is kept in a file gets a
@@ -17,8 +17,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSE_RULES, MaskError, Reuse, check_form, validate_mask
-from torchrl_sparse.keys import COND, PRUNE_MASK, REUSE, read
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, MaskError, Reuse, check_form, check_reuse, validate_mask
+from torchrl_sparse.keys import COND, PRUNE_MASK, read
 
 __all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
 
@@ -67,14 +67,13 @@ class PlanSpec:
 class Planner(TensorDictModuleBase):
     """Base of everything that decides which blocks a query skips.
 
-    Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L] and
-    ``("diffusion", "reuse")`` i64 [*B, 1].
+    Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
     A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that was made for
     one policy sets ``made_for``. ``policy.plan = planner`` binds it.
 
     Attributes:
         reuse: what a pruned block reuses, ``"block"``, ``"type"`` or ``"single"`` (see
-            :mod:`torchrl_sparse.blocks.mask`); written for every observation.
+            :mod:`torchrl_sparse.blocks.mask`), of all observations.
         is_static: True where the mask does not depend on the observation.
         made_for: the only spec that it can be bound to; None serves every policy.
         rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
@@ -96,7 +95,7 @@ class Planner(TensorDictModuleBase):
     """
 
     in_keys = [COND]
-    out_keys = [PRUNE_MASK, REUSE]
+    out_keys = [PRUNE_MASK]
     reuse: Reuse = "block"
     is_static = False
     made_for: PlanSpec | None = None
@@ -124,8 +123,9 @@ class Planner(TensorDictModuleBase):
         """Prepare to serve ``spec``; a policy calls it when it is given the planner or another sampler.
 
         Raises:
-            ValueError: if the planner was made for another; it then stays as it was.
+            ValueError: if the planner was made for another, or its ``reuse`` is no rule; it then stays as it was.
         """
+        check_reuse(self.reuse)
         if self.made_for is not None:
             self.made_for.check_is(spec, type(self).__name__)
         self._prepare(spec)
@@ -148,7 +148,7 @@ class Planner(TensorDictModuleBase):
         return {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the mask and the reuse rule of every observation; the engine validates what the mask says.
+        """Write the mask of every observation; the engine validates what it says.
 
         Raises:
             RuntimeError: if the planner is not bound.
@@ -166,9 +166,7 @@ class Planner(TensorDictModuleBase):
             check_form(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
         except MaskError as error:
             raise ValueError(f"{type(self).__name__}.masks: {error}") from error
-        tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
-        rule = REUSE_RULES.index(self.reuse)
-        return tensordict.set(REUSE, torch.full((*batch, 1), rule, device=cond.device))
+        return tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
 
 
 def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:

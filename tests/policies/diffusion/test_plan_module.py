@@ -1,4 +1,7 @@
-"""The planner's part of a policy: any module that writes a mask and its reuse rule."""
+"""The planner's part of a policy: a mask, and the rule by which pruned blocks reuse."""
+
+import copy
+import pickle
 
 import pytest
 import torch
@@ -22,14 +25,15 @@ def half_pruned(policy, rows):
     return mask.repeat(rows, 1, 1)
 
 
-def plan_module(policy, rules):
-    """A module that prunes half of every row, row i under ``rules[i]``."""
+class HalfPruned(Planner):
+    """Prunes half of every row."""
 
-    def decide(cond):
-        codes = torch.tensor([[REUSE_RULES.index(rule)] for rule in rules])
-        return half_pruned(policy, len(cond)), codes
+    def __init__(self, policy, reuse):
+        super().__init__()
+        self.reuse, self.mask = reuse, half_pruned(policy, 1)
 
-    return TensorDictModule(decide, in_keys=[keys.COND], out_keys=[keys.PRUNE_MASK, keys.REUSE])
+    def masks(self, cond):
+        return self.mask.repeat(len(cond), 1, 1)
 
 
 def expected_chunk(policy, td, reuse):
@@ -38,40 +42,33 @@ def expected_chunk(policy, td, reuse):
     return policy.normalizer.unnormalize_action(actions[:, policy.n_obs_steps - 1 :])
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("rule", REUSE_RULES)
-def test_another_module_brings_its_own_rule(policy, rule):
-    policy.module["plan"] = plan_module(policy, [rule] * 3)
-    with torch.no_grad():
-        td = policy(request(3))
-        torch.testing.assert_close(td[keys.CHUNK], expected_chunk(policy, td, rule), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("engine", ["reference", "torch", "auto"])
-def test_rows_of_a_batch_may_have_different_rules(policy, engine):
-    policy.engine = engine
-    rules = ["type", "block", "single", "type", "block"]
-    policy.module["plan"] = plan_module(policy, rules)
-    with torch.no_grad():
-        td = policy(request(5))
-        for row, rule in enumerate(rules):
-            expected = expected_chunk(policy, td[row : row + 1], rule)
-            torch.testing.assert_close(td[keys.CHUNK][row : row + 1], expected, atol=1e-5, rtol=0)
-    assert (td[keys.CHUNK][0] - expected_chunk(policy, td, "block")[0]).abs().max() > 1e-3
+def test_a_query_reuses_by_the_rule_of_its_planner(policy, rule, engine):
+    policy.engine, policy.plan = engine, HalfPruned(policy, rule)
+    td = policy(request(3))
+    torch.testing.assert_close(td[keys.CHUNK], expected_chunk(policy, td, rule), atol=1e-5, rtol=0)
+    other = expected_chunk(policy, td, "type" if rule == "block" else "block")
+    assert (td[keys.CHUNK] - other).abs().max() > 1e-3
 
 
-def test_a_rule_that_is_none_or_missing_is_named(policy):
-    module = plan_module(policy, ["block"] * 2)
-    policy.module["plan"] = module
-    with pytest.raises(ValueError, match=r"\('diffusion', 'reuse'\): expected an index of .* got \[0, 3\]"):
-        policy.module["denoise"](
-            module(policy.module["encode"](request(2))).set(keys.REUSE, torch.tensor([[0], [3]]))
-        )
-    mask_alone = TensorDictModule(
-        lambda cond: half_pruned(policy, len(cond)), in_keys=[keys.COND], out_keys=[keys.PRUNE_MASK]
-    )
-    policy.module["plan"] = mask_alone
-    with pytest.raises(KeyError, match=r"expected the key \('diffusion', 'reuse'\), got"):
-        policy(request(2))
+@torch.no_grad()
+def test_a_rule_that_is_changed_counts_from_the_next_query_on_in_copies_too(policy):
+    policy.plan = HalfPruned(policy, "block")
+    policy(request(3))
+    policy.plan.reuse = "type"
+    twin = copy.deepcopy(policy)
+    for one in (policy, twin, pickle.loads(pickle.dumps(policy))):
+        td = one(request(3))
+        torch.testing.assert_close(td[keys.CHUNK], expected_chunk(policy, td, "type"), atol=1e-5, rtol=0)
+    twin.plan.reuse = "single"
+    td = twin(request(3))
+    torch.testing.assert_close(td[keys.CHUNK], expected_chunk(policy, td, "single"), atol=1e-5, rtol=0)
+    assert policy.plan.reuse == "type"
+    policy.plan.reuse = "types"
+    with pytest.raises(ValueError, match=r"reuse: expected one of .*, got 'types'"):
+        policy(request(3))
 
 
 def sag_pruner(policy):
@@ -115,9 +112,7 @@ def test_a_wrong_mask_is_named_with_its_planner(policy, engine):
     ):
         policy(request(2))
     wide = torch.zeros(2, policy.num_inference_steps, 99, dtype=torch.bool)
-    policy.module["plan"] = TensorDictModule(
-        lambda cond: (wide, torch.zeros(2, 1, dtype=torch.int64)), [keys.COND], [keys.PRUNE_MASK, keys.REUSE]
-    )
+    policy.module["plan"] = TensorDictModule(lambda cond: wide, [keys.COND], [keys.PRUNE_MASK])
     with pytest.raises(
         ValueError, match=r"^TensorDictModule: prune mask: expected shape \[2, 8, 6\].*\[2, 8, 99\]"
     ):

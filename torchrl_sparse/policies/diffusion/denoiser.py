@@ -11,7 +11,8 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.base import Engine
 from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot, check_engine
 from torchrl_sparse.blocks.engine.reference import denoise
-from torchrl_sparse.blocks.mask import REUSE_RULES, NetworkSizes, Reuse, mask_flops
+from torchrl_sparse.blocks.mask import NetworkSizes, Reuse, mask_flops
+from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.philox import philox_noise
@@ -40,6 +41,7 @@ class ActionDenoiser(TensorDictModuleBase):
         warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
         guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
         planning_flops: of the planner, which are counted with the loop's.
+        reuse: what a pruned block adds, as the planner that wrote the mask has it.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self.normalizer = normalizer
         self.warm = self.guided = False
         self.planning_flops = 0
+        self._plan: tuple[Planner, ...] = ()
         self._tails: dict[tuple, tuple[Sampler, EngineSlot]] = {}
         self.sampler = sampler
         self.engine = EngineSlot(engine)
@@ -62,7 +65,7 @@ class ActionDenoiser(TensorDictModuleBase):
 
     @property
     def in_keys(self):
-        own = [keys.COND, keys.SEED, keys.PRUNE_MASK, keys.REUSE]
+        own = [keys.COND, keys.SEED, keys.PRUNE_MASK]
         return [*own, *self._begin_keys(), *self._guide_keys()]
 
     def _begin_keys(self) -> list:
@@ -74,6 +77,16 @@ class ActionDenoiser(TensorDictModuleBase):
     @property
     def out_keys(self):
         return [keys.CHUNK, keys.FLOPS]
+
+    @property
+    def reuse(self) -> Reuse:
+        (plan,) = self._plan
+        return plan.reuse
+
+    def follow(self, plan: Planner) -> None:
+        """Take the reuse rule, and the FLOPs of deciding, of the planner that writes the masks from the next query on."""
+        self._plan = (plan,)  # in a tuple, since the planner is a stage of its own and no part of this one
+        self.planning_flops = plan.flops
 
     def choose(self, engine: EngineName) -> None:
         """Take another engine from the next query on; ValueError as `check_engine`."""
@@ -90,8 +103,8 @@ class ActionDenoiser(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.batch_size
-        wanted = [keys.COND, keys.PRUNE_MASK, keys.REUSE, *self._begin_keys()]
-        cond, mask, rules, *begin = (_flat(keys.read(tensordict, key), batch) for key in wanted)
+        wanted = [keys.COND, keys.PRUNE_MASK, *self._begin_keys()]
+        cond, mask, *begin = (_flat(keys.read(tensordict, key), batch) for key in wanted)
         guided = [_flat(keys.read(tensordict, key), batch).to(cond) for key in self._guide_keys()]
         shape = (self.network.horizon, self.network.input_dim)
         seed = tensordict.get(keys.SEED).reshape(-1)
@@ -99,7 +112,7 @@ class ActionDenoiser(TensorDictModuleBase):
         dtype = self.network.pos_emb.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
         guide = Guide(*guided) if guided else None
-        actions, flops = self._denoise(noise, cond, mask, rules.reshape(-1), guide, *begin)
+        actions, flops = self._denoise(noise, cond, mask, guide, *begin)
         chunk = self.normalizer.unnormalize_action(actions[:, self.network.n_obs_steps - 1 :])
         tensordict.set(keys.CHUNK, chunk.reshape(*batch, *chunk.shape[1:]))
         if self.planning_flops:
@@ -119,7 +132,6 @@ class ActionDenoiser(TensorDictModuleBase):
         noise: Tensor,
         cond: Tensor,
         mask: Tensor,
-        rules: Tensor,
         guide: Guide | None,
         start: Tensor | None = None,
         num_steps: Tensor | None = None,
@@ -128,7 +140,7 @@ class ActionDenoiser(TensorDictModuleBase):
         whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
         numbers = [whole] if num_steps is None else sorted(set(num_steps.flatten().tolist()))
         if numbers in ([], [whole]):
-            return self._follow_rules(noise, cond, mask, rules, guide), mask_flops(sizes, mask)
+            return self.run(noise, cond, mask, self.reuse, None, guide), mask_flops(sizes, mask)
         if not 1 <= numbers[0] <= numbers[-1] <= whole:
             raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
         actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
@@ -136,7 +148,7 @@ class ActionDenoiser(TensorDictModuleBase):
             rows = num_steps.flatten() == number
             part = self._last_steps(number, noise[rows], mask[rows], start[rows].to(noise))
             drawn = None if guide is None else guide.rows(rows)
-            actions[rows] = self._follow_rules(part[0], cond[rows], part[1], rules[rows], drawn, number)
+            actions[rows] = self.run(part[0], cond[rows], part[1], self.reuse, number, drawn)
             flops[rows] = mask_flops(sizes, part[1]).to(flops)
         return actions, flops
 
@@ -149,31 +161,6 @@ class ActionDenoiser(TensorDictModuleBase):
         noise[:, 0] = self.sampler.add_noise(start, noise[:, 0], timestep)
         mask[:, 0] = False
         return noise, mask
-
-    def _follow_rules(
-        self,
-        noise: Tensor,
-        cond: Tensor,
-        mask: Tensor,
-        rules: Tensor,
-        guide: Guide | None,
-        number: int | None = None,
-    ) -> Tensor:
-        """Denoise normalised actions, each row under the reuse rule of its own."""
-        codes = sorted(set(rules.tolist()))
-        if codes and not 0 <= codes[0] <= codes[-1] < len(REUSE_RULES):
-            raise ValueError(
-                f"{keys.REUSE}: expected an index of {list(REUSE_RULES)} for each row, got {codes}"
-            )
-        if len(codes) == 1:
-            return self.run(noise, cond, mask, REUSE_RULES[codes[0]], number, guide)
-        actions = torch.empty_like(noise[:, 0])
-        for code in codes:
-            rows = rules == code
-            drawn = None if guide is None else guide.rows(rows)
-            part = noise[rows], cond[rows], mask[rows]
-            actions[rows] = self.run(*part, REUSE_RULES[code], number, drawn)
-        return actions
 
     def run(
         self,

@@ -1,6 +1,6 @@
 """A diffusion policy as a TensorDict pipeline: encode the observations, plan what to skip, denoise a chunk of actions.
 
-The planner only writes ``("diffusion", "prune_mask")`` and ``("diffusion", "reuse")``; the denoiser only reads them. The
+The planner only writes ``("diffusion", "prune_mask")``; the denoiser only reads it, and the planner's reuse rule. The
 dense policy is the same pipeline with the `Dense` planner, so that every method is compared on one code path.
 """
 
@@ -146,7 +146,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         self.module["denoise"].sampler = sampler
         denoise = self.module["denoise"]
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
-        denoise.planning_flops = plan.flops
+        denoise.follow(plan)
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]

@@ -16,7 +16,6 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.packing import units
-from torchrl_sparse.blocks.mask import REUSE_RULES
 from torchrl_sparse.blocks.planner import Planner, StaticPlanner
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
@@ -59,7 +58,6 @@ def answer_directly(
     tensordict.set(keys.SEED, seed)
     masks = mask.expand(*batch, *mask.shape).clone(memory_format=torch.contiguous_format)
     tensordict.set(keys.PRUNE_MASK, masks)
-    tensordict.set(keys.REUSE, torch.full((*batch, 1), REUSE_RULES.index(plan.reuse)))
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), denoise.static_flops(mask)))
     tensordict.set(keys.CHUNK, chunk)
     engine.answer(packed, noise, cond, scales, mask, chunk, plan.reuse)
