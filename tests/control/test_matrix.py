@@ -51,13 +51,15 @@ def check(name, steps):
     return {seed for seed, _ in places}
 
 
-def collect(name, collector, **shutdown):
+def collect(name, collector, *, in_step=True, **shutdown):
+    """Collect some batches and compare them; environments that do not step together may come in any number."""
     ALIVE.append(collector)
     try:
         batches = [data.clone() for _, data in zip(range(BATCHES), collector, strict=False)]
     finally:
         collector.shutdown(**shutdown)
-    assert check(name, torch.cat([batch.reshape(-1).select(*COMPARED) for batch in batches])) == {0, 1, 2, 3}
+    seen = check(name, torch.cat([batch.reshape(-1).select(*COMPARED) for batch in batches]))
+    assert seen == {0, 1, 2, 3} if in_step else seen
 
 
 @pytest.mark.parametrize("name", BY_RULE)
@@ -98,14 +100,16 @@ def test_rollout(env, name):
 @pytest.mark.parametrize("name", EXECUTORS)
 def test_async_batched_collector(name):
     options = {"frames_per_batch": BATCH, "transport": "driver", "env_backend": "threading"}
-    collect(name, AsyncBatchedCollector(MAKERS, policy=EXECUTORS[name](), total_frames=-1, **options))
+    collector = AsyncBatchedCollector(MAKERS, policy=EXECUTORS[name](), total_frames=-1, **options)
+    collect(name, collector, in_step=False)
 
 
 @pytest.mark.usefixtures("forked_workers")
 @pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
 @pytest.mark.parametrize("name", SENT)
 def test_collectors_of_processes(kind, name):
-    collect(name, kind(MAKERS, EXECUTORS[name](), total_frames=-1, **OPTIONS))
+    collector = kind(MAKERS, EXECUTORS[name](), total_frames=-1, **OPTIONS)
+    collect(name, collector, in_step=kind is MultiSyncCollector)
 
 
 @pytest.mark.usefixtures("ray_cluster")  # skips without Ray

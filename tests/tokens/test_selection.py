@@ -14,7 +14,7 @@ from torchrl_sparse.tokens.selection import (
     scaled_layers,
 )
 
-SPEC = VisualSpec(32, (keys.IMAGE, keys.WRIST_IMAGE), (4, 4), 56)
+SPEC = VisualSpec(32, (keys.IMAGE, keys.WRIST_IMAGE), (4, 4), 56, 128)
 
 
 def chosen_one_by_one(score, count, among):

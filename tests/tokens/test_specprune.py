@@ -190,10 +190,10 @@ def test_release_prunes_after_the_first_layer_to_three_times_as_many():
 
 def test_published_depth_prunes_where_the_paper_does():
     pruner = SpecPrune()
-    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224, 4096))
     assert sorted(pruner.layers_scored(32)) == [0, 1, 5, 10, 15, 20]
     release = SpecPrune("release", dynamic=True)
-    release.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    release.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224, 4096))
     assert sorted(release.layers_scored(32)) == [0, 1, 5, 10, 15, 20, 25]
 
 
@@ -201,7 +201,7 @@ def test_published_depth_prunes_where_the_paper_does():
 def test_release_counts(budget, expected):
     """int(20 r), int(15 r) coarse and int(40 r^2), int(30 r^2) fine at r = 0.8."""
     pruner = SpecPrune("release")
-    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224))
+    pruner.bind(VisualSpec(32, SPEC.cameras, (16, 16), 224, 4096))
     td = query(1).set(keys.TOKEN_BUDGET, torch.tensor([[float(budget)]]))
     assert [count.item() for count in pruner._counts(td)] == expected
 
@@ -247,6 +247,6 @@ def test_mistakes_are_named():
     with pytest.raises(ValueError, match="keep_share: expected more than 0 and at most 1, got 0"):
         SpecPrune(keep_share=0)
     with pytest.raises(ValueError, match="expected more than 2 layers, got 2"):
-        SpecPrune().bind(VisualSpec(2, SPEC.cameras, (16, 16), 224))
+        SpecPrune().bind(VisualSpec(2, SPEC.cameras, (16, 16), 224, 4096))
     with pytest.raises(TypeError, match="beta_"):
         SpecPrune(beta_=0.1)

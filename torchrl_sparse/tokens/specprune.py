@@ -192,7 +192,7 @@ class SpecPrune(TokenPruner):
 
     Examples:
         >>> pruner = SpecPrune(alpha=0.5)
-        >>> pruner.bind(VisualSpec(32, (keys.IMAGE, keys.WRIST_IMAGE), (16, 16), 224))
+        >>> pruner.bind(VisualSpec(32, (keys.IMAGE, keys.WRIST_IMAGE), (16, 16), 224, 4096))
         >>> sorted(pruner.layers_scored(32))
         [0, 1, 5, 10, 15, 20]
     """

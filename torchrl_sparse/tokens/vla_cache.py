@@ -113,7 +113,9 @@ class VLACachePruner(TokenPruner):
         self._task_layer = round(_TASK_LAYER * spec.num_layers / _DEPTH)
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        return {**super().carried(chunk), REUSE_SHARE: Entry((self.spec.num_layers,))}
+        layers = self.spec.num_layers
+        cache = Entry((layers, self.spec.num_visual, self.spec.width))
+        return {**super().carried(chunk), REUSE_SHARE: Entry((layers,)), CACHE: cache}
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return set(range(num_layers))

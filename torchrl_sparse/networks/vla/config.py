@@ -180,7 +180,7 @@ class VLAConfig:
     @property
     def visual_spec(self) -> VisualSpec:
         """The sizes that decide which visual tokens there are."""
-        return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size)
+        return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size, self.llm.dim)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as JSON values, which `from_dict` reads."""

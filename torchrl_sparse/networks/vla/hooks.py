@@ -49,9 +49,10 @@ class VisualSpec:
         cameras: keys of the images, in the order of their tokens.
         grid: rows and columns of patches of one image.
         image_size: height and width of an image in pixels.
+        width: numbers of a token in the decoder, d.
 
     Examples:
-        >>> spec = VisualSpec(32, (("observation", "image"), ("observation", "wrist_image")), (16, 16), 224)
+        >>> spec = VisualSpec(32, (("observation", "image"), ("observation", "wrist_image")), (16, 16), 224, 4096)
         >>> spec.per_camera, spec.num_visual, [view.start for view in spec.views]
         (256, 512, [0, 256])
     """
@@ -60,6 +61,7 @@ class VisualSpec:
     cameras: tuple[NestedKey, ...]
     grid: tuple[int, int]
     image_size: int
+    width: int
 
     @property
     def per_camera(self) -> int:
