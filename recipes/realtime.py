@@ -23,6 +23,7 @@ from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.contract import policy_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
+from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods, time_methods
 from torchrl_sparse.evaluation.benchmarks.late import evaluate_late
@@ -71,13 +72,18 @@ def main(config: DictConfig) -> None:
 
     horizon, margins = episode_horizon(make_env, seeds), (config.margin, config.time_margin)
     terms = Terms(Design(len(seeds)), horizon, task.early_cut, *margins)
-    shared = {name: config[name] for name in ("control_freq", "out", "num_envs", "workers", "backend")}
+    shared = {name: config[name] for name in ("out", "num_envs", "workers", "backend")}
     settings = {name: config[name] for name in ("task", "horizon", "n_action_steps")}
-    shared |= {"model": model, "settings": settings, "policy_device": config.device}
+    shared |= {
+        "control_freq": CONTROL_FREQ,
+        "model": model,
+        "settings": settings,
+        "policy_device": config.device,
+    }
     runs = {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all runs
         for name, method in methods.items():
-            delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), config.control_freq)
+            delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), CONTROL_FREQ)
             episodes = {
                 steps: evaluate_late(name, method, steps, make_env, seeds, **shared)
                 for steps in delays.unique().tolist()
@@ -88,7 +94,7 @@ def main(config: DictConfig) -> None:
         task=task.name,
         split=config.split,
         seed=config.seed,
-        control_freq=config.control_freq,
+        control_freq=CONTROL_FREQ,
         n_action_steps=config.n_action_steps,
         machine=describe_machine(config.device, config.threads),
         terms=terms,

@@ -107,6 +107,7 @@ def _at_step(query: TensorDict, seed: int, step: int) -> TensorDict:
     query.set(keys.EPISODE_SEED, torch.tensor([seed]))
     query.set(keys.EPISODE_STEP, torch.tensor([step]))
     query.set(keys.IS_INIT, torch.tensor([step == 0]))
+    query.set(keys.AGE, torch.tensor([-1]))  # nothing was asked before
     return query.set(keys.CONTROL_STEP, torch.tensor([step - 1]))
 
 

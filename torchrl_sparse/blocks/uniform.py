@@ -50,7 +50,7 @@ class Uniform(StaticPlanner):
     """
 
     def __init__(self, interval: int, *, last: bool = False) -> None:
-        if not isinstance(interval, int) or interval < 1:
+        if type(interval) is not int or interval < 1:
             raise ValueError(f"interval: expected a whole number >= 1, got {interval!r}")
         super().__init__()
         self.interval, self.last = interval, last

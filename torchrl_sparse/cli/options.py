@@ -46,8 +46,10 @@ OPTIONS: dict[str, Any] = {
     "task": Word,
     "policy": Word,
     **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy", "collect_demos.policy"), Word | None),
-    "heads": Annotated[list[Count], Field(min_length=3, max_length=3)],
-    **dict.fromkeys(("planners", "schedule"), Word),
+    "heads": Annotated[list[Count], Field(min_length=3, max_length=3)] | None,
+    "published": Section,
+    "poses": bool,
+    "planners": Word,
     "demos": Word | None,
     **dict.fromkeys(("train_policy.demos", "train_vla.demos"), Paths),
     "out": Word,
@@ -88,7 +90,6 @@ OPTIONS: dict[str, Any] = {
     "eta": Annotated[float, Field(ge=0, le=1)],
     "spacings": Words,
     "samplers": Words,
-    "draws": Annotated[int, Field(ge=3)],
     "sampler": Section | None,
     "profile_query.sampler": Word,
     **dict.fromkeys(("base", "equal_to", "calibrate_bac.sampler"), Word | None),
@@ -115,7 +116,6 @@ OPTIONS: dict[str, Any] = {
     "horizon": Count | None,
     "steps": Count,
     "n_action_steps": Count | None,
-    "control_freq": Positive,
     "latencies": list[NotNegative],  # none: each method at its own
     "num_envs": Count,
     "workers": Count,
@@ -160,7 +160,7 @@ OPTIONS: dict[str, Any] = {
     "targets": Section,
     "share": Share,
     "source": Word,
-    **dict.fromkeys(("rollouts", "attempts"), Whole),
+    "rollouts": Whole,
     "grounding": Section,
     "locate_steps": Whole,
     "refer_steps": Whole,
@@ -218,7 +218,7 @@ OPTIONS: dict[str, Any] = {
 }
 """Option, of one recipe alone after its name and a dot -> type. Of nested options the last word counts."""
 
-OPEN_SECTIONS = ("specprune", "options", "controller", "train_vla.network")
+OPEN_SECTIONS = ("specprune", "options", "controller", "published", "train_vla.network")
 """Sections whose entries are those of a dataclass of the library, which checks them."""
 
 

@@ -24,7 +24,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from torchrl_sparse.data.controller_settings import CONTROL_FREQ
 from torchrl_sparse.data.hdf5_files import new_hdf5
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import (
@@ -39,6 +38,7 @@ from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
 from torchrl_sparse.data.recorded_poses import REACH, TURN, check_poses, steps_out_of_reach
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import POSE_DIM
 

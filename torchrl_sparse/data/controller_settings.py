@@ -13,10 +13,9 @@ import reprlib
 from collections.abc import Collection, Mapping
 from typing import Any
 
-__all__ = ["CONTROL_FREQ", "Choice", "arm_settings", "check_entries", "check_env_kwargs", "six_numbers"]
+from torchrl_sparse.envs.simulator import CONTROL_FREQ
 
-CONTROL_FREQ = 20
-"""Actions a second in this library's environments."""
+__all__ = ["Choice", "arm_settings", "check_entries", "check_env_kwargs", "six_numbers"]
 
 Choice = Collection[Any] | None
 """The values that an entry may have; None where it is read elsewhere or no value changes what an action or a step means."""

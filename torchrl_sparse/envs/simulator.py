@@ -17,6 +17,9 @@ import numpy as np
 
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
+CONTROL_FREQ = 20
+"""Actions a second of every robosuite environment here: 50 ms of physics pass between two of them."""
+
 # One thread loads robots at a time: a method of their class is replaced meanwhile, and another would put back the replacement.
 _LOADING = threading.Lock()
 

@@ -8,9 +8,11 @@ No simulator is needed: demonstrations are asked many times, with noise that is 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from omegaconf import DictConfig
+from pydantic import Field
 from tqdm import tqdm
 
 from recipes.studies.carried_noise.chains import carried_noise
@@ -23,8 +25,11 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
+OPTIONS = {"draws": Annotated[int, Field(ge=3)]}
+"""Options that no recipe of the library has -> type."""
 
-@recipe("carried_noise")
+
+@recipe("carried_noise", options=OPTIONS)
 def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)

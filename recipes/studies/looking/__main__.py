@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from omegaconf import DictConfig
+from pydantic import Field
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
@@ -35,6 +36,7 @@ from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import published_shape
 
 OPTIONS = {
+    "draws": Annotated[int, Field(ge=3)],
     "looking.sampler": Word | None,
     "looking.pruner": Word | None,
     "played": Literal["pruned", "dense"],

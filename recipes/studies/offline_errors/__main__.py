@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from omegaconf import DictConfig
+from pydantic import Field
 from tqdm import tqdm
 
 from recipes.studies.offline_errors.agreement import agreement_of, save_agreement, together_rows
@@ -42,7 +43,7 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 
-OPTIONS = {"results": Words, "aggregate": list[Word]}
+OPTIONS = {"draws": Annotated[int, Field(ge=3)], "results": Words, "aggregate": list[Word]}
 """Options that no recipe of the library has -> type."""
 
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from math import ceil
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 from tqdm import tqdm
 
 from torchrl_sparse.cli.options import Between, Count, Positive, Section
@@ -41,6 +42,7 @@ NAME = "searched"
 
 
 OPTIONS = {
+    "draws": Annotated[int, Field(ge=3)],
     "held_out": Between,
     "lengths": list[Count],
     "budget": Positive,

@@ -16,7 +16,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.envs.experts.disturbance import Disturbance, next_noise
 from torchrl_sparse.envs.experts.operators import OPERATORS, draw_operator
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.simulator import controller_config, import_robosuite
+from torchrl_sparse.envs.simulator import CONTROL_FREQ, controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask, StateTask
 from torchrl_sparse.rotations import absolute_to_pose, pose_to_absolute
 
@@ -108,7 +108,7 @@ class RobosuiteDemonstrator:
             "env_kwargs": {
                 "robots": ["Panda"] * task.arms,
                 "controller_configs": controller_config(absolute=True),
-                "control_freq": 20,
+                "control_freq": CONTROL_FREQ,
                 "has_renderer": False,
                 "has_offscreen_renderer": False,
                 "use_camera_obs": False,
