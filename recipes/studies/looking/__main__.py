@@ -41,7 +41,7 @@ OPTIONS = {
     "looking.pruner": Word | None,
     "played": Literal["pruned", "dense"],
     "oracle": Section,
-    "oracle.attempts": Whole,
+    "attempts": Whole,
 }
 """Options that no recipe of the library has -> type."""
 
