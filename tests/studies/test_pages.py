@@ -134,8 +134,9 @@ def test_pairs_count_the_episodes_beside_the_results(root):
         for index, success in enumerate([*outcomes, False]):  # the last is not of these results
             log.append(EpisodeResult(100_000 + index, success, 30, 4, 1e9, 0.0))
     heading, row = table('results.json pairs="bac : ddim10"', root)
-    assert heading == ["method", "against", "success", "difference, points", "verdict"]
+    assert heading == ["method", "against", "success", "difference, points", "verdict", "McNemar's p"]
     assert row[:3] == ["bac", "ddim10", "20 : 15"]
+    assert row[-1] == "0.062"  # five of five
 
 
 def test_a_row_counts_as_many_episodes_as_its_results_say_whatever_its_log_has():

@@ -44,7 +44,7 @@ def test_build_computes_what_the_schema_promises():
     results = build({"dense": dense, "fast": fast}, margin=0.1)
     entry = results.methods["fast"]
     assert entry.success == Success(k=10, n=20, rate=0.5, ci95=wilson_interval(10, 20))
-    assert entry.paired_vs_dense == Difference(-0.25, tango_interval(0, 5, 20), 0.1, "undecided")
+    assert entry.paired_vs_dense == Difference(-0.25, tango_interval(0, 5, 20), 0.1, "undecided", 0.0625)
     assert entry.flops == Flops(per_query=2.0, ratio_to_dense=0.2)
     assert entry.latency_s == Percentiles(0.25, 0.25, 5)
     assert entry.speedup_vs_dense == 4.0

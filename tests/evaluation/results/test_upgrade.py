@@ -15,7 +15,7 @@ from torchrl_sparse.evaluation.results.aggregate import (
     save_aggregate,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
-from torchrl_sparse.evaluation.results.parts import Difference, TimeDifference
+from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
@@ -117,16 +117,16 @@ def test_tasks_are_put_together_for_the_methods_that_all_have(tasks, tmp_path):
 def test_verdicts_over_tasks_that_do_not_survive_a_correction_for_all_are_marked(tasks):
     entry = aggregate_results(tasks).methods["bac"]
 
-    def judged(half):
+    def judged(half, p):
         """Two points below dense, give or take half an interval, at twice its time."""
         success = Difference(-0.02, (-0.02 - half, -0.02 + half), 0.05, "non-inferior")
         time = TimeDifference(2.0, (1.8, 2.2), 0.1, "inferior")
-        return replace(entry, paired_vs_dense=success, time_vs_dense=time)
+        return replace(entry, paired_vs_dense=success, time_vs_dense=time, p_values=PValues(p, 1e-6))
 
-    barely, clearly = judged(0.0299), judged(0.01)
-    results = AggregateResults(1, ("Lift", "Can"), "test", {"barely": barely, "clearly": clearly})
+    barely, clearly = judged(0.0299, 0.0246), judged(0.01, 1e-6)
+    results = AggregateResults(2, ("Lift", "Can"), "test", {"barely": barely, "clearly": clearly})
     rows = {row["method"]: row for row in aggregate_rows(results)}
-    # 1.97 standard errors from the margin: p = .0246, which the last of four may have, but none of three that are left.
+    # p = .0246 the last of four may have, but none of three that are left.
     assert rows["barely"]["verdict"] == "non-inferior"
     assert rows["clearly"]["verdict"] == "non-inferior, worse"
     several = {f"barely {index}": barely for index in range(2)}
@@ -134,6 +134,28 @@ def test_verdicts_over_tasks_that_do_not_survive_a_correction_for_all_are_marked
     marked = {row["method"] for row in rows if row["verdict"].endswith("†")}
     assert marked == {"barely", *several}
     assert {row["time verdict"] for row in rows} == {"inferior"}
+
+
+def test_what_says_nothing_over_tasks_is_named(tasks):
+    """Margins that differ, a log that lacks episodes, and a task in which dense solved none; pairs are never dropped."""
+    path, results = tasks[1], load_results(tasks[1])
+    log = path.parent / "episodes" / "bac.jsonl"
+    kept = log.read_text()
+    log.write_text("".join(kept.splitlines(keepends=True)[:-1]))
+    with pytest.raises(
+        ValueError, match=r"expected the 100 episodes from seed .* that results.json counts, got 99"
+    ):
+        aggregate_results(tasks)
+    log.write_text(kept)
+    dense = results.dense
+    wider = replace(dense, paired_vs_dense=replace(dense.paired_vs_dense, margin=0.1))
+    save_results(replace(results, methods=results.methods | {"dense": wider}), path)
+    with pytest.raises(ValueError, match="aggregate: expected the same margins in all files"):
+        aggregate_results(tasks)
+    nothing = replace(dense, success=Success.of([False] * 100))
+    save_results(replace(results, methods=results.methods | {"dense": nothing}), path)
+    with pytest.raises(ValueError, match="Dense solved none"):
+        aggregate_results(tasks)
 
 
 def test_what_cannot_be_put_together_is_named(tasks):

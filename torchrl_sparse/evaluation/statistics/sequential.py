@@ -96,9 +96,9 @@ class Design:
         """
         if z <= 0:
             return 0.5
+        z = min(z, _LARGEST_Z)
         if self.looks == 1:
             return float(ndtr(-z))
-        z = min(z, _LARGEST_Z)
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))
 
