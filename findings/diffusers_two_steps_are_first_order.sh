@@ -9,7 +9,7 @@
 # Hurts: comparisons of solvers at the few steps that robots can afford; a table then has the same method twice, and
 #   "the higher order brings nothing" is no result.
 # Live with it: compare orders at three steps and more (3 against 2 at five), or say that it is DDIM.
-# torchrl_sparse: its `dpmpp2m` makes the same first-order last step; at two steps it is `ddim` on the same timesteps.
+# torchrl_sparse: the same holds of its `dpmpp2m`; in two steps it differs from `ddim` only where a prediction is clipped.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT
