@@ -4,11 +4,11 @@
 # Versions: torch 2.13.0 (`torch.utils.flop_counter`).
 # Guess: a Transformer encoder layer has the same FLOPs in training and in evaluation.
 # What happens: in `eval()` under `no_grad`, layer and attention run as one fused operator that the counter has no formula
-#   for. It reports 1,966,080 FLOPs in training, 1,966,080 in evaluation with gradients, and 0 in evaluation without.
-#   `MultiheadAttention` alone: 655,360 and 0. A decoder layer loses its two attentions' share, 2,621,440 and 1,966,080: its
-#   self-attention counts nothing while its other parts still do, so the number looks plausible.
+#   for: 0 FLOPs. In training it finds 2,017,280, which is right; in evaluation with gradients 1,966,080, since attention's own
+#   products are then a fused operator too. A decoder layer counts 2,723,840, 2,621,440 and 1,966,080: less each time, and
+#   still a plausible number.
 # Hurts: every table "FLOPs of the policy at inference", and ratios of pruned to dense that are taken this way.
-# Live with it: count with gradients enabled, or disable the path (`torch.backends.mha.set_fastpath_enabled(False)`).
+# Live with it: count in training mode (with dropout, as by default), or by hand.
 # torchrl_sparse: right; it counts by formulas of its own (`blocks/engine/costs.py`), never by this counter.
 set -eu
 dir=$(mktemp -d)
@@ -39,11 +39,10 @@ found = {}
 for name, (module, call) in cases.items():
     found[name] = [flops(module, call, *mode) for mode in ((True, True), (False, True), (False, False))]
     print(f"{name:14} training {found[name][0]:>9}, eval {found[name][1]:>9}, eval without gradients {found[name][2]:>9}")
-assert all(first == second for first, second, _ in found.values())
-assert found["encoder layer"][2] == 0 and found["attention"][2] == 0
-assert 0 < found["decoder layer"][2] < found["decoder layer"][0]
-torch.backends.mha.set_fastpath_enabled(False)
-module, call = cases["encoder layer"]
-assert flops(module, call, False, False) == found["encoder layer"][0]
-print("with the path disabled: as in training")
+assert found["encoder layer"] == [2017280, 1966080, 0]
+assert found["attention"][2] == 0
+assert found["decoder layer"] == [2723840, 2621440, 1966080]
+by_hand = 2 * 2 * (4 * 10 * 64 * 64 + 2 * 10 * 10 * 64 + 2 * 10 * 64 * 256)  # rows, projections, attention, feed-forward
+print("encoder layer by hand:", by_hand)
+assert by_hand == found["encoder layer"][0]
 EOF
