@@ -7,7 +7,7 @@
 #   0.03333. At 60 Hz it is 62.5; 20 Hz is exact. After ten steps at 30 Hz clock and physics are 13 ms apart.
 # Hurts: data recorded at 30 Hz, a usual rate of cameras, replayed with true times: velocities are off by 4 %.
 # Live with it: take a rate that divides 500 (20, 25, 50), and read `sim.data.time`.
-# torchrl_sparse: tasks run at 20 Hz; a rate that no whole number of physics steps makes has to be refused or rounded aloud.
+# torchrl_sparse: its tasks run at 20 Hz, which is exact.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT

@@ -10,7 +10,7 @@
 # Hurts: block caches and pruning that are plugged in from outside: tests in training mode pass, and at inference the method
 #   silently is the dense model, with dense results and no speed-up.
 # Live with it: count the calls, in evaluation; or `torch.backends.mha.set_fastpath_enabled(False)`.
-# torchrl_sparse: right; its planners never patch modules: a mask is a key, and the engine that reads it owns every block.
+# torchrl_sparse: right; planners of diffusion policies patch no modules: a mask is a key, and its engine owns every block.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT
