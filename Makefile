@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs install sanitize torture
+.PHONY: demo test lint docs install sanitize torture findings
 
 install: $(VENV)/.installed
 
@@ -49,3 +49,10 @@ sanitize: install build/sanitize/native.so
 MINUTES ?= 30
 torture: install build/sanitize/native.so
 	$(BIN)/python -m tests.torture minutes=$(MINUTES)
+
+# Behaviours of public packages, each tried without this project, see findings/README.md. Installs what each one pins.
+findings:
+	@changed=; for finding in findings/*.sh; do \
+		if PYTHON=$(PYTHON) bash $$finding > /dev/null 2>&1; then echo "as described  $$finding"; \
+		else echo "CHANGED       $$finding"; changed="$$changed $$finding"; fi; done; \
+	if [ -n "$$changed" ]; then echo "behaviour changed, or could not be run:$$changed"; exit 1; fi
