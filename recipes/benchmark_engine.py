@@ -93,7 +93,8 @@ def run_case(name: str, entry: DictConfig, config: DictConfig) -> EngineShape:
 
 def image_parts(case: EngineCase, quick: bool, repeats: int) -> dict[str, dict[str, float]]:
     """Time whole queries of an image policy, dense and of few steps."""
-    policy, seconds = image_policy(case.network, width=16 if quick else 64), {}
+    policy = image_policy(case.network, width=16 if quick else 64, sampler=case.queries["dense"].sampler)
+    seconds = {}
     for kind in ("dense", "ddim10", "ddim2"):
         policy.sampler = case.queries[kind].sampler
         seconds[kind] = image_query_seconds(policy, image_query(policy, case.batch), repeats)

@@ -74,18 +74,15 @@ def main(config: DictConfig) -> None:
     terms = Terms(Design(len(seeds)), horizon, task.early_cut, *margins)
     shared = {name: config[name] for name in ("out", "num_envs", "workers", "backend")}
     settings = {name: config[name] for name in ("task", "horizon", "n_action_steps")}
-    shared |= {
-        "control_freq": CONTROL_FREQ,
-        "model": model,
-        "settings": settings,
-        "policy_device": config.device,
-    }
+    shared |= {"model": model, "settings": settings, "policy_device": config.device}
     runs = {}
     with backend_runtime(config.backend, config.workers):  # one Ray for all runs
         for name, method in methods.items():
             delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), CONTROL_FREQ)
             episodes = {
-                steps: evaluate_late(name, method, steps, make_env, seeds, **shared)
+                steps: evaluate_late(
+                    name, method, steps, make_env, seeds, control_freq=CONTROL_FREQ, **shared
+                )
                 for steps in delays.unique().tolist()
             }
             runs[name] = RealtimeRun(latency[name].p50, episodes)

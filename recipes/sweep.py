@@ -11,27 +11,19 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 from omegaconf import DictConfig
 
-from torchrl_sparse.cli.recipe import check_command, recipe
+from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.cli.trials import check_served, check_trials
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.results.sweep_files import (
-    find_program,
-    parameter_sets,
-    read_sweep,
-    trial_command,
-)
+from torchrl_sparse.evaluation.results.sweep_files import find_program, read_sweep
 from torchrl_sparse.evaluation.results.sweeps import (
     LocalSweep,
     ServedSweep,
-    Trial,
     merge_trials,
     run_trial,
     write_trials,
@@ -70,42 +62,6 @@ def find_sweep(name: str) -> Path:
     if path is None or not path.is_file():
         raise FileNotFoundError(f"sweep: expected one of {', '.join(known)} or a yaml file, got {name!r}")
     return path
-
-
-def check_trials(file: Path, settings: Mapping[str, Any]) -> None:
-    """Read every trial's command line as its recipe will, before the first one runs.
-
-    Raises:
-        ValueError: naming file, trial and option.
-    """
-    program = find_program(settings["program"])
-    with patch.dict(os.environ, WANDB_RUN_ID="trial"):  # which options may refer to
-        _check_trials(file, settings, program)
-
-
-def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> None:
-    for parameters in parameter_sets(settings):
-        words = trial_command(settings, parameters)
-        options = words[words.index(str(program)) + 1 :] if str(program) in words else []
-        try:
-            check_command(program, options)
-        except ValueError as error:
-            raise ValueError(f"{file}: trial {Trial('', dict(parameters)).label}: {error}") from error
-
-
-def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
-    """Refuse what W&B's own agent hands to a trial in words that Hydra does not read, or to another project."""
-    for name, entry in settings["parameters"].items():
-        values = (
-            [entry.get("value"), *entry.get("values", ())] if "value" in entry else entry.get("values", ())
-        )
-        if "parameters" in entry or any(value is None or isinstance(value, dict) for value in values):
-            raise ValueError(
-                f"{file}: {name}: expected numbers, words or lists with mode=online, whose agent writes null and mappings "
-                f"as Hydra does not read them, got {entry!r}"
-            )
-    if settings.get("project", project) != project:
-        raise ValueError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
 
 
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:

@@ -20,7 +20,6 @@ from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.contract import continued_source, policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
@@ -68,29 +67,24 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     else:
         policy = begun
     trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
-    print(
-        f"{config.demos}: {len(demos)} demonstrations, {len(demos.data)} steps, "
-        f"{len(trainer.train_rows)} training windows; "
-        f"{sum(p.numel() for p in policy.network.parameters()):,} parameters"
-    )
+    size = sum(p.numel() for p in policy.network.parameters())
+    data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"
+    print(f"{config.demos}: {data}; {size:,} parameters")
     return trainer
 
 
 def begun_policy(config: DictConfig) -> DiffusionPolicy:
     """Read the policy of ``init``, whose ``source`` then says that it is trained for this task."""
-    policy, cameras = (
-        DiffusionPolicy.from_pretrained(config.init, engine="reference"),
-        chosen_cameras(config.cameras),
-    )
-    if policy.vision is not None and "cameras" not in policy.source:
-        policy.source = policy.source | {"cameras": cameras}
+    policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
+    cameras = chosen_cameras(config.cameras)
+    if policy.vision is not None:
+        policy.source = {"cameras": cameras} | policy.source
     policy.source = continued_source(config.task, policy)
     own = policy_contract(config.task, policy).cameras
     for name, key in cameras.items():
         if own.get(name) != key:
-            raise ValueError(
-                f"cameras.{name}: expected {own.get(name)}, as of the policy in {config.init}, got {key}"
-            )
+            expected = f"{own.get(name)}, as of the policy in {config.init}"
+            raise ValueError(f"cameras.{name}: expected {expected}, got {key}")
     return policy
 
 
@@ -110,7 +104,7 @@ def closed_loop_success(trainer: PolicyTrainer, config: DictConfig) -> float | N
 
     policy = trainer.ema_policy()
     if config.eval_ddim_steps:
-        policy.sampler = Sampler("ddim", config.eval_ddim_steps, policy.sampler.num_train_timesteps)
+        policy.sampler = policy.sampler.variant("ddim", config.eval_ddim_steps)
     episodes = evaluate(
         "dense",
         ChunkExecutor(policy, trainer.config.n_action_steps),

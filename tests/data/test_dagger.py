@@ -1,7 +1,6 @@
 """DAgger: who drives which steps, what is learned from an episode, what is dropped, and resumption."""
 
 import pickle
-from dataclasses import replace
 from functools import partial
 
 import h5py
@@ -13,13 +12,13 @@ from torchrl.data import Unbounded
 from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401  a fixture
 from torchrl_sparse import DiffusionPolicy, keys
 from torchrl_sparse.data import demos
-from torchrl_sparse.data.dagger import Driver, Driving, load_driver
+from torchrl_sparse.data.dagger import Driver, Driving
 from torchrl_sparse.data.demonstrate import demonstrate
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.robomimic import join_demos, read_demos
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.seeded import SeededEnv
-from torchrl_sparse.envs.tasks import TASKS, StateTask, find_task
+from torchrl_sparse.envs.tasks import TASKS, StateTask
 from torchrl_sparse.rotations import pose_to_absolute
 
 PIT = -0.4  # beyond which nobody gets out
@@ -277,35 +276,3 @@ def test_a_policy_that_cannot_drive_is_refused_before_anything_is_written(
     with pytest.raises((ValueError, OSError), match=message):
         collect(tmp_path / "a.h5", Collection(task, episodes=1, driving=wrong))
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_policy_of_another_convention_drives_as_it_would_in_its_own_environment(driving, monkeypatch):
-    """The same function of the same world, with the vector to the cube as robosuite 1.4 observed it."""
-    read = DiffusionPolicy.from_pretrained
-
-    def imported(path):
-        policy = read(path, engine="reference")
-        with torch.no_grad():
-            policy.network.cond_obs_emb.weight[:, 7:10] *= -1
-        policy.normalizer.state_offset[7:10] *= -1
-        policy.source = {"weights": "ema_model"}
-        return policy
-
-    task, env = find_task("Lift"), RobosuiteEnv("Lift")
-    own = demonstrate(task, env, 300, driver=load_driver("Lift", driving))
-    monkeypatch.setattr(DiffusionPolicy, "from_pretrained", imported)
-    old = replace(driving, fingerprint=imported("assets/lift").fingerprint)
-    episode = demonstrate(task, env, 300, driver=load_driver("Lift", old))
-    env.close()
-    assert episode.driven == own.driven > 0
-    np.testing.assert_allclose(
-        episode.executed_actions[: own.driven], own.executed_actions[: own.driven], atol=1e-4
-    )
-    np.testing.assert_array_equal(episode.observations["object"][0], own.observations["object"][0])
-
-
-def test_a_policy_with_cameras_cannot_drive(driving, monkeypatch, make_image_policy):  # noqa: F811
-    seeing = make_image_policy()
-    monkeypatch.setattr(DiffusionPolicy, "from_pretrained", lambda path: seeing)
-    with pytest.raises(ValueError, match="policy: expected one that observes states, got one with cameras"):
-        load_driver("Lift", replace(driving, fingerprint=seeing.fingerprint))

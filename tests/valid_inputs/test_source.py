@@ -8,8 +8,8 @@ import hydra
 import numpy as np
 import pytest
 import torch
-from torchrl_sparse.evaluation.statistics.carried_noise import carried_noise
 
+from recipes.studies.carried_noise.chains import carried_noise
 from tests.data.published_demos import env_args_14, env_args_15
 from tests.evaluation.accelerate.small import GRID, ask, fixed_times
 from tests.recipe_modules import RECIPES, load_recipe

@@ -9,7 +9,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from tests.evaluation.results.test_sweeps import finish
-from tests.recipe_modules import load_recipe
+from torchrl_sparse.cli.trials import check_served, check_trials
 from torchrl_sparse.evaluation.results.sweep_files import parameter_sets, read_sweep, trial_command
 from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial, run_trial
 from torchrl_sparse.runtime.failure import RunFailed
@@ -73,24 +73,23 @@ def test_a_quantised_draw_is_a_plain_whole_number(write, tmp_path, parameter):
 
 def test_every_trial_is_read_before_the_first(write):
     """A sweep whose last value no trial can read would fail after hours."""
-    check = load_recipe("sweep").check_trials
     grid = write({"num_updates": {"values": [10, 5]}, "horizon": {"values": [None, 60]}})
-    check(grid, read_sweep(grid))
+    check_trials(grid, read_sweep(grid))
     late = write({"num_updates": {"values": [10, 5, 0]}})
     with pytest.raises(ValueError, match=r"sweep.yaml: trial num_updates=0: num_updates: expected greater"):
-        check(late, read_sweep(late))
+        check_trials(late, read_sweep(late))
     unknown = write({"num_upates": {"values": [10]}})
     with pytest.raises(
         ValueError, match=r"trial num_upates=10: num_upates: expected an option of this recipe"
     ):
-        check(unknown, read_sweep(unknown))
+        check_trials(unknown, read_sweep(unknown))
     drawn = write(
         {"episodes": {"distribution": "q_uniform", "min": -16, "max": 64, "q": 16}}, method="random"
     )
     with pytest.raises(
         ValueError, match=r"trial episodes=-16: episodes: expected greater than or equal to 1"
     ):
-        check(drawn, read_sweep(drawn))
+        check_trials(drawn, read_sweep(drawn))
 
 
 def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
@@ -104,30 +103,64 @@ def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
     assert len(capped.trials) == 2
 
 
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"command": ["python", "${program}"]}, r"command: expected \$\{program\} and \$\{args_no_hyphens\}"),
+        (
+            {"command": ["python", "benchmark.py", "${args_no_hyphens}"]},
+            r"command: expected \$\{program\} and",
+        ),
+        ({"command": [*COMMAND, "seed=3"]}, "command: expected no parameter in it, got seed"),
+        ({"command": [*COMMAND, "++split=test"]}, "split: expected development, got test: a sweep tunes"),
+        (
+            {"method": "bayes", "metric": {"name": "tested/success"}},
+            "metric.goal: expected maximize or minimize",
+        ),
+        ({"metric": {**METRIC, "target": 0.5}}, "metric.target: expected none"),
+    ],
+)
+def test_a_sweep_that_would_not_do_what_it_says_is_refused(write, entries, message):
+    """Parameters that reach no trial, values that stand twice, held-out seeds, a metric that would be minimised."""
+    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+        read_sweep(write({"seed": {"values": [1]}}, **entries))
+
+
+def test_a_search_by_a_metric_that_no_trial_reports_is_refused(write, tmp_path):
+    entries = {"method": "bayes", "metric": {"name": "tested/succes", "goal": "maximize"}}
+    sweep = LocalSweep(
+        read_sweep(write({"seed": {"min": 1, "max": 9}}, **entries)), tmp_path / "out", count=2
+    )
+    finish(sweep, sweep.next_trial())
+    with pytest.raises(
+        ValueError, match=r"metric.name: expected one of .*tested/success.*got 'tested/succes'"
+    ):
+        sweep.next_trial()
+
+
 def test_a_file_without_a_command_gets_what_recipes_need(write, monkeypatch):
     """W&B's own default puts hyphens before options, which Hydra refuses, and gives trials no folder of their own."""
     path = write({"num_updates": {"values": [10, 5]}})
     path.write_text(path.read_text().replace("command:", "description: x\n#").replace("\n- ", "\n#"))
     config = read_sweep(path)
     monkeypatch.setenv("SWEEP_OUT", "outputs")
-    load_recipe("sweep").check_trials(path, config)
+    check_trials(path, config)
     words = trial_command(config, {"num_updates": 5})
     assert {"num_updates=5", "split=development", "logger=wandb"} <= set(words)
     assert any(word.startswith("out=") and "WANDB_RUN_ID" in word for word in words)
 
 
 def test_what_the_servers_agent_cannot_say_is_refused_online(write):
-    check = load_recipe("sweep").check_served
     path = write({"horizon": {"values": [None, 60]}})
     with pytest.raises(
         ValueError, match=r"sweep.yaml: horizon: expected numbers, words or lists with mode=online"
     ):
-        check(path, read_sweep(path), "torchrl_sparse")
+        check_served(path, read_sweep(path), "torchrl_sparse")
     path = write({"horizon": {"values": [60]}}, project="mine")
     with pytest.raises(
         ValueError, match=r"project: expected that of .*sweep.yaml, 'mine', got 'torchrl_sparse'"
     ):
-        check(path, read_sweep(path), "torchrl_sparse")
+        check_served(path, read_sweep(path), "torchrl_sparse")
 
 
 def test_a_trial_fails_with_its_own_line(write, tmp_path, monkeypatch):

@@ -36,16 +36,19 @@ from torchrl_sparse.data.hdf5_reader import (
 from torchrl_sparse.data.hdf5_writer import lay_out
 from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.data.recorded_control import RecordedControl, read_control
-from torchrl_sparse.data.recorded_poses import REACH, TURN, check_poses, steps_out_of_reach
+from torchrl_sparse.data.recorded_poses import (
+    REACH,
+    TURN,
+    check_hands,
+    check_poses,
+    check_rate,
+    steps_out_of_reach,
+)
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
-from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.rotations import POSE_DIM
 
 __all__ = ["AbsoluteActions", "convert_demos"]
-
-# m between a recorded hand and the same state's hand here; another robot or table is far off
-_TOLERANCE = 1e-3
 
 
 def convert_demos(path: str | Path, out: str | Path, *, poses: bool = False) -> int:
@@ -231,24 +234,15 @@ def _make_parts(source: Node, names: Sequence[str], control: RecordedControl, pa
         demo, length = open_demo(demo_group(source), name)
         reader = ArrayReader(source)  # one demonstration is in memory at a time
         states, actions = (reader.numbers(demo, key, length) for key in ("states", "actions"))
-        _check_rate(demo, states[:, 0])
+        check_rate(demo, states[:, 0])
         with _saying(demo.where):
             arrays, clipped = absolute.convert(states, actions)
-        _check_hands(demo, arrays, length)
+        check_hands(demo, arrays, length)
         with new_hdf5(_part(parts, name)) as file:
             file.attrs["clipped"] = clipped
             for key, value in arrays.items():
                 file[key] = value
     absolute.close()
-
-
-def _check_rate(demo: Node, seconds: np.ndarray) -> None:
-    """Refuse states that are another time apart than this library's environments pass in a step."""
-    apart = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-    if apart > 0 and abs(apart * CONTROL_FREQ - 1) > 0.1:
-        raise ValueError(
-            f"{demo.where}, states: expected {1 / CONTROL_FREQ} s between them, got {apart:.3f} s, another control_freq"
-        )
 
 
 @contextmanager
@@ -257,17 +251,6 @@ def _saying(where: str | Path) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-
-
-def _check_hands(demo: Node, arrays: Mapping[str, np.ndarray], length: int) -> None:
-    """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
-    for key, value in arrays.items():
-        if key.endswith("eef_pos") and (recorded := demo.find(key)) is not None:
-            far = np.linalg.norm(ArrayReader(demo).numbers(demo, key, length) - value, axis=1).max()
-            if far > _TOLERANCE:
-                raise ValueError(
-                    f"{recorded.where}: expected the hand where the states put it, got {far:.4f} m off"
-                )
 
 
 def _merge(source: Node, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]) -> int:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from torchrl_sparse.data.hdf5_nodes import Node
+from torchrl_sparse.data.hdf5_reader import ArrayReader
+from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.rotations import POSE_DIM
 
-__all__ = ["check_poses", "steps_out_of_reach"]
+__all__ = ["REACH", "TURN", "check_hands", "check_poses", "check_rate", "steps_out_of_reach"]
+
+# m between a recorded hand and the same state's hand here; another robot or table is far off
+_TOLERANCE = 1e-3
 
 REACH = 0.3
 """m that a commanded position may lie ahead of the hand. A delta reaches 0.09, an expert of this library 0.08."""
@@ -57,3 +63,23 @@ def steps_out_of_reach(
             away = Rotation.from_rotvec(arms[:, arm, 3:6]) * Rotation.from_quat(quaternion).inv()
             turn = np.maximum(turn, away.magnitude())
     return far, turn
+
+
+def check_rate(demo: Node, seconds: np.ndarray) -> None:
+    """Refuse states that are another time apart than this library's environments pass in a step."""
+    apart = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    if apart > 0 and abs(apart * CONTROL_FREQ - 1) > 0.1:
+        raise ValueError(
+            f"{demo.where}, states: expected {1 / CONTROL_FREQ} s between them, got {apart:.3f} s, another control_freq"
+        )
+
+
+def check_hands(demo: Node, arrays: Mapping[str, np.ndarray], length: int) -> None:
+    """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
+    for key, value in arrays.items():
+        if key.endswith("eef_pos") and (recorded := demo.find(key)) is not None:
+            far = np.linalg.norm(ArrayReader(demo).numbers(demo, key, length) - value, axis=1).max()
+            if far > _TOLERANCE:
+                raise ValueError(
+                    f"{recorded.where}: expected the hand where the states put it, got {far:.4f} m off"
+                )

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from torchrl.envs import EnvBase
@@ -65,6 +65,9 @@ class RobosuiteTask(_Named):
         way_of: ``"module:function"`` that tells the way of an episode from its states; None where a task has but one.
     """
 
+    acts_in_poses: ClassVar[bool] = True
+    abs_action: ClassVar[bool] = True
+
     name: str
     alias: str
     arms: int
@@ -96,14 +99,6 @@ class RobosuiteTask(_Named):
     def proprioception_keys(self) -> tuple[str, ...]:
         """Those of the arms: the state of image tasks, where cameras show the objects."""
         return tuple(f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
-
-    @property
-    def acts_in_poses(self) -> bool:
-        return True
-
-    @property
-    def abs_action(self) -> bool:
-        return True
 
     @property
     def state_dim(self) -> int:

@@ -65,6 +65,7 @@ def test_tensors_that_share_one_record(write):
         name: entry(shape, numel=4 * 700 * 700) for name, shape in shapes(n_emb=700, n_layer=64).items()
     }
     put(payload, *EMA, value=tensors)
+    payload["cfg"]["policy"]["model"] |= {"n_emb": 700, "n_layer": 64}
     assert "expected tensors with storages of their own" in refusal(write(payload, {"0": record}))
 
 
@@ -217,7 +218,13 @@ OBSERVATIONS = ("cfg", "policy", "shape_meta", "obs")
 def test_observations_without_end(write, observations, message):
     payload, records = true_payload()
     target = "diffusion_transformer_hybrid_image_policy.DiffusionTransformerHybridImagePolicy"
-    payload["cfg"]["policy"] |= payload["cfg"]["policy"]["model"] | {"_target_": target}
+    policy = payload["cfg"]["policy"]
+    denoiser = {
+        name: policy["model"][name] for name in ("n_layer", "n_head", "n_emb", "n_cond_layers", "causal_attn")
+    }
+    for name in ("model", "obs_dim", "action_dim"):
+        policy.pop(name, None)
+    policy |= denoiser | {"_target_": target, "obs_encoder_group_norm": True}
     put(payload, *OBSERVATIONS[:-1], value={"obs": observations})
     assert message in refusal(write(payload, records))
 

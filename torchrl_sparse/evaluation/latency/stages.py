@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_sparse.evaluation.latency.measure import measure_latency
+from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
@@ -20,12 +21,15 @@ __all__ = ["image_policy", "image_query", "image_query_seconds"]
 _CAMERAS, _IMAGE = ("image", "wrist_image"), 84
 
 
-def image_policy(network: TransformerForDiffusion, *, width: int = 64) -> DiffusionPolicy:
+def image_policy(
+    network: TransformerForDiffusion, *, width: int = 64, sampler: Sampler | None = None
+) -> DiffusionPolicy:
     """Put the published encoder of two cameras, untrained, before a denoiser whose condition is their features and a state.
 
     Args:
         network: the denoiser, on the device that is to run everything.
         width: of the encoder's first stage; 64 is a ResNet-18.
+        sampler: of the policy, whose training steps others of it have too; 100 of DDPM without it.
 
     Raises:
         ValueError: if the condition has no room for the features.
@@ -38,7 +42,8 @@ def image_policy(network: TransformerForDiffusion, *, width: int = 64) -> Diffus
         )
     one, zero = torch.ones(state), torch.zeros(state)
     action = torch.ones(network.input_dim), torch.zeros(network.input_dim)
-    return DiffusionPolicy(network, Normalizer(one, zero, *action), vision=vision).to(network.pos_emb.device)
+    policy = DiffusionPolicy(network, Normalizer(one, zero, *action), vision=vision, sampler=sampler)
+    return policy.to(network.pos_emb.device)
 
 
 def image_query(policy: DiffusionPolicy, batch: int) -> TensorDict:

@@ -296,6 +296,4 @@ def _to_itself(terms: Terms) -> dict[str, Any]:
 
 
 def _speedup_interval(latency: Latency, dense: Latency) -> Interval | None:
-    if not latency.samples:
-        return None
-    return median_ratio_interval(dense.samples, latency.samples)
+    return median_ratio_interval(dense.samples, latency.samples) if latency.samples else None

@@ -58,7 +58,8 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     if violations:
         raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
     split = config["parameters"].get("split", {})
-    if "split=test" in config["command"] or "test" in [split.get("value"), *split.get("values", [])]:
+    said = {str(word).lstrip("+") for word in config["command"]}
+    if "split=test" in said or "test" in [split.get("value"), *split.get("values", [])]:
         raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
     return config
 
@@ -73,6 +74,17 @@ def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
     for name, kind in kinds.items():
         if not isinstance(config.get(name), kind):
             raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
+    named = {str(word).partition("=")[0].lstrip("+") for word in config["command"]}
+    if twice := sorted(named & config["parameters"].keys()):
+        raise ValueError(f"{path}: command: expected no parameter in it, got {', '.join(twice)}")
+    for macro in ("${program}", "${args"):
+        if not any(str(word).startswith(macro) for word in config["command"]):
+            expected = "${program} and ${args_no_hyphens} among its words"
+            raise ValueError(f"{path}: command: expected {expected}, got {config['command']}")
+    if config["method"] == "bayes" and "goal" not in (metric := config.get("metric") or {}):
+        raise ValueError(f"{path}: metric.goal: expected maximize or minimize, got {metric}")
+    if "target" in (config.get("metric") or {}):
+        raise ValueError(f"{path}: metric.target: expected none: a sweep runs all its trials")
     if config["method"] not in _METHODS:
         raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
 

@@ -135,6 +135,9 @@ class LocalSweep:
 
     def _as_run(self, trial: Trial) -> Any:
         engine, metrics = sweep_engine(), trial_metrics(load_results(self.results_file(trial)))
+        wanted = (self.config.get("metric") or {}).get("name")
+        if self.config["method"] == "bayes" and wanted not in metrics:
+            raise ValueError(f"metric.name: expected one of {', '.join(metrics)}, got {wanted!r}")
         return engine.SweepRun(
             name=trial.id,
             config={name: {"value": value} for name, value in trial.parameters.items()},

@@ -1,0 +1,50 @@
+"""A sweep's trials as their recipes will read them, before the first one runs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from torchrl_sparse.cli.recipe import check_command
+from torchrl_sparse.evaluation.results.sweep_files import find_program, parameter_sets, trial_command
+from torchrl_sparse.evaluation.results.sweeps import Trial
+
+__all__ = ["check_served", "check_trials"]
+
+
+def check_trials(file: Path, settings: Mapping[str, Any]) -> None:
+    """Read every trial's command line as its recipe will, before the first one runs.
+
+    Raises:
+        ValueError: naming file, trial and option.
+    """
+    program = find_program(settings["program"])
+    with patch.dict(os.environ, WANDB_RUN_ID="trial"):  # which options may refer to
+        _check_trials(file, settings, program)
+
+
+def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> None:
+    for parameters in parameter_sets(settings):
+        words = trial_command(settings, parameters)
+        try:
+            check_command(program, words[words.index(str(program)) + 1 :])
+        except ValueError as error:
+            raise ValueError(f"{file}: trial {Trial('', dict(parameters)).label}: {error}") from error
+
+
+def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
+    """Refuse what W&B's own agent hands to a trial in words that Hydra does not read, or to another project."""
+    for name, entry in settings["parameters"].items():
+        values = (
+            [entry.get("value"), *entry.get("values", ())] if "value" in entry else entry.get("values", ())
+        )
+        if "parameters" in entry or any(value is None or isinstance(value, dict) for value in values):
+            raise ValueError(
+                f"{file}: {name}: expected numbers, words or lists with mode=online, whose agent writes null and mappings "
+                f"as Hydra does not read them, got {entry!r}"
+            )
+    if settings.get("project", project) != project:
+        raise ValueError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
