@@ -167,7 +167,11 @@ def test_a_trial_fails_with_its_own_line(write, tmp_path, monkeypatch):
     """The sweep's process has Hydra raise its errors; a trial that inherited that would print a traceback."""
     program = tmp_path / "trial.py"
     program.write_text("import os, sys; sys.exit(os.environ.get('HYDRA_FULL_ERROR', 3))")
-    path = write({"seed": {"values": [1]}}, program=str(program), command=[sys.executable, "${program}"])
+    path = write(
+        {"seed": {"values": [1]}},
+        program=str(program),
+        command=[sys.executable, "${program}", "${args_no_hyphens}"],
+    )
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     sweep = LocalSweep(read_sweep(path), tmp_path / "out")
     lock = os.open(os.devnull, os.O_RDONLY)

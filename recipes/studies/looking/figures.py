@@ -25,7 +25,7 @@ def plot_looking(found: Looking, path: str | os.PathLike, *, title: str) -> Path
     """Draw where masks change over the phases of an episode: a row per phase, a column per cell, step after step.
 
     Args:
-        found: of :func:`~torchrl_sparse.evaluation.statistics.looking.looking`.
+        found: of :func:`~recipes.studies.looking.following.looking`.
         path: of the PNG.
         title: of the figure.
     """
@@ -51,7 +51,7 @@ def plot_reuse_sources(found: ReuseSources, path: str | os.PathLike, *, title: s
     """Draw how alike each block's output is to what it could reuse, mean over the denoising steps after the first.
 
     Args:
-        found: of :func:`~torchrl_sparse.evaluation.statistics.reuse_sources.reuse_sources`.
+        found: of :func:`~recipes.studies.looking.reuse_sources.reuse_sources`.
         path: of the PNG.
         title: of the figure.
     """

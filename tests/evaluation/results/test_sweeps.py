@@ -92,7 +92,7 @@ def test_what_wandb_would_refuse_is_named(tmp_path):
 @pytest.mark.parametrize(
     "change",
     [
-        {"command": ["${program}", "split=test"]},
+        {"command": ["${program}", "${args_no_hyphens}", "split=test"]},
         {"parameters": {"split": {"values": ["development", "test"]}}},
         {"parameters": {"split": {"value": "test"}}},
     ],

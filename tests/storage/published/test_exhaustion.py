@@ -224,7 +224,7 @@ def test_observations_without_end(write, observations, message):
     }
     for name in ("model", "obs_dim", "action_dim"):
         policy.pop(name, None)
-    policy |= denoiser | {"_target_": target, "obs_encoder_group_norm": True}
+    policy |= denoiser | {"_target_": target, "obs_encoder_group_norm": True, "eval_fixed_crop": True}
     put(payload, *OBSERVATIONS[:-1], value={"obs": observations})
     assert message in refusal(write(payload, records))
 
