@@ -292,8 +292,12 @@ class Sampler:
             noise: standard normal [B, H, A].
             timestep: i64 [B], 0 .. num_train_timesteps - 1.
         """
-        abar = self.alphas_cumprod.to(clean)[timestep][:, None, None]
-        return abar**0.5 * clean + (1 - abar) ** 0.5 * noise
+        abar = self.alphas_cumprod.to(clean.device)[timestep][:, None, None]
+        signal, spread = (
+            abar**0.5,
+            (1 - abar) ** 0.5,
+        )  # in f32: rounded to bf16, 1 - abar is 0 where little noise is added
+        return signal.to(clean) * clean + spread.to(clean) * noise
 
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
