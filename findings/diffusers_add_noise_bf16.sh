@@ -9,7 +9,7 @@
 # Hurts: trainings of diffusion policies in pure bf16, and most the last denoising steps, whose precision the robot feels;
 #   nothing warns, the loss just stays high at those timesteps.
 # Live with it: noise in f32 and cast the result; autocast does not help where the batch itself is bf16.
-# torchrl_sparse: `Sampler.add_noise` casts in the same order and has the same zeros; its own trainings are in f32.
+# torchrl_sparse: had the same zeros; `Sampler.add_noise` makes both factors in f32 since, and a test compares them.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT

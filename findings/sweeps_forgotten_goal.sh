@@ -7,7 +7,7 @@
 #   with 0.9. With `goal: maximize` it stops the one with 0.0. Both files are valid and nothing is said.
 # Hurts: sweeps over success rates, the metric of robot learning, which are all written after examples with a loss.
 # Live with it: always write the goal.
-# torchrl_sparse: its recipes' sweep files write the goal; a file of one's own without it is taken as the engine takes it.
+# torchrl_sparse: refuses a search (method bayes) whose file names no goal.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT

@@ -8,7 +8,7 @@
 #   three do. Every run is finished, every proposal valid, no word in either case.
 # Hurts: sweeps over metrics with long dotted names (task, method, measure), which are easy to misspell; days of trials.
 # Live with it: compare the metric's name with the first finished run's summary before the second one starts.
-# torchrl_sparse: a trial's metrics are written in one place (`results/tracking.py`); the name in the sweep file is the user's.
+# torchrl_sparse: refuses a search by a metric that its first trial did not report, and names those there are.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT

@@ -229,3 +229,12 @@ def test_add_noise_mixes_by_the_cumulative_alpha():
     for kind in ("ddpm", "unipc"):
         expected = DDPMScheduler(**PUBLISHED).add_noise(clean, noise, timestep)
         assert torch.equal(Sampler(kind, 10).add_noise(clean, noise, timestep), expected)
+
+
+def test_little_noise_is_added_in_bfloat16_too():
+    """Right to the rounding of a factor, where diffusers adds none (findings/diffusers_add_noise_bf16.sh)."""
+    clean, noise = torch.zeros(8, 1, 1), torch.ones(8, 1, 1)
+    exact = Sampler().add_noise(clean, noise, torch.arange(8))
+    rounded = Sampler().add_noise(clean.bfloat16(), noise.bfloat16(), torch.arange(8))
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), exact, rtol=2**-8, atol=0)

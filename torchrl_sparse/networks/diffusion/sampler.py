@@ -285,7 +285,7 @@ class Sampler:
         return (self.coefficients.clean(k, sample, eps, guide), *cleans)[: self.coefficients.history]
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training.
+        """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training; factors are made in f32.
 
         Args:
             clean: normalised actions [B, H, A].
@@ -293,11 +293,7 @@ class Sampler:
             timestep: i64 [B], 0 .. num_train_timesteps - 1.
         """
         abar = self.alphas_cumprod.to(clean.device)[timestep][:, None, None]
-        signal, spread = (
-            abar**0.5,
-            (1 - abar) ** 0.5,
-        )  # in f32: rounded to bf16, 1 - abar is 0 where little noise is added
-        return signal.to(clean) * clean + spread.to(clean) * noise
+        return (abar**0.5).to(clean) * clean + ((1 - abar) ** 0.5).to(clean) * noise
 
     def __repr__(self) -> str:
         return f"Sampler({', '.join(f'{name}={value!r}' for name, value in self.config.items())})"
