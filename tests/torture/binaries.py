@@ -238,7 +238,7 @@ def _sweep_changes() -> Iterator[Change]:
             name = f"{key} is {how}"
             yield Change(
                 name,
-                None if (key, how) in {("program", "unknown"), ("command", "a list")} else key,
+                None if (key, how) in {("program", "unknown"), ("command", "missing")} else key,
                 partial(_put_text, yaml.dump(sweep)),
             )
     bomb = "\n".join(

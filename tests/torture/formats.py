@@ -33,7 +33,7 @@ SWEEP = {
     "program": "trial.py",
     "method": "grid",
     "parameters": {"n": {"values": [1, 2]}},
-    "command": ["python"],
+    "command": ["python", "${program}", "${args_no_hyphens}"],
 }
 IDENTITY = {"method": "dense", "task": "lift"}
 

@@ -118,6 +118,7 @@ def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
             "metric.goal: expected maximize or minimize",
         ),
         ({"metric": {**METRIC, "target": 0.5}}, "metric.target: expected none"),
+        ({"metric": 3}, "metric: expected a name and a goal, got 3"),
     ],
 )
 def test_a_sweep_that_would_not_do_what_it_says_is_refused(write, entries, message):

@@ -46,10 +46,9 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
         raise ValueError(f"{path}: expected a wandb sweep, got {reason}") from error
     if not isinstance(config, dict):
         raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
-    set_here = {f"{name}=" for name in config.get("parameters") or ()}
-    default = [word for word in DEFAULT_COMMAND if not word.startswith(tuple(set_here))]
-    config = {"command": default} | config
+    config = {"command": [*DEFAULT_COMMAND]} | config
     _check_entries(path, config)
+    _check_command(path, config)
     check = sweep_engine().config.cfg.schema_violations_from_proposed_config
     try:
         violations = check(config)
@@ -74,19 +73,32 @@ def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
     for name, kind in kinds.items():
         if not isinstance(config.get(name), kind):
             raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
+    if config["method"] not in _METHODS:
+        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
+
+
+def _check_command(path: str | os.PathLike, config: dict[str, Any]) -> None:
+    """Refuse a command under which parameters would reach no trial or stand twice, and a metric that steers nothing.
+
+    Words of `DEFAULT_COMMAND` give way to parameters of their name.
+    """
+    parameters = config["parameters"]
+    if config["command"] == [*DEFAULT_COMMAND]:
+        config["command"] = [word for word in DEFAULT_COMMAND if word.partition("=")[0] not in parameters]
     named = {str(word).partition("=")[0].lstrip("+") for word in config["command"]}
-    if twice := sorted(named & config["parameters"].keys()):
+    if twice := sorted(named & parameters.keys()):
         raise ValueError(f"{path}: command: expected no parameter in it, got {', '.join(twice)}")
     for macro in ("${program}", "${args"):
         if not any(str(word).startswith(macro) for word in config["command"]):
             expected = "${program} and ${args_no_hyphens} among its words"
             raise ValueError(f"{path}: command: expected {expected}, got {config['command']}")
-    if config["method"] == "bayes" and "goal" not in (metric := config.get("metric") or {}):
+    metric = config.get("metric", {})
+    if not isinstance(metric, dict):
+        raise ValueError(f"{path}: metric: expected a name and a goal, got {metric!r}")
+    if config["method"] == "bayes" and "goal" not in metric:
         raise ValueError(f"{path}: metric.goal: expected maximize or minimize, got {metric}")
-    if "target" in (config.get("metric") or {}):
+    if "target" in metric:
         raise ValueError(f"{path}: metric.target: expected none: a sweep runs all its trials")
-    if config["method"] not in _METHODS:
-        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
 
 
 def parameter_sets(config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
