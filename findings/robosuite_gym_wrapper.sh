@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # robosuite's Gymnasium wrapper takes a seed without effect and calls the end of time a terminal state.
 #
-# Versions: robosuite 1.5.2 (its dependency evdev wants a C compiler), mujoco 3.9.0, gymnasium 1.4.0.
+# Versions: robosuite 1.5.2 (its dependency evdev wants a C compiler; its wrappers import h5py, which it does not install),
+#   mujoco 3.9.0, gymnasium 1.4.0.
 # Guess: `reset(seed=0)` twice gives the same start, and after `horizon` steps `truncated` is true.
 # What happens: the wrapper seeds NumPy's global generator, while a task places objects with a generator of its own: two starts after
 #   the same seed differ. After `horizon` steps `terminated` is true and `truncated` false, success or not.
@@ -12,7 +13,7 @@ set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT
 "${PYTHON:-python3}" -m venv "$dir/venv"
-"$dir/venv/bin/pip" install --quiet --disable-pip-version-check robosuite==1.5.2 mujoco==3.9.0 numpy==1.26.4 opencv-python==4.11.0.86 gymnasium==1.4.0
+"$dir/venv/bin/pip" install --quiet --disable-pip-version-check robosuite==1.5.2 mujoco==3.9.0 numpy==1.26.4 opencv-python==4.11.0.86 gymnasium==1.4.0 h5py==3.16.0
 cd "$dir"
 "$dir/venv/bin/python" -W ignore - <<'EOF'
 import numpy as np, robosuite
