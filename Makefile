@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs install sanitize torture findings
+.PHONY: demo test test-rest test-all lint docs install sanitize torture findings
 
 install: $(VENV)/.installed
 
@@ -22,8 +22,21 @@ demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
 		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# The quick tier: a few minutes on two cores.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -m "not full and not slow"
+
+# What the quick tier leaves out, but for gigabytes; with workers on Ray.
+test-rest: $(VENV)/.ray
+	$(PYTEST) -m "full and not slow"
+
+test-all: test test-rest
+
+$(VENV)/.ray: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[ray]"
+	touch $@
 
 lint: install
 	$(BIN)/ruff check .
