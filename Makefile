@@ -43,8 +43,17 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
+# Tables that sort and filter, from npm: a site that needs no network to be read.
+VENDOR := .ci/site/vendor
+$(VENDOR): Makefile
+	rm -rf $@ $@.part && mkdir -p $@.part
+	cd $@.part && npm pack --silent datatables.net@3.1.5 datatables.net-dt@3.1.2
+	tar xzf $@.part/datatables.net-3.1.5.tgz -C $@.part --strip-components=2 package/js/dataTables.min.js
+	tar xzf $@.part/datatables.net-dt-3.1.2.tgz -C $@.part --strip-components=2 package/css/dataTables.dataTables.min.css
+	rm $@.part/*.tgz && mv $@.part $@
+
 # The pages and the API reference, in site/. The variables silence the theme's and a plugin's announcements.
-docs: install
+docs: install $(VENDOR)
 	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict --quiet
 
 # The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.
