@@ -122,7 +122,7 @@ def _engines(options: Options, book: Book, seconds: float) -> Iterable[Verdict]:
 
 
 def _disturb(options: Options, book: Book, deadline: float) -> None:
-    """Run recipe after recipe undisturbed, share and fill its folder, and kill it; kill all in turn in the time that is left."""
+    """Run each recipe undisturbed, share and fill its folder, and kill it; then kill all in turn while there is time."""
     with tempfile.TemporaryDirectory() as folder:
         work, rng = Path(folder), random.Random(options.seed)
         recipes, killers = list(tiny_recipes(work)), []
