@@ -2,9 +2,8 @@
 
     python recipes/report.py runs=outputs out=outputs/report.html
 
-Or make a `results.json` of schema 1 anew in schema 2, with times from the episodes beside it; or put several tasks together:
+Or put several tasks together:
 
-    python recipes/report.py upgrade=[outputs/can/results.json,outputs/lift/results.json]
     python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results.json] out=outputs/aggregate.json
 
 Or draw what methods gain and lose on all tasks in one picture; of several files of a task the first that has a method counts:
@@ -23,23 +22,18 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.fronts import plot_fronts, plot_spending
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
-from torchrl_sparse.evaluation.results.schema import load_results, save_results
+from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
-from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 from torchrl_sparse.methods.token_budget import TokenBudget
 
 
 @recipe("report", out="file")
 def main(config: DictConfig) -> None:
-    if config.upgrade:
-        for path in map(Path, config.upgrade):
-            upgrade(path)
-    elif config.aggregate:
+    if config.aggregate:
         results = aggregate_results(config.aggregate)
         save_aggregate(results, config.out)
         print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
@@ -54,16 +48,6 @@ def main(config: DictConfig) -> None:
         for fault in faults.values():
             print(fault, file=sys.stderr)
         print(f"{config.out}: {Path(config.out).stat().st_size / 1e6:.1f} MB")
-
-
-def upgrade(path: Path) -> None:
-    """Write schema 2 in the place of schema 1, and the curves of success that it makes possible beside it."""
-    results, lacking = upgrade_results(path)
-    save_results(results, path)
-    plot_success_within(results, path.parent / "figures" / f"success_within_{path.stem}.png")
-    for name, why in lacking.items():
-        print(f"{path}: {name}: no times, {why}")
-    print(f"{path}: times of {len(results.methods) - len(lacking)} of {len(results.methods)} methods")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from torchrl_sparse.evaluation.results.completed import completed_rows, told_com
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 from torchrl_sparse.evaluation.results.report import pair_rows
 from torchrl_sparse.evaluation.results.result_files import READERS, Table, make_table, read_tables
-from torchrl_sparse.evaluation.results.schema import AnyResults, load_results
+from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
@@ -68,7 +68,7 @@ def _told(path: Path, which: str) -> Table:
     return make_table(results.subject, rows(told, results))
 
 
-def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
+def _episodes(path: Path, results: Results, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
     """Read the episodes of methods that are of these results, of each as many as they say; a log may have more."""
     found = {}
     for name in names:

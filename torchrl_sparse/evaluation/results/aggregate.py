@@ -56,17 +56,15 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     """Put the results of several tasks together; see `torchrl_sparse.evaluation.statistics.aggregate`.
 
     Args:
-        paths: of a ``results.json`` of version 2 of each task, with ``episodes/`` beside it.
+        paths: of a ``results.json`` of each task, with ``episodes/`` beside it.
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: naming the file, if one is of version 1 or of a task that is done by degrees, dense solved nothing in it, or
+        ValueError: naming the file, if one is of a task that is done by degrees, dense solved nothing in it, or
             its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
-        if not isinstance(results, Results):
-            raise ValueError(f"{path}: schema: expected 2 to aggregate, got {results.schema}")
         if results.by_degrees:
             raise ValueError(
                 f"{path}: expected a task that success and time decide, got {results.task}, by degrees"
@@ -84,15 +82,11 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     shared = [
         name
         for name in next(iter(found.values())).methods
-        if name != DENSE and all(_has_times(results, name) for results in found.values())
+        if name != DENSE and all(name in results.methods for results in found.values())
     ]
     if not shared:
-        raise ValueError(f"aggregate: expected a method whose times all of {tasks} have, got none")
+        raise ValueError(f"aggregate: expected a method that all of {tasks} have, got none")
     return AggregateResults(2, tuple(tasks), splits.pop(), {name: _entry(name, found) for name in shared})
-
-
-def _has_times(results: Results, name: str) -> bool:
-    return name in results.methods and results.methods[name].time_vs_dense is not None
 
 
 def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_sparse.evaluation.results.schema import AnyResults, Results
+from torchrl_sparse.evaluation.results.schema import Results
 from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
 __all__ = ["num_comparisons", "survivors"]
@@ -13,10 +13,8 @@ def num_comparisons(results: Results) -> int:
     return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
 
 
-def survivors(results: AnyResults) -> set[str] | None:
-    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
-    if not isinstance(results, Results):
-        return None
+def survivors(results: Results) -> set[str]:
+    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction."""
     if results.by_degrees:
         scores = {name: method.score.p_value for name, method in results.methods.items()}
         p_values = {f"{name} success": p for name, p in scores.items() if p is not None}

@@ -1,7 +1,6 @@
 """Success against latency in a world that does not wait: ``realtime.json`` and its table.
 
-A latency acts by the number of steps that the world makes in it, so points are kept by that. Version 1 had neither times nor
-their verdicts, and is still read.
+A latency acts by the number of steps that the world makes in it, so points are kept by that.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ from typing import Any, Literal
 import torch
 
 from torchrl_sparse.control.realtime_executor import delay_steps
+from torchrl_sparse.envs.seeds import Split
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
-from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference, require
+from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -60,8 +60,7 @@ class RealtimePoint:
         success: of its episodes.
         paired_vs_dense: against the dense policy at its own latency where ``own``, else at the same latency.
         episode_length: mean, environment steps.
-        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon. With what follows None
-            in version 1.
+        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
         time_vs_dense: its ratio to the dense policy's, compared like the success.
         p_values: of both verdicts; None of dense.
         correlation_with_dense: of its times with those that it is compared with; None also where either never differs.
@@ -72,8 +71,8 @@ class RealtimePoint:
     success: Success
     paired_vs_dense: Difference
     episode_length: float
-    restricted_mean_time: float | None = None
-    time_vs_dense: TimeDifference | None = None
+    restricted_mean_time: float
+    time_vs_dense: TimeDifference
     p_values: PValues | None = None
     correlation_with_dense: float | None = None
 
@@ -88,24 +87,17 @@ class RealtimeMethod:
 
 @dataclass(frozen=True)
 class Realtime:
-    """The content of a ``realtime.json``, whose version is ``realtime``; the last two are None in version 1."""
+    """The content of a ``realtime.json``, whose version is ``realtime``."""
 
-    realtime: Literal[1, 2]
+    realtime: Literal[2]
     task: str
     seed: int
     control_freq: float
     n_action_steps: int
     machine: Machine
     methods: dict[str, RealtimeMethod]
-    split: Literal["development", "test"] | None = None
-    episode_horizon: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.realtime == SCHEMA:
-            of_times = [point.time_vs_dense for method in self.methods.values() for point in method.points]
-            for name, value in {"split": self.split, "episode_horizon": self.episode_horizon}.items():
-                require(value is not None, name, "a value in version 2", value)
-            require(None not in of_times, "time_vs_dense", "a value in version 2", None)
+    split: Split
+    episode_horizon: int
 
 
 @dataclass(frozen=True)
@@ -124,7 +116,7 @@ def build_realtime(
     runs: Mapping[str, RealtimeRun],
     *,
     task: str,
-    split: Literal["development", "test"],
+    split: Split,
     seed: int,
     control_freq: float,
     n_action_steps: int,
@@ -188,9 +180,9 @@ def load_realtime(path: str | os.PathLike) -> Realtime:
 
 
 def num_late_comparisons(results: Realtime) -> int:
-    """Return the verdicts of the table, on success and on time of every point but dense's; 0 of version 1."""
+    """Return the verdicts of the table, on success and on time of every point but dense's."""
     points = [point for name, method in results.methods.items() for point in method.points if name != DENSE]
-    return 2 * len(points) if results.realtime == SCHEMA else 0
+    return 2 * len(points)
 
 
 def realtime_rows(results: Realtime) -> list[dict[str, str]]:
@@ -219,8 +211,6 @@ def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection
         "success": count_text(point.success),
         "vs dense, points": "" if name == DENSE else difference_text(point.paired_vs_dense),
     }
-    if results.realtime != SCHEMA:
-        return row | {"steps": f"{point.episode_length:.1f}"}
     mean = f"{point.restricted_mean_time:.1f}"
     told = ("baseline", mean, "", "", "") if name == DENSE else _told(point, mean, lasting)
     return row | dict(zip(_COLUMNS, told, strict=True))
@@ -254,15 +244,8 @@ def realtime_note(results: Realtime) -> str:
     return (
         f"{results.task}, {results.control_freq:g} Hz; {every}; the world goes on meanwhile. Success with Wilson's "
         "95 % interval, difference to dense with Tango's: at a method's own latency to dense at dense's own, else at the "
-        f"same latency. {_times_note(results)}Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, "
-        f"{machine.date[:10]}."
-    )
-
-
-def _times_note(results: Realtime) -> str:
-    if results.realtime != SCHEMA:
-        return ""
-    return (
-        f"Mean time to success, {results.episode_horizon} steps where there is none, is compared likewise. "
+        f"same latency. Mean time to success, {results.episode_horizon} steps where there is none, is compared likewise. "
         f"{num_late_comparisons(results)} comparisons; † marks a verdict that does not survive Holm's correction for them. "
+        f"Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, "
+        f"{machine.date[:10]}."
     )

@@ -19,7 +19,7 @@ from torchrl_sparse.evaluation.results.engine_report import (
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
 from torchrl_sparse.evaluation.results.realtime import load_realtime, num_late_comparisons, realtime_rows
 from torchrl_sparse.evaluation.results.report import comparison_rows, results_rows
-from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
+from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.text import count_text, mean_text, percent_text
 from torchrl_sparse.evaluation.results.vla_report import (
     load_vla_results,
@@ -71,12 +71,9 @@ def _results(path: Path) -> dict[str, Table]:
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
-    marked = num_comparisons(results) if isinstance(results, Results) else 0
-    methods = replace(make_table(results.subject, whole, len(rows[0])), comparisons=marked)
-    pairs = results.pairs if isinstance(results, Results) else None
+    methods = replace(make_table(results.subject, whole, len(rows[0])), comparisons=num_comparisons(results))
+    pairs = results.pairs
     compared = {"pairs": make_table(results.subject, comparison_rows(pairs))} if pairs else {}
-    if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
-        return {"methods": methods} | compared
     headline, budgets = headline_rows(results), budget_rows(results)
     chosen = {
         "headline": make_table(results.subject, headline),
@@ -85,32 +82,22 @@ def _results(path: Path) -> dict[str, Table]:
     return {"methods": methods} | compared | chosen
 
 
-def _more(results: AnyResults, name: str) -> Row:
+def _more(results: Results, name: str) -> Row:
     """Return the columns that only a page asks for."""
     method = results.methods[name]
     chunks, score = 1 / method.latency_s.p50, method.score
-    more = {
+    limits, within = method.speedup_ci95, method.success_within
+    early = "" if results.early_cut is None else f"{100 * within[str(results.early_cut)]:.1f}"
+    return {
         "success, %": percent_text(method.success),
         "success or score": mean_text(score.mean, score.ci95) if score else count_text(method.success),
         "action chunks per second": f"{chunks:.1f}",
         "actions per second": f"{results.policy.n_action_steps * chunks:.0f}",
-    }
-    if isinstance(method, MethodEntry):
-        more |= _more_of_times(results, method)
-        if not score:
-            return more
-    # Beside rows of version 2 that success and time decide, one of version 1 or one that its score decides has no times.
-    return more | dict.fromkeys(("time vs dense", "time verdict"), "")
-
-
-def _more_of_times(results: Results, method: MethodEntry) -> Row:
-    """Return those of version 2, empty where a method's episodes are not kept."""
-    mean, shares, limits = method.restricted_mean_time, method.success_within, method.speedup_ci95
-    early = None if shares is None or results.early_cut is None else shares[str(results.early_cut)]
-    return {
-        "mean time, steps": "" if mean is None else f"{mean:.1f}",
-        "early, %": "" if early is None else f"{100 * early:.1f}",
+        "mean time, steps": f"{method.restricted_mean_time:.1f}",
+        "early, %": early,
         "speed-up, 95 %": "" if limits is None else f"[{limits[0]:.2f}, {limits[1]:.2f}]",
+        # Beside rows that success and time decide, one that its score decides has no times.
+        **(dict.fromkeys(("time vs dense", "time verdict"), "") if score else {}),
     }
 
 
