@@ -6,12 +6,9 @@ Or put several tasks together:
 
     python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results.json] out=outputs/aggregate.json
 
-Or draw what methods gain and lose on all tasks in one picture; of several files of a task the first that has a method counts:
+Or draw what pruners of visual tokens lose over the tokens that they keep, as `calibrate_tokens` measured it:
 
-    python recipes/report.py fronts=[assets/lift/test_split/results.json,assets/pusht/results.json] out=outputs/fronts.png
-
-and ``spending=`` what methods that ask more often, or for several samples, spend a second, ``budgets=`` what pruners of visual
-tokens lose over the tokens that they keep, as `calibrate_tokens` measured it.
+    python recipes/report.py budgets=[outputs/specprune.json,outputs/fastv.json] out=outputs/budgets.png
 """
 
 from __future__ import annotations
@@ -22,11 +19,9 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.evaluation.figures.fronts import plot_fronts, plot_spending
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
-from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.methods.token_budget import TokenBudget
 
@@ -37,10 +32,6 @@ def main(config: DictConfig) -> None:
         results = aggregate_results(config.aggregate)
         save_aggregate(results, config.out)
         print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
-    elif config.fronts:
-        print(plot_fronts([load_results(path) for path in config.fronts], config.out))
-    elif config.spending:
-        print(plot_spending([load_results(path) for path in config.spending], config.out))
     elif config.budgets:
         print(plot_token_budgets([TokenBudget.from_pretrained(path) for path in config.budgets], config.out))
     else:

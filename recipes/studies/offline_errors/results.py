@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
+from recipes.studies.offline_errors.errors import OfflineErrors
 from recipes.studies.offline_errors.ranks import rank_correlation
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
-from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [

@@ -47,6 +47,7 @@ _DRAWN = {  # by the beginning of a file's name, what is drawn of it too: result
     ),
     "realtime": (load_realtime, realtime_rows, realtime_note, {"success against latency": plot_realtime}),
 }
+_KINDS = (*_DRAWN, *READERS)
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 # From the numbers, instead of a file that may be older than they are.
 _DRAWN_HERE = ("acceleration.png", "pareto.png", "realtime.png", "success_within.png")
@@ -117,12 +118,10 @@ def find_runs(root: str | os.PathLike) -> list[Path]:
     Raises:
         FileNotFoundError: if there is none.
     """
-    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith((*READERS,)))
+    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith(_KINDS))
     if not found:
-        others = (kind for kind in READERS if kind not in _DRAWN)
-        raise FileNotFoundError(
-            f"{root}: expected {' or '.join(f'{kind}.json' for kind in (*_DRAWN, *others))} in it or below it, got none"
-        )
+        expected = " or ".join(f"{kind}.json" for kind in _KINDS)
+        raise FileNotFoundError(f"{root}: expected {expected} in it or below it, got none")
     return found
 
 

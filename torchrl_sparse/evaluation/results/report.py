@@ -26,19 +26,13 @@ from torchrl_sparse.evaluation.results.text import (
     threads_text,
     verdict_text,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.evaluation.statistics.intervals import (
-    DEFAULT_MARGIN,
     episodes_needed,
-    paired_difference,
 )
 
 __all__ = [
     "comparison_rows",
-    "format_pairs",
     "format_table",
-    "pair_rows",
     "results_note",
     "results_rows",
 ]
@@ -117,48 +111,6 @@ def _episode_cells(cost: EpisodeCost | None) -> dict[str, str]:
 def _tokens_text(tokens: TokensKept) -> str:
     modes = [f"{count:.0f}" if count is not None else "-" for count in (tokens.kept_coarse, tokens.kept_fine)]
     return f"{tokens.kept_mean:.1f} ({' / '.join(modes)})"
-
-
-def format_pairs(
-    episodes: Mapping[str, Sequence[EpisodeResult]],
-    pairs: Sequence[Sequence[str]],
-    margin: float = DEFAULT_MARGIN,
-) -> str:
-    """Return a table of differences in success between methods of which none need be dense, paired by seed.
-
-    Args:
-        episodes: method -> its episodes.
-        pairs: of names, the first against the second; at least one pair.
-        margin: non-inferiority margin of the verdict on the first.
-
-    Raises:
-        ValueError: if a pair is not two of the methods, or they ran on different seeds.
-
-    >>> once = [EpisodeResult(0, True, 8, 1, 1.0, 0.0)]
-    >>> print(format_pairs({"a": once, "b": once}, [("a", "b")]))
-    | method   | against   |   success |   difference, points | verdict   |   McNemar's p |
-    |:---------|:----------|----------:|---------------------:|:----------|--------------:|
-    | a        | b         |     1 : 1 |  +0.0 [-79.3, +79.3] | undecided |          1.00 |
-    """
-    return markdown_table(pair_rows(episodes, pairs, margin))
-
-
-def pair_rows(
-    episodes: Mapping[str, Sequence[EpisodeResult]], pairs: Sequence[Sequence[str]], margin: float
-) -> list[dict[str, str]]:
-    """Return the rows of `format_pairs`: column -> text."""
-    return [_pair_row(episodes, pair, margin) for pair in pairs]
-
-
-def _pair_row(
-    episodes: Mapping[str, Sequence[EpisodeResult]], pair: Sequence[str], margin: float
-) -> dict[str, str]:
-    if len(pair) != 2 or not set(pair) <= set(episodes):
-        raise ValueError(f"pairs: expected two of {', '.join(episodes)}, got {list(pair)}")
-    pairs = pair_episodes(pair[0], episodes[pair[0]], pair[1], episodes[pair[1]])
-    ours, theirs = pairs.solved
-    difference = Difference.of(paired_difference(ours, theirs, margin))
-    return _success_cells(pair, (sum(ours), sum(theirs)), difference)
 
 
 def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from recipes.studies.fronts import figure as fronts
 from tests.evaluation.figures.test_plots import has_color
-from torchrl_sparse.evaluation.figures import fronts
 from torchrl_sparse.evaluation.results.schema import load_results
 
 LIFT, CAN, SQUARE = (
