@@ -21,16 +21,17 @@ from omegaconf import DictConfig
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
-from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows, save_aggregate
+from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.methods.token_budget import TokenBudget
+from torchrl_sparse.storage.json import write_json
 
 
 @recipe("report", out="file")
 def main(config: DictConfig) -> None:
     if config.aggregate:
         results = aggregate_results(config.aggregate)
-        save_aggregate(results, config.out)
+        write_json(config.out, results)
         print(f"{markdown_table(aggregate_rows(results))}\n\n{config.out}: {', '.join(results.tasks)}")
     elif config.budgets:
         print(plot_token_budgets([TokenBudget.from_pretrained(path) for path in config.budgets], config.out))

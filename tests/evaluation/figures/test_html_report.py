@@ -14,9 +14,9 @@ from tests.evaluation.results.test_realtime import DENSE, FAST, build
 from tests.recipe_modules import run
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.html_report import find_runs, write_report
-from torchrl_sparse.evaluation.results.realtime import save_realtime
 from torchrl_sparse.evaluation.results.result_files import read_tables
 from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.storage.json import write_json
 
 ASSETS = Path(__file__).parents[3] / "assets"
 
@@ -45,7 +45,7 @@ class Page(HTMLParser):
 def runs(tmp_path):
     root = tmp_path / "runs"
     save_results(synthetic.make_results(20, names=("dense", "bac")), root / "lift" / "results.json")
-    save_realtime(build(dense=DENSE, bac=FAST), root / "moving" / "realtime.json")
+    write_json(root / "moving" / "realtime.json", build(dense=DENSE, bac=FAST))
     figure, _ = make_figure(2, 2)
     save_figure(figure, root / "lift" / "figures" / "schedule_bac.png")
     (root / "lift" / "rollout_bac.mp4").write_bytes(b"a video")

@@ -11,12 +11,12 @@ from torchrl_sparse.evaluation.results.aggregate import (
     aggregate_results,
     aggregate_rows,
     load_aggregate,
-    save_aggregate,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
+from torchrl_sparse.storage.json import write_json
 
 NAMES = ("dense", "ddim10", "bac")
 
@@ -50,7 +50,7 @@ def test_tasks_are_put_together_for_the_methods_that_all_have(tasks, tmp_path):
     ratios = [m.time_vs_dense.ratio for m in each]
     assert entry.time_vs_dense.ratio == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
     assert entry.episodes == 160
-    save_aggregate(results, tmp_path / "aggregate.json")
+    write_json(tmp_path / "aggregate.json", results)
     assert load_aggregate(tmp_path / "aggregate.json") == results
     page = write_tables("<!-- table: aggregate.json -->\n<!-- end -->", tmp_path)
     assert aggregate_rows(results)[0]["time vs dense"] in page

@@ -14,7 +14,6 @@ from torchrl_sparse.evaluation.results.realtime import (
     load_realtime,
     num_late_comparisons,
     realtime_rows,
-    save_realtime,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.evaluation.statistics.sequential import Design
@@ -70,7 +69,7 @@ def test_verdicts_count_and_those_of_chance_are_marked():
 
 
 def test_late_points_are_compared_from_their_logs_wherever_those_lie(tmp_path):
-    path = save_realtime(build(dense=DENSE, bac=FAST), tmp_path / "realtime.json")
+    path = write_json(tmp_path / "realtime.json", build(dense=DENSE, bac=FAST))
     for log, played in {
         tmp_path / "episodes" / "bac_delay1.jsonl": episodes(17, n=21, first=210_000),  # one of no point
         tmp_path / "dense_delay3.jsonl": episodes(10, first=210_000),
@@ -100,7 +99,7 @@ def test_what_cannot_be_paired_is_refused():
 
 def test_file_table_and_figure(tmp_path):
     results = build(dense=DENSE, bac=FAST)
-    assert load_realtime(save_realtime(results, tmp_path / "realtime.json")) == results
+    assert load_realtime(write_json(tmp_path / "realtime.json", results)) == results
     table = format_realtime(results)
     assert "145 ms, its own" in table
     assert "+35.0" in table

@@ -13,11 +13,10 @@ from torchrl_sparse.evaluation.results.parts import (
     Flops,
     Percentiles,
     Success,
-    TokensKept,
 )
 from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, TokensKept
 from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
+from torchrl_sparse.evaluation.results.comparisons import surviving
 from torchrl_sparse.evaluation.results.parts import Difference, PValues, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.text import NONE_SOLVED, p_text, points_text, ratio_text, verdict_text
@@ -17,9 +18,8 @@ from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.evaluation.statistics.aggregate import TaskPairs, aggregate_tasks
 from torchrl_sparse.evaluation.statistics.durations import time_verdict
 from torchrl_sparse.evaluation.statistics.intervals import verdict
-from torchrl_sparse.evaluation.statistics.multiplicity import holm
 from torchrl_sparse.evaluation.statistics.sequential import Design
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "AggregateResults",
@@ -27,7 +27,6 @@ __all__ = [
     "aggregate_rows",
     "load_aggregate",
     "num_verdicts",
-    "save_aggregate",
 ]
 
 
@@ -126,7 +125,8 @@ def _episodes(path: Path, name: str, first: int, n: int) -> list[EpisodeResult]:
 
 def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text; † where a verdict does not survive Holm's correction."""
-    lasting = holm(_p_values(results), num_verdicts(results))
+    p_values = {name: entry.p_values for name, entry in results.methods.items()}
+    lasting = surviving(p_values, num_verdicts(results))
     return [
         {
             "method": name,
@@ -146,12 +146,6 @@ def num_verdicts(results: AggregateResults) -> int:
     return 2 * len(results.methods)
 
 
-def _p_values(results: AggregateResults) -> dict[str, float]:
-    """Return the p-value of each verdict."""
-    success = {f"{name} success": entry.p_values.success for name, entry in results.methods.items()}
-    return success | {f"{name} time": entry.p_values.time for name, entry in results.methods.items()}
-
-
 def load_aggregate(path: str | os.PathLike) -> AggregateResults:
     """Read an ``aggregate.json``.
 
@@ -160,8 +154,3 @@ def load_aggregate(path: str | os.PathLike) -> AggregateResults:
         ValueError: naming file and key, if it is of another kind.
     """
     return read_json(path, AggregateResults)
-
-
-def save_aggregate(results: AggregateResults, path: str | os.PathLike) -> Path:
-    """Write an ``aggregate.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)

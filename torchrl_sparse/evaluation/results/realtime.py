@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -17,6 +16,7 @@ from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.envs.seeds import Split
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
+from torchrl_sparse.evaluation.results.comparisons import surviving
 from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
@@ -29,8 +29,7 @@ from torchrl_sparse.evaluation.results.text import (
     verdict_text,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.statistics.multiplicity import holm
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "Realtime",
@@ -43,11 +42,9 @@ __all__ = [
     "num_late_comparisons",
     "realtime_note",
     "realtime_rows",
-    "save_realtime",
 ]
 
 SCHEMA = 2
-_COLUMNS = ("verdict", "mean time, steps", "time vs dense", "time verdict", "correlation")
 
 
 @dataclass(frozen=True)
@@ -164,11 +161,6 @@ def _point(
     )
 
 
-def save_realtime(results: Realtime, path: str | os.PathLike) -> Path:
-    """Write a ``realtime.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)
-
-
 def load_realtime(path: str | os.PathLike) -> Realtime:
     """Read a ``realtime.json``.
 
@@ -188,48 +180,37 @@ def num_late_comparisons(results: Realtime) -> int:
 def realtime_rows(results: Realtime) -> list[dict[str, str]]:
     """Return one row of text per method and delay."""
     points = [(name, point) for name, method in results.methods.items() for point in method.points]
-    tested = {(name, point.delay_steps): point.p_values for name, point in points if point.p_values}
-    p_values = {(*key, what): getattr(p, what) for key, p in tested.items() for what in ("success", "time")}
-    lasting = holm(p_values, num_late_comparisons(results))
-    return [
-        _row(
-            name,
-            results,
-            point,
-            {what for what in ("success", "time") if (name, point.delay_steps, what) in lasting},
-        )
-        for name, point in points
-    ]
+    p_values = {f"{name} +{point.delay_steps}": point.p_values for name, point in points}
+    lasting = surviving(p_values, num_late_comparisons(results))
+    return [_row(name, results, point, lasting) for name, point in points]
 
 
 def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection[str]) -> dict[str, str]:
     own = f"{1e3 * results.methods[name].own_latency_s:.3g} ms, its own" if point.own else ""
+    tested, correlation = f"{name} +{point.delay_steps}", point.correlation_with_dense
+    success, time = point.paired_vs_dense, point.time_vs_dense
+    verdicts = [
+        verdict_text(success, f"{tested} success" in lasting),
+        verdict_text(time, f"{tested} time" in lasting),
+    ]
+    if not point.success.k and not success.diff:  # by either
+        verdicts = [NO_VERDICT, NO_VERDICT]
     row = {
         "method": name,
         "delay, steps": str(point.delay_steps),
         "latency": own or f"{1e3 * point.delay_steps / results.control_freq:.0f} ms",
         "success": count_text(point.success),
-        "vs dense, points": "" if name == DENSE else difference_text(point.paired_vs_dense),
+        "vs dense, points": difference_text(success),
+        "verdict": verdicts[0],
+        "mean time, steps": f"{point.restricted_mean_time:.1f}",
+        "time vs dense": ratio_text(time),
+        "time verdict": verdicts[1],
+        "correlation": "" if correlation is None else f"{correlation:.2f}",
     }
-    mean = f"{point.restricted_mean_time:.1f}"
-    told = ("baseline", mean, "", "", "") if name == DENSE else _told(point, mean, lasting)
-    return row | dict(zip(_COLUMNS, told, strict=True))
-
-
-def _told(point: RealtimePoint, mean: str, lasting: Collection[str]) -> tuple[str, ...]:
-    correlation, difference, time = (
-        point.correlation_with_dense,
-        point.paired_vs_dense,
-        point.time_vs_dense,
-    )
-    nothing = not point.success.k and not difference.diff  # by either
-    return (
-        NO_VERDICT if nothing else verdict_text(difference, "success" in lasting),
-        mean,
-        ratio_text(time),
-        NO_VERDICT if nothing else verdict_text(time, "time" in lasting),
-        "" if correlation is None else f"{correlation:.2f}",
-    )
+    if name != DENSE:
+        return row
+    compared = ("vs dense, points", "time vs dense", "time verdict", "correlation")
+    return row | dict.fromkeys(compared, "") | {"verdict": "baseline"}
 
 
 def format_realtime(results: Realtime) -> str:

@@ -10,7 +10,6 @@ from torchrl_sparse.evaluation.results.parts import (
     EpisodeCost,
     PairedEntry,
     TimeDifference,
-    TokensKept,
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.tables import markdown_table
@@ -26,6 +25,7 @@ from torchrl_sparse.evaluation.results.text import (
     threads_text,
     verdict_text,
 )
+from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
 from torchrl_sparse.evaluation.statistics.intervals import (
     episodes_needed,
 )

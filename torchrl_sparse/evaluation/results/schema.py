@@ -26,10 +26,10 @@ from torchrl_sparse.evaluation.results.parts import (
     Score,
     Success,
     TimeDifference,
-    TokensKept,
     check_interval,
     require,
 )
+from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
