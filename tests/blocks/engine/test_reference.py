@@ -107,7 +107,7 @@ def test_type_reuse_follows_a_hand_computed_zigzag(ddpm):
 
 
 def reuse_source(mask, reuse):
-    """Which evaluation produced what a block adds, its own or an earlier one if it is pruned: (step, column), i64 [B, K, 3L]."""
+    """Which evaluation made what a block adds, its own or an earlier one if it is pruned: (step, column), [B, K, 3L]."""
     *batch, num_steps, num_blocks = mask.shape
     # With evaluations numbered in order of execution, the newest computed one is a running maximum.
     order = torch.arange(num_steps * num_blocks).view(num_steps, num_blocks)
