@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from recipes.studies.pages.result_tables import subject
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.pareto import plain_log_ticks
 from torchrl_sparse.evaluation.results.parts import Interval
@@ -149,7 +150,8 @@ def _by_task(results: Sequence[Results]) -> dict[str, list[Results]]:
     """Return what is drawn under each title."""
     tasks: dict[str, list[Results]] = {}
     for one in results:
-        tasks.setdefault(f"{one.subject}, score" if one.by_degrees else one.subject, []).append(one)
+        title = subject(one)
+        tasks.setdefault(f"{title}, score" if one.by_degrees else title, []).append(one)
     return tasks
 
 

@@ -93,8 +93,13 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
         if results.task != task:
             raise ValueError(f"results: {path}: expected a table of {task}, got one of {results.task}")
         found = outcomes(results).items()
-        played[path] = {name: outcome for name, outcome in found if MethodName.parse(name).asked_as_usual}
+        played[path] = {name: outcome for name, outcome in found if answers_alone(MethodName.parse(name))}
     return played
+
+
+def answers_alone(name: MethodName) -> bool:
+    """Tell whether episodes follow from the method's answers, not from how often or for how many it is asked."""
+    return name.every is None and name.samples == 1 and not name.ensembled and not name.ahead
 
 
 def no_calibration() -> Any:

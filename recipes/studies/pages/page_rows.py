@@ -10,7 +10,7 @@ from recipes.studies.offline_errors.agreement import load_agreement, together_ro
 from recipes.studies.offline_errors.results import agreement_rows, error_rows, load_offline
 from recipes.studies.pages.completed import completed_rows, told_completed
 from recipes.studies.pages.late_pairs import late_pair_rows
-from recipes.studies.pages.result_tables import acceleration_tables, realtime_tables, results_tables
+from recipes.studies.pages.result_tables import acceleration_tables, realtime_tables, results_tables, subject
 from recipes.studies.pages.scores import score_rows, told_scores
 from recipes.studies.pages.ways import way_rows
 from recipes.studies.simulate_stopping.results import load_stopping, stopping_rows
@@ -70,7 +70,7 @@ def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
         time_margin=results.dense.time_vs_dense.margin,
     )
     compared = [compare_pair(ours, played[ours], other, played[other], terms) for ours, other in pairs]
-    return make_table(results.subject, comparison_rows(compared), len(_OF_PAIRS))
+    return make_table(subject(results), comparison_rows(compared), len(_OF_PAIRS))
 
 
 def _told(path: Path, which: str) -> Table:
@@ -79,7 +79,7 @@ def _told(path: Path, which: str) -> Table:
     told = tell(_episodes(path, results, results.methods))
     if not told:
         raise ValueError(f"rows: expected episodes of {results.task} {expected}, got none")
-    return make_table(results.subject, rows(told, results))
+    return make_table(subject(results), rows(told, results))
 
 
 def _episodes(path: Path, results: Results, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:

@@ -12,9 +12,14 @@ from torchrl_sparse.evaluation.results.realtime import load_realtime, num_late_c
 from torchrl_sparse.evaluation.results.report import comparison_rows, results_rows
 from torchrl_sparse.evaluation.results.result_files import Row, Table, make_table
 from torchrl_sparse.evaluation.results.schema import Results, load_results
-from torchrl_sparse.evaluation.results.text import count_text, mean_text, percent_text
+from torchrl_sparse.evaluation.results.text import count_text, mean_text, percent_range
 
-__all__ = ["acceleration_tables", "realtime_tables", "results_tables"]
+__all__ = ["acceleration_tables", "realtime_tables", "results_tables", "subject"]
+
+
+def subject(results: Results) -> str:
+    """Return what tables and figures of several results tell apart: the task, and whether the policy has cameras for it."""
+    return f"{results.task}, cameras" if results.policy.cameras else results.task
 
 
 def results_tables(path: Path) -> dict[str, Table]:
@@ -22,13 +27,13 @@ def results_tables(path: Path) -> dict[str, Table]:
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
-    methods = replace(make_table(results.subject, whole, len(rows[0])), comparisons=num_comparisons(results))
+    methods = replace(make_table(subject(results), whole, len(rows[0])), comparisons=num_comparisons(results))
     pairs = results.pairs
-    compared = {"pairs": make_table(results.subject, comparison_rows(pairs))} if pairs else {}
+    compared = {"pairs": make_table(subject(results), comparison_rows(pairs))} if pairs else {}
     headline, budgets = headline_rows(results), budget_rows(results)
     chosen = {
-        "headline": make_table(results.subject, headline),
-        "budgets": make_table(results.subject, budgets),
+        "headline": make_table(subject(results), headline),
+        "budgets": make_table(subject(results), budgets),
     }
     return {"methods": methods} | compared | chosen
 
@@ -40,7 +45,7 @@ def _more(results: Results, name: str) -> Row:
     limits, within = method.speedup_ci95, method.success_within
     early = "" if results.early_cut is None else f"{100 * within[str(results.early_cut)]:.1f}"
     return {
-        "success, %": percent_text(method.success),
+        "success, %": f"{100 * method.success.rate:.1f} {percent_range(method.success.ci95)}",
         "success or score": mean_text(score.mean, score.ci95) if score else count_text(method.success),
         "action chunks per second": f"{chunks:.1f}",
         "actions per second": f"{results.policy.n_action_steps * chunks:.0f}",

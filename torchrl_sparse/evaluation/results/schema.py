@@ -161,11 +161,6 @@ class Results:
             require(known, "pairs", f"two of {', '.join(self.methods)}", [pair.method, pair.against])
 
     @property
-    def subject(self) -> str:
-        """What tables and figures of several results tell apart: the task, and whether the policy has cameras for it."""
-        return f"{self.task}, cameras" if self.policy.cameras else self.task
-
-    @property
     def by_degrees(self) -> bool:
         """Whether the task is done by degrees, so that verdicts are those of scores."""
         return self.dense.score is not None
