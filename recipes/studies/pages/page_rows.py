@@ -128,10 +128,11 @@ _OF_EPISODES: dict[str, tuple[Callable, Callable, str]] = {
     ),
 }
 _OF_PAIRS = ("method", "against", "success", "difference, points", "verdict", "McNemar's p")
-_READERS = READERS | {
+_READERS = {
     "results": results_tables,
     "acceleration": acceleration_tables,
     "realtime": realtime_tables,
+    **READERS,
     "offline_agreement": _agreement,
     "offline_errors": _offline,
     "carried_noise": _carried_noise,

@@ -47,7 +47,7 @@ DENSE = "dense"
 """The method that all others are compared with."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MethodEntry:
     """Everything about one method.
 
@@ -60,11 +60,11 @@ class MethodEntry:
         speedup_vs_dense: ratio of the medians.
         action_error_vs_dense: of its actions.
         episode_length: mean, environment steps.
+        planning_s: part of a query in which the planner decides; where it looks at the observation.
+        tokens: that it keeps; of policies with visual tokens.
         restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
         time_vs_dense: its ratio to the dense policy's.
         success_within: share of episodes solved within so many steps; see `allowed_steps`.
-        planning_s: part of a query in which the planner decides; where it looks at the observation.
-        tokens: that it keeps; of policies with visual tokens.
         correlation_with_dense: Pearson's, of times over the seeds; None where times never differ.
         p_values: of the two verdicts; None of dense.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement; None in older files.
@@ -81,11 +81,11 @@ class MethodEntry:
     speedup_vs_dense: float
     action_error_vs_dense: ActionError
     episode_length: float
+    planning_s: Percentiles | None = None
+    tokens: TokensKept | None = None
     restricted_mean_time: float
     time_vs_dense: TimeDifference
     success_within: dict[str, float]
-    planning_s: Percentiles | None = None
-    tokens: TokensKept | None = None
     correlation_with_dense: float | None = None
     p_values: PValues | None = None
     speedup_ci95: Interval | None = None
