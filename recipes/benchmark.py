@@ -29,13 +29,12 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
-from torchrl_sparse.evaluation.figures.ways import plot_ways
+from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
-from torchrl_sparse.evaluation.results.ways import told_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, method_identity

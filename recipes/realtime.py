@@ -35,13 +35,13 @@ from torchrl_sparse.evaluation.results.realtime import (
     RealtimeRun,
     build_realtime,
     format_realtime,
-    save_realtime,
 )
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import check_method
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.state_model import fit_state_model
@@ -96,7 +96,7 @@ def main(config: DictConfig) -> None:
         machine=describe_machine(config.device, config.threads),
         terms=terms,
     )
-    save_realtime(results, out / "realtime.json")
+    write_json(out / "realtime.json", results)
     plot_realtime(results, out / "realtime.png")
     print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
 

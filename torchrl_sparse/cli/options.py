@@ -55,7 +55,7 @@ OPTIONS: dict[str, Any] = {
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,
-    **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending", "budgets"), list[Word]),
+    **dict.fromkeys(("aggregate", "budgets"), list[Word]),
     "title": str,
     "sweep": Word,
     "project": Word,
