@@ -49,7 +49,7 @@ def fail(monkeypatch, capsys):
             ["quality=nope"],
             "quality: expected one of proficient, recovering, mixed for Lift, got 'nope'",
         ),
-        ("convert_robomimic", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
+        ("convert_demos", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
         (
             "benchmark_vla",
@@ -79,7 +79,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(fail, tmp_path, recipe, op
 
 
 def test_an_option_that_has_to_be_given_is_named(fail):
-    assert fail("convert_robomimic", "out=a.h5").startswith("demos: expected a value, got ")
+    assert fail("convert_demos", "out=a.h5").startswith("demos: expected a value, got ")
 
 
 @pytest.mark.parametrize(

@@ -45,10 +45,11 @@ OPTIONS: dict[str, Any] = {
     # what is done, on what, where to
     "task": Word,
     "policy": Word,
-    **dict.fromkeys(("benchmark_engine.policy", "libero_smoke.policy", "collect_demos.policy"), Word | None),
+    **dict.fromkeys(("benchmark_engine.policy", "collect_demos.policy"), Word | None),
     "heads": Annotated[list[Count], Field(min_length=3, max_length=3)] | None,
     "published": Section,
     "poses": bool,
+    "format": Literal["robomimic", "pusht"] | None,
     "planners": Word,
     "demos": Word | None,
     **dict.fromkeys(("train_policy.demos", "train_vla.demos"), Paths),
@@ -68,7 +69,7 @@ OPTIONS: dict[str, Any] = {
     "count": Count | None,
     "wandb": Section,
     # methods
-    **dict.fromkeys(("method", "preset"), Word),
+    "method": Word,
     "methods": Words,
     "benchmark.methods": Words | None,
     "benchmark_vla.methods": list[Word],  # none: dense alone
@@ -98,7 +99,6 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("updates", "intervals"), list[Count]),
     "specprune": Section,
     "options": Section,
-    "alpha": Positive,
     **dict.fromkeys(("alphas", "numbers"), Annotated[list[Positive], Field(min_length=1)]),
     "shares": list[Share],
     "measure": Word,
@@ -120,8 +120,7 @@ OPTIONS: dict[str, Any] = {
     "num_envs": Count,
     "workers": Count,
     "backend": Literal["process", "ray"],
-    "suites": Words | None,
-    **dict.fromkeys(("task_id", "skipped_layers", "warmup"), Whole),
+    **dict.fromkeys(("skipped_layers", "warmup"), Whole),
     "quality": Word,
     "keep_failures": bool,
     "mixing": Annotated[float, Field(ge=0, le=1)],
@@ -145,7 +144,7 @@ OPTIONS: dict[str, Any] = {
     "dtype": Literal["float32", "float16", "bfloat16"],
     # cameras
     "cameras": Section,
-    "render_demos.cameras": Words,
+    "convert_demos.cameras": list[Word],  # none: nothing is rendered
     "image": Word | None,
     "wrist_image": Word | None,
     "image_size": Count,
