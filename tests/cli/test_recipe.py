@@ -67,7 +67,7 @@ def fail(monkeypatch, capsys):
         ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
         ("train_pruner", ["init=nope.json"], "expected a file nope.json, got none"),
         ("train_pruner", ["method=l2c", "spread=1"], "spread: expected null with an init or with method=l2c"),
-        ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
+        ("profile_policy", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
