@@ -1,4 +1,4 @@
-"""Convert published demonstrations for training, and render cameras.
+"""Convert published demonstrations, and render cameras.
 
     python recipes/convert_demos.py demos=low_dim_v15.hdf5 out=data/lift_human.h5     # as robomimic publishes it
     python recipes/convert_demos.py demos=pusht_human.npz out=data/pusht_human.h5     # as Diffusion Policy publishes Push-T's

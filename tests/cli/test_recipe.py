@@ -83,6 +83,21 @@ def test_an_option_that_has_to_be_given_is_named(fail):
 
 
 @pytest.mark.parametrize(
+    ("recipe", "name", "guess"),
+    [
+        ("benchmark", "bac_blokwise", "bac_blockwise"),
+        ("benchmark", "dim10", "ddim10"),
+        ("benchmark", "sag_fixd", "sag_fixed"),  # saved beside the policy
+        ("benchmark_vla", "specprun", "specprune"),
+    ],
+)
+def test_a_misspelt_method_is_told_which_is_meant(fail, tmp_path, recipe, name, guess):
+    line = fail(recipe, f"methods=[{name}]", f"out={tmp_path}/out")
+    assert line.startswith("methods: expected ")
+    assert line.endswith(f"got '{name}', did you mean {guess}?")
+
+
+@pytest.mark.parametrize(
     "content",
     ["parameters: [", "parameters: {a: {}}", "a: 1\n\tb: 2", 'a: "b\nc: {d', "7", "- " * 5000, "a: \udcff"],
 )
@@ -197,6 +212,6 @@ def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
 
 def test_help_says_what_a_recipe_is_for_and_what_its_options_do():
     told = run("calibrate_bac", "--help")
-    assert told.startswith("Compute the BAC schedules of a trained policy from one dense query.")
+    assert told.startswith("Compute the BAC schedules of a policy, without training.\n")
     assert "samples: 1                                   # queries to average over" in told
     assert "hydra" not in told
