@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -26,8 +26,10 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from tests.options.tasks import EASY
 from tests.recipe_modules import load_recipe, options_file, script
 from torchrl_sparse.cli.options import OPEN_SECTIONS
+from torchrl_sparse.envs.tasks import TASKS
 from torchrl_sparse.storage.json import read_json
 
 __all__ = ["AS_TYPED", "OTHER", "Call", "OptionTests", "Row", "Run", "Runs", "returning"]
@@ -188,6 +190,7 @@ def _word(recipe: str, row: Row | str) -> str:
     return f"{'' if known else '+'}{row.option}={row.value}"
 
 
+@cache
 def _options(recipe: str) -> dict[str, Any]:
     read = yaml.safe_load(options_file(recipe).read_text())
     return {name: value for name, value in read.items() if name not in ("defaults", "hydra")}
@@ -208,12 +211,12 @@ def _is_open(recipe: str, name: str, options: Mapping[str, Any]) -> bool:
 
 def _play(tests: type[OptionTests], folder: Path, changes: Sequence[str]) -> Run:
     """Run a recipe in this process as its program does, in a folder of its own."""
-    tests.prepare(folder)
     module = load_recipe(tests.recipe)
     changed = {word.lstrip("+").partition("=")[0] for word in changes}
     words = [*(word for word in tests.base if word.lstrip("+").partition("=")[0] not in changed), *changes]
     calls: dict[str, list[Call]] = {}
-    with _undone(folder), ExitStack() as patches:
+    with _undone(folder), patch.dict(TASKS, {task.name: task for task in EASY}), ExitStack() as patches:
+        tests.prepare(folder)
         for path in dict.fromkeys([*tests.watched, *tests.replaced]):
             owner, name = _find(module, path)
             found = tests.replaced.get(path, getattr(owner, name))

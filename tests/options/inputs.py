@@ -39,19 +39,16 @@ def write_demos(path: Path, number: int, *, cameras: Sequence[str] = (), pixels:
     return path
 
 
-def write_block_push(path: Path, number: int = 2) -> Path:
-    """Write demonstrations of a task whose policies have other sizes."""
+def write_state_demos(path: Path, task: str, sizes: tuple[int, int], number: int = 2) -> Path:
+    """Write demonstrations of a task outside robosuite, with states and actions of these sizes."""
     random = np.random.default_rng(0)
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         for index in range(number):
             demo = file.create_group(f"data/demo_{index}")
             demo.attrs["num_samples"] = STEPS
-            demo["actions"], demo["obs/state"] = (
-                random.uniform(-3, 1, (STEPS, 2)),
-                random.uniform(0, 9, (STEPS, 16)),
-            )
-        describe_state_task(file, "BlockPush")
+            demo["obs/state"], demo["actions"] = (random.uniform(-1, 1, (STEPS, size)) for size in sizes)
+        describe_state_task(file, task)
     return path
 
 
@@ -61,5 +58,13 @@ def write_policy(folder: Path, demos: Path, task: str = "lift", **sizes: int) ->
     policy = untrained_policy(shown, SMALL | sizes, poses=shown.data[keys.ACTION].shape[-1] == 10)
     for parameter in policy.network.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
+    policy.sampler = policy.sampler.variant("ddpm", 20)
     policy.save_pretrained(folder)
     return policy
+
+
+def write_reach(folder: Path, task: str = "Reach", **sizes: int) -> DiffusionPolicy:
+    """Write such a policy for one of the tasks that cost nothing, and its demonstrations where recipes look for them."""
+    demos = folder.parents[1 if folder.parent.name == "assets" else 0] / f"data/{task.lower()}_proficient.h5"
+    write_state_demos(demos, task, (1, 1))
+    return write_policy(folder, demos, task, **sizes)

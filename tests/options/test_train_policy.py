@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file
 
 from tests.options.harness import OptionTests, Row
-from tests.options.inputs import STEPS, write_block_push, write_demos, write_policy
+from tests.options.inputs import STEPS, write_demos, write_policy, write_state_demos
 from tests.options.training import (
     AVERAGE,
     LOGGER,
@@ -70,7 +70,7 @@ class TestOptions(OptionTests):
     base = (
         *("max_steps=3", "batch_size=4", "lr_warmup_steps=1", "train.val_ratio=0.25"),
         *("network.n_layer=1", "network.n_emb=16", "network.n_head=2"),
-        *("log_every=1", "checkpoint_every=1", "eval_every=1", "logger=wandb"),
+        *("log_every=1", "checkpoint_every=2", "eval_every=1", "logger=wandb"),
     )
     watched = (*WATCHED, AVERAGE, "untrained_policy", "DiffusionPolicy.to")
     replaced = {
@@ -101,7 +101,7 @@ class TestOptions(OptionTests):
             Row("train.seed", "5", batch("seed")),
             Row("device", "'cpu:0'", lambda run: str(run.call("DiffusionPolicy.to")["args"][0])),
             Row("threads", "2", threads),
-            Row("checkpoint_every", "2", first_step("held_out/loss")),
+            Row("checkpoint_every", "3", first_step("held_out/loss")),
             Row("eval_every", "2", first_step("eval/success")),
             Row("eval_episodes", "4", evaluated(lambda call: len(call["seeds"]))),
             Row("eval_ddim_steps", "7", evaluated(lambda call: call["actor"].policy.num_inference_steps)),
@@ -142,6 +142,6 @@ class TestOptions(OptionTests):
     def prepare(folder):
         demos = write_demos(folder / "data/lift_proficient.h5", 4, cameras=(AGENT, WRIST))
         write_demos(folder / "data/more.h5", 3)
-        write_block_push(folder / "data/block_push_proficient.h5")
+        write_state_demos(folder / "data/block_push_proficient.h5", "BlockPush", (16, 2))
         torch.manual_seed(0)
         write_policy(folder / "other", demos, n_emb=8)
