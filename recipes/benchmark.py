@@ -1,4 +1,4 @@
-"""Compare a policy dense and accelerated: success, time, ms.
+"""Compare dense and accelerated: success, time, latency.
 
 Methods are paired; it leaves a table, plots and videos.
 

@@ -186,7 +186,10 @@ def _read(row: Row) -> Any:
 def _word(recipe: str, row: Row | str) -> str:
     if isinstance(row, str):
         return row
-    known = row.option in {*_leaves(_options(recipe)), *_options(recipe)}
+    options = _options(recipe)
+    known = (
+        row.option in {*_leaves(options), *options} and options.get(row.option) != {}
+    )  # Hydra adds to those
     return f"{'' if known else '+'}{row.option}={row.value}"
 
 

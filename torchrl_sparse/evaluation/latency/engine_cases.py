@@ -31,7 +31,7 @@ SHAPES = {"low_dim": ("lift", {}), "image": ("lift", {"cond_dim": 137}), "kitche
 
 _PRUNE_RATE = 0.91
 _SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
-_NUM_UPDATES = 10
+_NUM_UPDATES, _TOP_K = 10, 5  # the paper's
 _RUNNERS = {"torch": TorchEngine, "native": NativeEngine}
 # By runner, its weights and their bytes.
 _ROUNDED_RUNNERS = {
@@ -240,4 +240,5 @@ class EngineCase:
     def _calibrate_bac(self) -> Tensor:
         calibration = calibrate(self.network, self._dense, self.noise[:1], self.cond[:1])
         num_updates = min(_NUM_UPDATES, self._dense.num_inference_steps)
-        return bac_schedule(calibration, num_updates, policy="untrained").mask()
+        top_k = min(_TOP_K, self.network.num_blocks)
+        return bac_schedule(calibration, num_updates, policy="untrained", top_k=top_k).mask()
