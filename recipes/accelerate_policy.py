@@ -1,4 +1,6 @@
-"""From a slow policy to the fastest one that is still right: calibrate, time, rank, play, choose, save.
+"""Pick the fastest way to run a policy that is still right.
+
+Calibrate, time, rank, play, choose, save.
 
     python recipes/accelerate_policy.py task=lift policy=latest.ckpt demos=data/lift.h5 budget_ms=5 out=runs/fast
     python recipes/accelerate_policy.py task=lift policy=assets/lift demos=data/lift.h5 episodes=0

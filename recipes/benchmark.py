@@ -1,4 +1,6 @@
-"""Benchmark a policy: dense against accelerated, paired, with a table, plots and videos.
+"""Compare dense and accelerated: success, time, latency.
+
+Methods are paired; it leaves a table, plots and videos.
 
     python recipes/benchmark.py task=lift methods=[dense,dense_noise,ddim10,bac] episodes=50 out=outputs/lift
     python recipes/benchmark.py task=lift methods=[dense,ddim10] split=test until=decided max_episodes=1300

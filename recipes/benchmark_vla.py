@@ -1,4 +1,6 @@
-"""Benchmark a vision-language-action policy: dense against pruned visual tokens, paired, with a table, plots and videos.
+"""Compare a VLA dense and with pruned visual tokens.
+
+Methods are paired; it leaves a table, plots and videos.
 
     python recipes/benchmark_vla.py policy=runs/vla_lift_named/policy methods=[dense,specprune,fastv@specprune]
     python recipes/benchmark_vla.py policy=FOLDER_OF_OPENVLA_OFT task=libero_spatial split=test episodes=500 num_envs=10

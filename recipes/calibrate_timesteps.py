@@ -1,4 +1,6 @@
-"""Find the timesteps at which few denoising steps of a trained policy come closest to its demonstrations.
+"""Find the best timesteps for a few denoising steps.
+
+Those at which a trained policy comes closest to its demonstrations.
 
     python recipes/calibrate_timesteps.py task=square demos=data/square_recovering.h5 kind=ddpm num_inference_steps=3
 

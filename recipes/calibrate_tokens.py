@@ -1,4 +1,6 @@
-"""Pick how many visual tokens a method keeps for a task: the fewest within a tolerance of the dense policy.
+"""Find how many visual tokens a VLA can do without.
+
+A method then keeps the fewest within a tolerance of the dense policy.
 
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla tolerance=0.02
     python recipes/calibrate_tokens.py task=lift_named policy=assets/vla demos=data/lift_named_images.h5   # without rendering

@@ -1,4 +1,6 @@
-"""Collect scripted demonstrations; kill it at any moment and run it again to go on.
+"""Collect demonstrations by an expert, or by DAgger.
+
+Kill it at any moment and run it again to go on.
 
     python recipes/collect_demos.py task=lift episodes=200 quality=proficient out=data/lift_proficient.h5
 

@@ -1,4 +1,6 @@
-"""Play episodes with one policy and sum them up; kill it at any moment and run it again to go on.
+"""Play episodes with one policy and count successes.
+
+Kill it at any moment and run it again to go on.
 
     python recipes/evaluate_policy.py task=pusht policy=runs/pusht/policy episodes=20
     python recipes/evaluate_policy.py task=block_push policy=runs/block_push/policy demos=data/block_push.h5 \

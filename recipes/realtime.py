@@ -1,4 +1,6 @@
-"""Success against latency: the environment keeps moving while the policy computes.
+"""Measure success against latency in a world that moves on.
+
+The environment keeps moving while the policy computes.
 
     python recipes/realtime.py task=lift_moving policy=runs/lift_moving/policy methods=[dense,ddim10,bac] episodes=100
 

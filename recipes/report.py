@@ -1,4 +1,6 @@
-"""Make one HTML page on any set of results: tables with intervals, Pareto fronts, masks and videos, nothing to fetch.
+"""Make one HTML page of any number of results.
+
+Tables with intervals, Pareto fronts, masks and videos, nothing to fetch.
 
     python recipes/report.py runs=outputs out=outputs/report.html
 

@@ -1,4 +1,6 @@
-"""Run an ordinary wandb sweep yaml; kill it at any moment and run it again to go on.
+"""Run a W&B sweep file, with a server or without.
+
+Kill it at any moment and run it again to go on.
 
     python recipes/sweep.py sweep=rho_lift                   # no server: wandb's own engine, runs kept offline
     wandb sync outputs/sweeps/rho_lift/*/wandb/offline-run-*            # whenever there is one

@@ -1,4 +1,6 @@
-"""Train a diffusion policy. Stop it at any moment; the same command resumes it, equal to the last bit.
+"""Train a diffusion policy from demonstrations.
+
+Stop it at any moment; the same command resumes it, equal to the last bit.
 
     python recipes/train_policy.py demos=data/lift_proficient.h5 out=runs/lift max_steps=20000 batch_size=128
 

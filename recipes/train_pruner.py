@@ -1,4 +1,4 @@
-"""Train SAG's pruner, or static gates, for a trained policy.
+"""Train a pruner (SAG) or a static schedule for a policy.
 
     python recipes/train_pruner.py task=can policy=assets/can demos=data/can_proficient.h5 rate=0.91 out=runs/sag_can
 

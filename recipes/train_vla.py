@@ -1,7 +1,10 @@
-"""Train a vision-language-action policy. Stop it at any moment; the same command resumes it, equal to the last bit.
+"""Train a small vision-language-action policy.
+
+Stop it at any moment; the same command resumes it, equal to the last bit.
 
     python recipes/collect_demos.py task=lift_named episodes=600 out=data/lift_named_proficient.h5
-    python recipes/render_demos.py task=lift_named
+    views="cameras=[agentview,robot0_eye_in_hand]"
+    python recipes/convert_demos.py demos=data/lift_named_proficient.h5 out=data/lift_named_images.h5 "$views"
     python recipes/train_vla.py task=lift_named precision=bf16
     python recipes/train_vla.py task=lift_named precision=bf16 base=SmolLM2-135M-Instruct.Q4_1.gguf +network.patch_size=7
 

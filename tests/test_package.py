@@ -11,29 +11,60 @@ from pathlib import Path
 import pytest
 import yaml
 
+from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.cli.console import main
 
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_command_lists_every_recipe_with_its_purpose(capsys):
+def test_the_command_lists_every_recipe_with_its_purpose_in_the_order_of_use(capsys):
     assert main([]) == 0
     lines = capsys.readouterr().out.splitlines()
-    for path in (ROOT / "recipes").glob("*.py"):
-        (line,) = (line for line in lines if line.split(" ")[0] == path.stem)
-        assert len(line.split()) > 3
+    assert max(map(len, lines)) < 80
+    names = [line.split()[0] for line in lines if line.startswith("  ")]
+    scripts = {path.stem.removesuffix("_policy") for path in (ROOT / "recipes").glob("*.py")}
+    assert {name.removesuffix("_policy") for name in names} == scripts | {"env"}
+    order = ["collect_demos", "train_policy", "accelerate", "benchmark", "profile"]
+    assert [name for name in names if name in order] == order
+    assert all(len(line.split()) > 4 for line in lines if line.startswith("  "))
 
 
-def test_an_unknown_recipe_is_one_line(capsys):
-    assert main(["benchmrak"]) == 2
-    assert "expected env or one of accelerate_policy, benchmark" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("name", "guess"),
+    [
+        ("benchmrak", ", did you mean benchmark?"),
+        ("profile_query", ", did you mean profile?"),
+        ("convert_robomimic", ", did you mean convert_demos?"),
+        ("nonsense", ""),
+    ],
+)
+def test_an_unknown_recipe_is_one_line(capsys, name, guess):
+    assert main([name]) == 2
+    expected = f"expected a recipe, got {name!r}{guess}; torchrl-sparse alone lists them\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_short_and_long_names_lead_to_one_recipe(capsys):
+    told = []
+    for name in ("profile", "profile_policy"):
+        assert main([name, "--help"]) == 0
+        told.append(capsys.readouterr().out)
+    assert told[0] == told[1]
+    assert told[0].startswith("Find out where the time of one policy call goes.\n")
 
 
 def test_a_fault_can_be_reported_with_the_installation(capsys):
     assert main(["env"]) == 0
     told = capsys.readouterr().out
     assert "torchrl 0." in told
-    assert "native engine: " in told
+    built, which = native_available()
+    assert f"native engine: {which if built else f'not available, {which}'}\n" in told
+
+
+def test_an_engine_that_cannot_run_is_told_with_the_reason(capsys, monkeypatch):
+    monkeypatch.setattr("torchrl_sparse.blocks.engine.native_available", lambda: (False, "it was not built"))
+    assert main(["env"]) == 0
+    assert "native engine: not available, it was not built\n" in capsys.readouterr().out
 
 
 def test_a_recipe_runs_from_any_folder_with_overrides(tmp_path):

@@ -13,7 +13,7 @@ from torchrl_sparse.cli.options import OPTIONS, check_options
 
 NAMES = sorted(path.stem for path in RECIPES.glob("*.yaml"))
 STUDIES = sorted(path.parent.name for path in RECIPES.glob("studies/*/__main__.py"))
-NEEDED = {"convert_robomimic": ["demos=a", "out=b"], "convert_pusht": ["demos=a", "out=b"]}
+NEEDED = {"convert_demos": ["demos=a", "out=b"]}
 
 
 def options(recipe, *overrides):

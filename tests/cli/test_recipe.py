@@ -49,7 +49,7 @@ def fail(monkeypatch, capsys):
             ["quality=nope"],
             "quality: expected one of proficient, recovering, mixed for Lift, got 'nope'",
         ),
-        ("convert_robomimic", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
+        ("convert_demos", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("sweep", ["sweep=nope"], "sweep: expected one of bac_lift, "),
         (
             "benchmark_vla",
@@ -67,7 +67,7 @@ def fail(monkeypatch, capsys):
         ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
         ("train_pruner", ["init=nope.json"], "expected a file nope.json, got none"),
         ("train_pruner", ["method=l2c", "spread=1"], "spread: expected null with an init or with method=l2c"),
-        ("profile_vla", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
+        ("profile_policy", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["demos=nope.h5"], "nope.h5: expected a file of demonstrations, got none"),
         ("train_pruner", ["method=nope"], "method: expected one of sag, l2c, got 'nope'"),
@@ -79,7 +79,22 @@ def test_a_mistake_is_one_line_and_nothing_is_written(fail, tmp_path, recipe, op
 
 
 def test_an_option_that_has_to_be_given_is_named(fail):
-    assert fail("convert_robomimic", "out=a.h5").startswith("demos: expected a value, got ")
+    assert fail("convert_demos", "out=a.h5").startswith("demos: expected a value, got ")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "guess"),
+    [
+        ("benchmark", "bac_blokwise", "bac_blockwise"),
+        ("benchmark", "dim10", "ddim10"),
+        ("benchmark", "sag_fixd", "sag_fixed"),  # saved beside the policy
+        ("benchmark_vla", "specprun", "specprune"),
+    ],
+)
+def test_a_misspelt_method_is_told_which_is_meant(fail, tmp_path, recipe, name, guess):
+    line = fail(recipe, f"methods=[{name}]", f"out={tmp_path}/out")
+    assert line.startswith("methods: expected ")
+    assert line.endswith(f"got '{name}', did you mean {guess}?")
 
 
 @pytest.mark.parametrize(
@@ -197,6 +212,6 @@ def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
 
 def test_help_says_what_a_recipe_is_for_and_what_its_options_do():
     told = run("calibrate_bac", "--help")
-    assert told.startswith("Compute the BAC schedules of a trained policy from one dense query.")
+    assert told.startswith("Compute the BAC schedules of a policy, without training.\n")
     assert "samples: 1                                   # queries to average over" in told
     assert "hydra" not in told

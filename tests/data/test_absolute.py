@@ -62,7 +62,7 @@ def replay(path, task):
 
 
 def test_deltas_are_not_read_as_poses(published):
-    message = r"low_dim_v15\.hdf5: expected absolute poses, got deltas, as its controller says; recipes/convert_robomimic"
+    message = r"low_dim_v15\.hdf5: expected absolute poses, got deltas, as its controller says; recipes/convert_demos"
     with pytest.raises(ValueError, match=message):
         read_demos(published, ["robot0_eef_pos"])
 

@@ -4,22 +4,17 @@ import importlib.util
 import io
 from contextlib import nullcontext
 
-import hydra
 import imageio.v3 as iio
 import pytest
 import torch
-from omegaconf import OmegaConf
 from PIL import Image
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, NonTensor, Unbounded
 from torchrl.data.vla import preprocessing
-from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.recipe_modules import RECIPES, load_recipe
-from tests.storage.published import openvla
 from torchrl_sparse import keys
-from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.envs import libero
 from torchrl_sparse.envs.libero import SUITES, make_libero_env, rotation_vector
 from torchrl_sparse.envs.release_images import ReleaseImages, as_released
@@ -152,48 +147,3 @@ def test_images_are_those_of_torchrls_preprocessor():
         difference = (mine.float() - theirs.float()).abs()
         assert difference.max() <= 2
         assert difference.mean() < 0.3  # Pillow rounds between its two passes
-
-
-def test_a_published_folder_is_played_on_its_images(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("transformers")
-    (tmp_path / "published").mkdir()
-    openvla.write(tmp_path / "published", openvla.make_tensors(), *openvla.make_heads())
-    recipe, asked = load_recipe("libero_smoke"), []
-
-    def make(suite, task_id, image_size, as_released):
-        asked.append((suite, image_size, as_released))
-        images = ReleaseImages([keys.IMAGE, keys.WRIST_IMAGE], image_size)
-        return TransformedEnv(Rendered(256), Compose(InitTracker(), images))
-
-    monkeypatch.setattr(recipe, "make_libero_env", make)
-    options = [f"policy={tmp_path}/published", "suites=[libero_spatial]", "heads=[4,2,4]", "steps=5"]
-    with hydra.initialize_config_dir(str(RECIPES), version_base=None):
-        config = hydra.compose("libero_smoke", [*options, "n_action_steps=4", "alpha=0.1", f"out={tmp_path}"])
-    check_options("libero_smoke", OmegaConf.to_container(config))
-    recipe.main.__wrapped__(config)
-    assert asked == [("libero_spatial", 28, True)]
-    assert "libero_spatial, 'wait': 5 steps, 2 queries" in capsys.readouterr().out
-
-
-def test_the_smoke_recipe_steps_and_draws_every_suite(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("transformers")
-    recipe = load_recipe("libero_smoke")
-    asked = []
-
-    def make(suite, task_id, image_size, as_released):
-        assert not as_released
-        asked.append((suite, task_id))
-        return TransformedEnv(StillScene(image_size), InitTracker())
-
-    monkeypatch.setattr(recipe, "make_libero_env", make)
-    with hydra.initialize_config_dir(str(RECIPES), version_base=None):
-        config = hydra.compose(
-            "libero_smoke", ["steps=10", "task_id=3", "n_action_steps=4", f"out={tmp_path}"]
-        )
-    recipe.main.__wrapped__(config)
-    assert asked == [(suite, 3) for suite in SUITES]
-    printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == len(SUITES)
-    for suite, line in zip(SUITES, printed, strict=True):
-        assert line.startswith(f"{suite}, 'wait': 10 steps, 3 queries")
-        assert iio.imread(tmp_path / f"{suite}.png").std() > 1

@@ -22,7 +22,7 @@ from torchrl_sparse.cli.options import OPTIONS, check_options
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 
-__all__ = ["benchmark_command", "check_command", "recipe"]
+__all__ = ["benchmark_command", "check_command", "recipe", "refuse_unread"]
 
 _FULL = "HYDRA_FULL_ERROR"
 _MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException, RunFailed)
@@ -98,6 +98,22 @@ def check_command(program: Path, words: Sequence[str]) -> None:
         check_options(options.stem, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except (ValueError, HydraException, OmegaConfBaseException) as error:
         raise ValueError(_one_line(error)) from error
+
+
+def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: str) -> None:
+    """Raise ValueError for the first of the options ``names`` that is given though nothing would read it.
+
+    Args:
+        config: of a recipe.
+        names: options that have to be as its yaml says.
+        program: path of the recipe, beside which the yaml lies.
+        why: ends what is expected, such as "of a VLA".
+    """
+    defaults = OmegaConf.load(Path(program).with_suffix(".yaml"))
+    for name in names:
+        if config[name] != defaults[name]:
+            expected = "null" if defaults[name] is None else defaults[name]
+            raise ValueError(f"{name}: expected {expected} {why}, got {config[name]}")
 
 
 def _help(purpose: str, options: Path) -> str:

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft
 
-__all__ = ["load_vla"]
+__all__ = ["is_vla", "load_vla"]
 
 _UNSAID = ("cameras", "heads", "chunk_size", "normalization", "center_crop")
 
 
-def load_vla(config: DictConfig, data_set: str) -> VLAPolicy:
+def is_vla(path: str | Path) -> bool:
+    """Tell a vision-language-action policy, ours or a published one, by its ``config.json``; not whether it is complete.
+
+    >>> is_vla("assets/vla"), is_vla("assets/lift")
+    (True, False)
+    """
+    config = Path(path) / "config.json"
+    if not config.is_file() or is_openvla_oft(path):
+        return config.is_file()
+    return str(read_json(config, dict[str, Any]).get("format")).startswith("torchrl_sparse.vla_policy/")
+
+
+def load_vla(config: DictConfig, data_set: str | None) -> VLAPolicy:
     """Load the folder ``config.policy``, with those options that the files of a published one do not say.
 
     Args:
         config: of a recipe. ``published`` holds arguments of `VLAPolicy.from_openvla_oft`; null ones are the published values.
-        data_set: whose statistics normalise a published policy's actions.
+        data_set: whose statistics normalise a published policy's actions; None where its file has one only.
 
     Raises:
         FileNotFoundError, ValueError: as of `VLAPolicy.from_pretrained`; also for options that a folder does not need.

@@ -40,7 +40,7 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
         FileNotFoundError: if there is no file.
         RuntimeError: if no GL library is installed.
         ValueError: naming the demonstration, if one is damaged or its model is none of robosuite 1.5; if there is no such
-            camera, or ``out`` is ``path``.
+            camera, it has images of one already, or ``out`` is ``path``.
     """
     if Path(path).resolve() == Path(out).resolve():
         raise ValueError(f"out: expected another file than the demonstrations, got {out}")
@@ -50,11 +50,24 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
             source.copy(file, name)
         for name in tqdm(demo_names(source), unit="demo"):
             demo, length = open_demo(demo_group(source), name)
+            present = _present(demo, cameras)
             states = ArrayReader(source).numbers(demo, "states", length)
             _restore(env, demo, read_initial_state(path, int(name[5:])))
             for key, values in _render(env, states, cameras, image_size).items():
-                file["data"][name].create_dataset(f"obs/{key}", data=values, compression="lzf")
+                if key not in present:
+                    file["data"][name].create_dataset(f"obs/{key}", data=values, compression="lzf")
         env.close()
+
+
+def _present(demo: Node, cameras: Sequence[str]) -> set[str]:
+    """Return the names of a demonstration's observations, of which none may be an image of ``cameras``."""
+    observed = demo.find("obs")
+    present = {*(observed.names() if observed is not None and observed.is_group else ())}
+    if again := [camera for camera in cameras if f"{camera}_image" in present]:
+        raise ValueError(
+            f"{demo.where}: cameras: expected ones that it has no images of, got {', '.join(again)}"
+        )
+    return present
 
 
 def _restore(env: RobosuiteEnv, demo: Node, start: InitialState) -> None:

@@ -189,7 +189,7 @@ def _read_numbers(
         if control is not None and control.are_deltas:
             raise ValueError(
                 f"{path}: expected absolute poses, got deltas, as its controller says; "
-                "recipes/convert_robomimic.py converts them"
+                "recipes/convert_demos.py converts them"
             )
         data, reader = demo_group(file), ArrayReader(file)
         episodes = [read_episode(reader, data, name, wanted, control) for name in names]

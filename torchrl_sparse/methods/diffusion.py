@@ -45,6 +45,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.realtime_chunking import RealtimeChunking
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart
+from torchrl_sparse.runtime.names import did_you_mean
 
 __all__ = [
     "METHODS",
@@ -257,8 +258,13 @@ def _find(text: str, planners: Path) -> Method:
     if (method := _lookup(name)) is not None:
         return method
     if _saved_path(planners, name) is None:
+        known = [
+            *METHODS,
+            *(path.stem for path in sorted(planners.glob("*")) if _saved_path(planners, path.stem)),
+        ]
         raise ValueError(
-            f"methods: expected {', '.join(METHODS)}, or a planner in {planners} ({name}.json or {name}/), got {text!r}"
+            f"methods: expected {', '.join(METHODS)}, or a planner in {planners} ({name}.json or {name}/), "
+            f"got {text!r}{did_you_mean(name, known)}"
         )
     return SAVED
 

@@ -20,6 +20,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.runtime.names import did_you_mean
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.dense_first import DenseFirst
 from torchrl_sparse.tokens.efficientvla import EfficientVLAPruner
@@ -159,7 +160,8 @@ class TokenMethodName:
         name, at, rest = text.partition("@")
         method = TOKEN_METHODS.get(name)
         if method is None:
-            raise ValueError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}")
+            guess = did_you_mean(name, TOKEN_METHODS)
+            raise ValueError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}{guess}")
         if not at:
             return cls(name)
         if method.number is not None and re.fullmatch(r"\d*\.?\d+", rest):

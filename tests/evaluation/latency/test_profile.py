@@ -1,6 +1,7 @@
 """One query under the glass: its parts add up, its threads are compared, its tail is kept, and what cannot be is one line."""
 
 import itertools
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from types import SimpleNamespace
@@ -8,13 +9,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from recipes.studies.pages.page_rows import read_table
-from tests.recipe_modules import run
 from torchrl_sparse import DiffusionPolicy, Sampler
-from torchrl_sparse.blocks.engine import native_available
-from torchrl_sparse.cli.options import check_options
+from torchrl_sparse.blocks.engine import ENGINES, EngineEntry, native_available
 from torchrl_sparse.evaluation.latency import profile
-from torchrl_sparse.evaluation.latency.measure import usable_cores
 from torchrl_sparse.evaluation.latency.profile import (
     busy_cores,
     exported_call,
@@ -25,10 +22,8 @@ from torchrl_sparse.evaluation.latency.profile import (
     tail,
     thread_seconds,
 )
-from torchrl_sparse.evaluation.results.query_report import QueryProfile
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.storage.json import read_json
 
 needs_native = pytest.mark.skipif(not native_available()[0], reason=native_available()[1])
 PARTS = ["query", "noise", "weights", "blocks", "compiled rest", "tensors"]
@@ -69,17 +64,22 @@ def test_every_sampler_is_timed_on_every_number_of_threads(policy):
 def test_times_are_those_of_the_sampler_and_the_threads(policy, monkeypatch):
     """Told by a stand-in for the engine, since a clock may say anything."""
 
-    def engine(network, sampler, threads):
-        return SimpleNamespace(denoise=lambda noise, cond: (sampler.num_inference_steps, threads))
+    def engine(network, sampler, threads, weights="float32"):
+        return SimpleNamespace(denoise=lambda noise, cond: (sampler.num_inference_steps, threads, weights))
 
     def measure(calls, repeats, warmup):
         return {name: SimpleNamespace(p50=call()) for name, call in calls.items()}
 
-    monkeypatch.setattr(profile, "NativeEngine", engine)
+    for name, rounded in (("native", {}), ("native_int8", {"weights": "int8"})):
+        monkeypatch.setitem(ENGINES, name, EngineEntry(partial(engine, **rounded)))
     monkeypatch.setattr(profile, "measure_latency", measure)
     samplers = {"dense": Sampler("ddpm", 6), "ddim1": Sampler("ddim", 1)}
-    seconds = thread_seconds(policy.network, samplers, [1, 2], repeats=3)
-    assert seconds == {"dense": {1: (6, 1), 2: (6, 2)}, "ddim1": {1: (1, 1), 2: (1, 2)}}
+    for name, weights in (("native", "float32"), ("native_int8", "int8")):
+        seconds = thread_seconds(policy.network, samplers, [1, 2], repeats=3, engine=name)
+        assert seconds == {
+            name: {count: (steps, count, weights) for count in (1, 2)}
+            for name, steps in (("dense", 6), ("ddim1", 1))
+        }
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
@@ -134,30 +134,8 @@ def test_an_interrupt_leaves_what_all_callers_were_timed_for(interrupted_at, kep
 
 
 @needs_native
-def test_the_recipe_leaves_tables_and_a_figure(tmp_path, policy):
-    policy.save_pretrained(tmp_path / "policy")
-    options = ("queries=20", "repeats=2", "warmup=0", "thread_counts=[2]", f"out={tmp_path}/out")
-    output = run("profile_query", f"policy={tmp_path}/policy", "sampler=ddim2", *options)
-    assert "20 queries, one after the other." in output
-    found = read_json(tmp_path / "out" / "query.json", QueryProfile)
-    assert list(found.parts_s) == PARTS
-    assert set(found.threads_s) == {"dense", "ddim2"}
-    assert set(found.threads_s["dense"]) == {"1", "2"} if usable_cores() > 1 else {"1"}
-    late = found.tails_s["Python"]
-    assert late["p50"] <= late["p99.9"] <= late["max"]
-    (row,) = read_table(tmp_path / "out" / "query.json", "tails").rows
-    assert (row["beside"], row["queries"]) == ("0 busy processes", "20, one after the other")
-    assert (tmp_path / "out" / "query_threads.png").stat().st_size > 0
-
-
-@needs_native
 def test_a_library_that_is_none_is_one_line(policy, tmp_path):
     (tmp_path / "libtsp.so").write_bytes(b"no library")
     for path in (tmp_path / "libtsp.so", Path("nowhere.so")):
         with pytest.raises(ValueError, match=r"^library: expected libtsp\.so, got "):
             exported_call(policy, path).__enter__()
-
-
-def test_no_threads_at_all_are_refused():
-    with pytest.raises(ValueError, match=r"^thread_counts.*: expected greater than or equal to 1, got 0$"):
-        check_options("profile_query", {"thread_counts": [2, 0]})

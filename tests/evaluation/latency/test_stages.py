@@ -5,15 +5,17 @@ import torch
 
 from torchrl_sparse import Sampler
 from torchrl_sparse.evaluation.latency.engine_cases import make_network
-from torchrl_sparse.evaluation.latency.stages import image_policy, image_query, image_query_seconds
+from torchrl_sparse.evaluation.latency.stages import example_query, image_policy, stage_seconds
+
+SMALL = {"n_layer": 2, "n_emb": 32}
 
 
 def test_a_whole_query_of_the_image_shape_is_timed_by_parts():
     torch.manual_seed(0)
-    policy = image_policy(make_network("image", quick=True), width=16)
+    policy = image_policy(make_network("image", **SMALL), width=16)
     policy.sampler = Sampler("ddim", 2)
-    query = image_query(policy, batch=2)
-    seconds = image_query_seconds(policy, query, repeats=2)
+    query = example_query(policy, batch=2)
+    seconds = stage_seconds(policy, query, repeats=2)
     cameras = ["camera image", "camera wrist_image"]
     assert list(seconds) == ["query", "encode", "pixels", *cameras, "denoise", "rest", "encode, plain"]
     assert min(seconds[name] for name in seconds if name != "rest") > 0
@@ -24,4 +26,4 @@ def test_a_whole_query_of_the_image_shape_is_timed_by_parts():
 
 def test_a_condition_without_room_for_features_is_refused():
     with pytest.raises(ValueError, match=r"^cond_dim: expected more than the features' 128, got 19$"):
-        image_policy(make_network("low_dim", quick=True), width=16)
+        image_policy(make_network("low_dim", **SMALL), width=16)

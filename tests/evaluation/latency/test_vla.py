@@ -1,17 +1,14 @@
 """The latency benchmark of vision-language-action models at toy size: what it runs, what it writes, what it draws."""
 
-import imageio.v3 as iio
 import pytest
 import torch
 
 pytest.importorskip("transformers")
 
-from tests.recipe_modules import run
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.vla_cases import SHAPES, VLACase, make_policy
-from torchrl_sparse.evaluation.results.vla_report import load_vla_results
 from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops
 from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, SpecPrune
 
@@ -31,7 +28,7 @@ def case():
 
 
 def test_the_reduced_shape_has_the_published_tokens_and_about_the_published_share_of_the_decoder():
-    reduced, published = SHAPES["reduced"], SHAPES["published"]
+    reduced, published = SHAPES["reduced"], SHAPES["openvla_oft"]
     assert (reduced.num_visual, reduced.num_slots) == (published.num_visual, published.num_slots) == (512, 56)
     shares = []
     for config in (reduced, published):
@@ -89,37 +86,8 @@ def test_numbers_are_those_of_the_medians(case):
     assert results.shape.tokens == SPEC.num_visual + 3 + 14 + (9 + 17 + 4)
 
 
-def test_the_recipe_leaves_json_table_and_chart(tmp_path):
-    options = (
-        "shape=toy",
-        "repeats=1",
-        "warmup=0",
-        "alphas=[1]",
-        "shares=[0.5]",
-        "equal_to='specprune, alpha 1'",
-    )
-    printed = run("profile_vla", *options, f"out={tmp_path}")
-    results = load_vla_results(tmp_path / "vla_latency.json")
-    assert results.machine.threads == 1
-    assert results.shape.name == "toy"
-    assert list(results.methods) == [
-        *("dense", "specprune, alpha 1", "fastv, 50%", "random, 50%"),
-        *("fastv, as many", "frame difference, as many", "random, as many"),
-    ]
-    kept = [method.kept for name, method in results.methods.items() if "as many" in name]
-    assert kept == pytest.approx([results.methods["specprune, alpha 1"].kept] * 3, abs=1)
-    linear, attention, square = results.products.values()
-    assert linear.flops + attention.flops == decoder_flops(
-        SHAPES["toy"], torch.full((8,), results.shape.tokens)
-    )
-    assert square.flops == 2 * 2048**3
-    assert all(f" {name} | " in printed for name in results.products)
-    assert all(f"| {name} " in printed for name in [*results.methods, *results.parts])
-    assert iio.imread(tmp_path / "vla_latency.png").std() > 5
-
-
 def test_unknown_shapes_are_refused():
     with pytest.raises(
-        ValueError, match="shape: expected one of published, reduced, smollm2, toy, got 'huge'"
+        ValueError, match="shape: expected one of openvla_oft, reduced, smollm2, toy, got 'huge'"
     ):
         make_policy("huge")

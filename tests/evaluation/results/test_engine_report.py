@@ -1,15 +1,11 @@
 """The benchmark of the engines at toy size: what it runs, what it writes, what it draws."""
 
-import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
-import imageio.v3 as iio
 import pytest
 import torch
 
-from recipes.studies.pages.page_rows import read_table
-from tests.recipe_modules import RECIPES, load_recipe, run
 from torchrl_sparse.blocks.engine import TorchEngine, native_available
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.mask import prune_rate
@@ -19,17 +15,16 @@ from torchrl_sparse.evaluation.latency.limits import measure_bandwidth, measure_
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.evaluation.results.engine_report import (
     format_engine_table,
-    load_engine_results,
     shape_results,
 )
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
-ASSETS = RECIPES.parent / "assets"
+SMALL, STEPS = {"n_layer": 2, "n_emb": 32}, Sampler("ddpm", 20, 20)
 
 
 @pytest.fixture(scope="module")
 def case():
-    return EngineCase(make_network("low_dim", quick=True), batch=2, num_steps=20)
+    return EngineCase(make_network("low_dim", **SMALL), batch=2, dense=STEPS)
 
 
 def test_rows_of_a_batch_have_masks_of_their_own_at_the_rate_that_the_name_says(case):
@@ -42,22 +37,11 @@ def test_rows_of_a_batch_have_masks_of_their_own_at_the_rate_that_the_name_says(
 
 
 def test_a_schedule_of_bac_can_be_given():
-    network = make_network("low_dim", quick=True)
+    network = make_network("low_dim", **SMALL)
     mask = torch.zeros(20, network.num_blocks, dtype=torch.bool)
     mask[1::2, 3] = True
-    case = EngineCase(network, batch=2, num_steps=20, bac_mask=mask)
+    case = EngineCase(network, batch=2, dense=STEPS, bac_mask=mask)
     assert torch.equal(case.queries["bac10"].mask, torch.stack([mask, mask]))
-
-
-def test_a_trained_policy_brings_its_schedule_which_no_other_may_use(tmp_path):
-    recipe = load_recipe("benchmark_engine")
-    network, mask = recipe.load_trained(ASSETS / "lift")
-    assert mask.shape == (100, network.num_blocks)
-    assert prune_rate(mask) > 0.8
-    shutil.copytree(ASSETS / "lift", tmp_path / "lift", ignore=shutil.ignore_patterns("*.mp4", "*.png"))
-    shutil.copy(ASSETS / "can" / "bac.json", tmp_path / "lift")
-    with pytest.raises(ValueError, match="made for policy fingerprint"):
-        recipe.load_trained(tmp_path / "lift")
 
 
 def test_every_variant_answers_its_query(case):
@@ -108,13 +92,6 @@ def test_an_unknown_shape_is_refused():
         ValueError, match=r"shape: expected one of \['low_dim', 'image', 'kitchen'\], got 'moon'"
     ):
         make_network("moon")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_the_recipe_says_so_in_one_line(tmp_path):
-    refused = run("benchmark_engine", "quick=true", "device=cuda", f"out={tmp_path / 'out'}", expect=2)
-    assert refused.strip().endswith("device: expected one that this machine and PyTorch have, got 'cuda'")
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_variant_that_answers_otherwise_is_never_timed(case):
@@ -183,7 +160,7 @@ def test_the_compiled_baseline_has_graphs_where_there_are_any(device, mode, monk
 
 @pytest.mark.skipif(not native_available()[0], reason=native_available()[1])
 def test_every_instruction_set_can_have_rows_of_its_own():
-    case = EngineCase(make_network("low_dim", quick=True), batch=1, num_steps=20, instruction_sets=True)
+    case = EngineCase(make_network("low_dim", **SMALL), batch=1, dense=STEPS, instruction_sets=True)
     variants = case.variants()
     for name in native_available()[1].split(", "):
         for kind in ("dense", "random91", "bac10", "ddim2"):
@@ -192,29 +169,3 @@ def test_every_instruction_set_can_have_rows_of_its_own():
             assert (variant.call() - case.reference(kind)).abs().max() < 1e-5
     widest = native_available()[1].split(", ")[-1]
     assert torch.equal(variants["native dense"].call(), variants[f"native-{widest} dense"].call())
-
-
-def test_whole_queries_of_images_have_a_table_of_their_own(tmp_path):
-    options = ("quick=true", "cases=[{shape: image, batch: 2}]", f"out={tmp_path}")
-    printed = run("benchmark_engine", *options)
-    assert "Whole queries, cameras included." in printed
-    table = read_table(tmp_path / "engine.json", "image_b2_parts")
-    rows = {table.name(row): row for row in table.rows}
-    assert list(rows)[:2] == ["query", "encode"]
-    assert rows["query"]["ddim2, share"] == "100%"
-    assert float(rows["camera image"]["dense, ms"]) > 0
-
-
-def test_recipe_writes_results_and_charts(tmp_path):
-    options = (
-        "quick=true",
-        "cases=[{shape: low_dim, batch: 1}, {shape: kitchen, batch: 2}]",
-        f"out={tmp_path}",
-    )
-    printed = run("benchmark_engine", *options)
-    results = load_engine_results(tmp_path / "engine.json")
-    assert list(results.shapes) == ["low_dim_b1", "kitchen_b2"]
-    assert "eager-ifs random91" in results.shapes["low_dim_b1"].rows
-    for name in results.shapes:
-        assert iio.imread(tmp_path / f"engine_{name}.png").std() > 5
-        assert f"{name}: batch" in printed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,52 @@ from torchrl_sparse.evaluation.results.vla_report import (
     VLAMethod,
     VLAShape,
 )
+from torchrl_sparse.policies.vla.policy import VLAPolicy
+from torchrl_sparse.runtime.progress import progress
+from torchrl_sparse.tokens import FastVPruner, FrameDifferencePruner, RandomPruner, SpecPrune
+from torchrl_sparse.tokens.base import TokenPruner
 
-__all__ = ["measure_vla"]
+__all__ = ["measure_vla", "token_pruners"]
+
+
+def token_pruners(
+    policy: VLAPolicy, alphas: Iterable[float], shares: Iterable[float], equal_to: str | None = None
+) -> dict[str, TokenPruner | None]:
+    """Return dense, SpecPrune at every alpha, and FastV and random at every share of the visual tokens.
+
+    Args:
+        policy: that they are for.
+        alphas, shares: positive; shares at most 1.
+        equal_to: name of one of them, whose mean of tokens in a layer FastV, frame difference and random keep too.
+
+    Raises:
+        ValueError: if ``equal_to`` is none of them, or keeps fewer tokens than the layers before FastV's do.
+    """
+    pruners: dict[str, TokenPruner | None] = {DENSE: None}
+    pruners |= {f"specprune, alpha {alpha:g}": SpecPrune(alpha=alpha) for alpha in alphas}
+    for name, kind in (("fastv", FastVPruner), ("random", RandomPruner)):
+        pruners |= {f"{name}, {share:.0%}": kind(share) for share in shares}
+    return pruners if equal_to is None else pruners | _equal_pruners(policy, pruners, equal_to)
+
+
+def _equal_pruners(
+    policy: VLAPolicy, pruners: Mapping[str, TokenPruner | None], name: str
+) -> dict[str, TokenPruner]:
+    if name not in pruners:
+        raise ValueError(f"equal_to: expected one of {', '.join(pruners)}, got {name!r}")
+    share = VLACase(policy, {name: pruners[name]}).answer(name)[keys.KEPT].item()
+    share /= policy.network.config.num_visual
+    # the share of layers that see every token
+    before = FastVPruner().layer / policy.network.config.llm.layers
+    if share <= before:
+        raise ValueError(
+            f"equal_to: expected a method that keeps more than {before:.0%}, got {share:.0%} of {name}"
+        )
+    return {
+        "fastv, as many": FastVPruner((share - before) / (1 - before)),
+        "frame difference, as many": FrameDifferencePruner(share),
+        "random, as many": RandomPruner(share),
+    }
 
 
 def measure_vla(
@@ -32,7 +76,6 @@ def measure_vla(
     machine: Machine,
     repeats: int,
     warmup: int = 2,
-    on_round: Callable[[int, int], None] | None = None,
 ) -> VLALatency:
     """Time the parts of the dense query and all methods, everything interleaved.
 
@@ -40,7 +83,7 @@ def measure_vla(
         case: with a method ``"dense"``.
         name: of its shape.
         machine: that this runs on.
-        repeats, warmup, on_round: see `measure_latency`.
+        repeats, warmup: rounds, see `measure_latency`.
     """
     pruned = [name for name, policy in case.policies.items() if policy.pruner is not None]
     calls = {("parts", part): call for part, call in case.parts().items()}
@@ -49,7 +92,8 @@ def measure_vla(
     weight = next(case.network.parameters())
     products = product_calls(case)
     calls |= {("products", name): product.call for name, product in products.items()}
-    latency = measure_latency(calls, repeats, warmup, device=weight.device, on_round=on_round)
+    with progress(name, "round", repeats) as show:
+        latency = measure_latency(calls, repeats, warmup, device=weight.device, on_round=show)
     shape = VLAShape(
         name=name,
         dtype=str(weight.dtype).removeprefix("torch."),

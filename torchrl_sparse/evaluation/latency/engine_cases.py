@@ -24,15 +24,14 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.training.diffusion.published import published_network
 
-__all__ = ["QUICK", "SHAPES", "EngineCase", "QueryKind", "Variant", "make_network"]
+__all__ = ["SHAPES", "EngineCase", "QueryKind", "Variant", "make_network"]
 
 # The published networks by task, and what differs; the robomimic image tasks differ from low_dim in their condition.
 SHAPES = {"low_dim": ("lift", {}), "image": ("lift", {"cond_dim": 137}), "kitchen": ("kitchen", {})}
-QUICK = {"n_layer": 2, "n_emb": 32}
 
 _PRUNE_RATE = 0.91
 _SHORT_PRUNE_RATE = 0.5  # ten steps of which the first computes everything cannot be pruned by 91 %
-_NUM_UPDATES = 10
+_NUM_UPDATES, _TOP_K = 10, 5  # the paper's
 _RUNNERS = {"torch": TorchEngine, "native": NativeEngine}
 # By runner, its weights and their bytes.
 _ROUNDED_RUNNERS = {
@@ -44,8 +43,8 @@ _FEW_KINDS = ("dense", "random91", "bac10", "ddim2")
 _DRAWN_SEED = 1
 
 
-def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
-    """Make an untrained network of a published shape; ``quick`` makes it small.
+def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
+    """Make an untrained network of a published shape, but for ``sizes``, arguments of `TransformerForDiffusion`.
 
     Raises:
         ValueError: on an unknown shape.
@@ -54,7 +53,7 @@ def make_network(shape: str, quick: bool = False) -> TransformerForDiffusion:
         raise ValueError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")
     torch.manual_seed(0)
     task, changes = SHAPES[shape]
-    return published_network(task, **changes, **(QUICK if quick else {})).eval().requires_grad_(False)
+    return published_network(task, **changes, **sizes).eval().requires_grad_(False)
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class EngineCase:
     Args:
         network: the denoiser, in eval mode, on the device that is to run everything.
         batch: rows B; each has a random mask of its own where masks are random.
-        num_steps: denoising steps K of the dense query.
+        dense: sampler of the dense query, whose steps the caches are calibrated for; DDPM with 100 without it.
         compiled: also run the eager baseline through ``torch.compile``.
         bac_mask: of a schedule of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
             first of the case's own queries, whose observation is noise.
@@ -121,7 +120,7 @@ class EngineCase:
         network: TransformerForDiffusion,
         batch: int,
         *,
-        num_steps: int = 100,
+        dense: Sampler | None = None,
         compiled: bool = False,
         bac_mask: Tensor | None = None,
         instruction_sets: bool = False,
@@ -129,7 +128,7 @@ class EngineCase:
         self.network, self.batch, self._compiled = network, batch, compiled
         self._instruction_sets = instruction_sets
         self.device = network.pos_emb.device
-        self._ddpm = Sampler("ddpm", num_steps, num_steps)
+        self._dense = dense or Sampler("ddpm")
         generator = torch.Generator().manual_seed(0)
         self.cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)
         self.cond = self.cond.to(self.device)
@@ -137,7 +136,8 @@ class EngineCase:
         initial = torch.randn(shape, generator=generator).to(self.device)
         # The eager baseline's sampler draws the steps' noise from a generator with this seed, in this order.
         drawn = torch.Generator(self.device).manual_seed(_DRAWN_SEED)
-        steps = [torch.randn(shape, generator=drawn, device=self.device) for _ in range(num_steps - 1)]
+        noises = range(self._dense.num_inference_steps - 1)
+        steps = [torch.randn(shape, generator=drawn, device=self.device) for _ in noises]
         self.noise = torch.stack([initial, *steps], dim=1)
         mask = self._calibrate_bac() if bac_mask is None else bac_mask
         queries = self._make_queries(generator, mask.repeat(batch, 1, 1))
@@ -204,18 +204,18 @@ class EngineCase:
         return call
 
     def _make_queries(self, generator: torch.Generator, bac_masks: Tensor) -> dict[str, QueryKind]:
-        ddpm, steps = self._ddpm, self._ddpm.num_inference_steps
-        full = torch.linspace(0, steps - 1, round((1 - _PRUNE_RATE) * steps)).round().long()
+        dense, steps = self._dense, self._dense.num_inference_steps
+        full = torch.linspace(0, steps - 1, max(1, round((1 - _PRUNE_RATE) * steps))).round().long()
         full_steps = torch.ones(self.batch, steps, self.network.num_blocks, dtype=torch.bool)
         full_steps[:, full] = False
         all_pruned = torch.ones_like(full_steps)
         all_pruned[:, 0] = False
         queries = {
-            "dense": QueryKind(ddpm),
-            "random91": QueryKind(ddpm, self._random_mask(steps, _PRUNE_RATE, generator)),
-            "bac10": QueryKind(ddpm, bac_masks),
-            f"full{len(full)}": QueryKind(ddpm, full_steps),
-            "all-pruned": QueryKind(ddpm, all_pruned),
+            "dense": QueryKind(dense),
+            "random91": QueryKind(dense, self._random_mask(steps, _PRUNE_RATE, generator)),
+            "bac10": QueryKind(dense, bac_masks),
+            f"full{len(full)}": QueryKind(dense, full_steps),
+            "all-pruned": QueryKind(dense, all_pruned),
         }
         for count in (16, 10, 8):
             count = min(count, steps)
@@ -227,7 +227,7 @@ class EngineCase:
         return queries
 
     def _ddim(self, num_steps: int) -> Sampler:
-        return Sampler("ddim", num_steps, self._ddpm.num_train_timesteps)
+        return self._dense.variant("ddim", num_steps)
 
     def _random_mask(self, steps: int, rate: float, generator: torch.Generator) -> Tensor:
         """Draw for each row a mask of its own that prunes ``rate`` of all blocks, none in the first step."""
@@ -238,6 +238,7 @@ class EngineCase:
         return torch.cat([first, later.view(self.batch, steps - 1, blocks)], dim=1)
 
     def _calibrate_bac(self) -> Tensor:
-        calibration = calibrate(self.network, self._ddpm, self.noise[:1], self.cond[:1])
-        num_updates = min(_NUM_UPDATES, self._ddpm.num_inference_steps)
-        return bac_schedule(calibration, num_updates, policy="untrained").mask()
+        calibration = calibrate(self.network, self._dense, self.noise[:1], self.cond[:1])
+        num_updates = min(_NUM_UPDATES, self._dense.num_inference_steps)
+        top_k = min(_TOP_K, self.network.num_blocks)
+        return bac_schedule(calibration, num_updates, policy="untrained", top_k=top_k).mask()

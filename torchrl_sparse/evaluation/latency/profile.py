@@ -20,40 +20,41 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_sparse import keys
+from torchrl_sparse.blocks.engine.factory import ENGINES
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.packing import units
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch
 from torchrl_sparse.evaluation.latency.measure import measure_latency, next_arguments
+from torchrl_sparse.evaluation.latency.stages import example_query, stage_seconds
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = [
     "busy_cores",
+    "call_parts",
     "exported_call",
     "paced_seconds",
     "policy_inputs",
     "query_parts",
     "serial_share",
-    "state_query",
     "tail",
     "thread_seconds",
 ]
 
 _PERCENTILES = (50, 99, 99.9, 100)
+_WEIGHTS = {"native_bf16": "bfloat16", "native_int8": "int8"}
 
 
-def state_query(policy: DiffusionPolicy) -> TensorDict:
-    """Return one observation [1] of a policy of states, with the seed of its noise.
+def call_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[str, float]:
+    """Measure a policy call and its parts: `query_parts` where it runs as two native calls, else `stage_seconds`.
 
     Raises:
-        ValueError: if the policy has cameras.
+        ValueError: if its engine cannot run here, or a policy of states under a static plan runs in another than native.
     """
-    if policy.vision is not None:
-        raise ValueError(f"policy: expected one of states, got cameras {list(policy.vision.cameras)}")
-    state = torch.zeros(1, policy.n_obs_steps, len(policy.normalizer.state_scale))
-    episode = {"seed": torch.ones(1, 1, dtype=torch.long), "step": torch.ones(1, 1, dtype=torch.long)}
-    return TensorDict({"history": {"state": state}, "episode": episode}, [1])
+    if policy.vision is None and policy.plan.is_static and not policy.start.name:
+        return query_parts(policy, repeats, warmup)
+    return stage_seconds(policy, example_query(policy), repeats, warmup)
 
 
 @torch.no_grad()
@@ -81,7 +82,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
         >>> abs(query - sum(parts.values())) < 1e-9
         True
     """
-    query = state_query(policy)
+    query = example_query(policy)
     engine = policy.module["denoise"].engine.get(policy.network, policy.sampler)
     if not isinstance(engine, NativeEngine):
         raise ValueError(f"engine: expected native, got {engine.name}")
@@ -128,8 +129,17 @@ def thread_seconds(
     threads: Sequence[int],
     repeats: int,
     warmup: int = 2,
+    *,
+    engine: str = "native",
 ) -> dict[str, dict[int, float]]:
     """Measure the median seconds of an unpruned query of each sampler on each number of threads, all interleaved.
+
+    Args:
+        network: the denoiser, on the CPU.
+        samplers: by name.
+        threads: numbers of them.
+        repeats, warmup: rounds, see `measure_latency`.
+        engine: one of the native ones.
 
     Returns:
         name of the sampler -> threads -> seconds.
@@ -141,8 +151,8 @@ def thread_seconds(
         shape = (1, sampler.num_inference_steps, network.horizon, network.input_dim)
         noise = torch.randn(shape, generator=generator)
         for count in threads:
-            engine = NativeEngine(network, sampler, threads=count)
-            calls[f"{name} {count}"] = partial(engine.denoise, noise, cond)
+            runner = ENGINES[engine].make(network, sampler, threads=count)
+            calls[f"{name} {count}"] = partial(runner.denoise, noise, cond)
     latency = measure_latency(calls, repeats, warmup)
     return {name: {count: latency[f"{name} {count}"].p50 for count in threads} for name in samplers}
 
@@ -204,8 +214,8 @@ def paced_seconds(
 
 
 def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
-    """Yield one observation of a policy of states again and again, in new TensorDicts, since a policy writes into them."""
-    query = state_query(policy)
+    """Yield one observation again and again, in new TensorDicts, since a policy writes into them."""
+    query = example_query(policy)
     return (query.copy() for _ in repeat(None))
 
 
@@ -214,13 +224,13 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
     """Export the policy and lend the same query of the C interface, ``tsp.h``, as a robot calls it.
 
     Args:
-        policy: of states, which `DiffusionPolicy.export` can write.
+        policy: of states, which `DiffusionPolicy.export` can write; with the weights that its engine rounds to.
         library: the shared library that CMake makes, ``libtsp.so``.
 
     Raises:
         ValueError: if the library cannot be loaded or the policy not exported.
     """
-    state = state_query(policy)["history", "state"].contiguous()
+    state = example_query(policy)["history", "state"].contiguous()
     chunk = torch.empty(policy.horizon - policy.n_obs_steps + 1, policy.network.output_dim)
     try:
         found = ctypes.CDLL(str(library.resolve()))
@@ -229,7 +239,7 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
     found.tsp_load.restype, found.tsp_free.argtypes = c_void_p, [c_void_p]
     found.tsp_query.argtypes = [c_void_p, c_void_p, c_uint64, c_void_p]
     with tempfile.TemporaryDirectory() as folder:
-        policy.export(Path(folder) / "policy.tsp")
+        policy.export(Path(folder) / "policy.tsp", weights=_WEIGHTS.get(policy.engine, "float32"))
         reason = ctypes.create_string_buffer(256)
         handle = found.tsp_load(f"{folder}/policy.tsp".encode(), reason, c_size_t(len(reason)))
     if handle is None:

@@ -1,8 +1,8 @@
 """The cases of a latency benchmark of vision-language-action models: shapes, queries, parts of a query, and pruning's own work.
 
-Weights are random: they change which tokens go, not what arithmetic costs. Every method answers the second query of an episode,
-in which a tenth of all patches has changed, with what it remembers of the first. Parts and helpers are replayed on tensors of
-such a query, so that nothing is timed from within.
+Images are noise, and of `SHAPES` the weights too: they change which tokens go, not what arithmetic costs. Every method answers
+the second query of an episode, in which a tenth of all patches has changed, with what it remembers of the first. Parts and
+helpers are replayed on tensors of such a query, so that nothing is timed from within.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import pack, visual_scores
 from torchrl_sparse.networks.vla.hooks import LayerState
@@ -30,7 +31,7 @@ from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames
 __all__ = ["SHAPES", "VLACase", "make_policy"]
 
 SHAPES = {
-    "published": VLAConfig(crop_area=0.9),
+    "openvla_oft": VLAConfig(crop_area=0.9),
     # The published tokens, and about the published share of the decoder, in a model that a CPU answers in seconds.
     "reduced": VLAConfig(
         dino=TransformerSize(256, 8, 4, 1024),
@@ -83,15 +84,18 @@ class VLACase:
     Args:
         policy: whose network, normaliser and tokenizer all methods share.
         pruners: name -> pruner; None for dense.
+        instruction: that the policy is given; None takes its task's first one, or one of LIBERO's.
 
     Attributes:
         policies: name -> its policy.
         queries: name -> the second query, with what the first left it.
     """
 
-    def __init__(self, policy: VLAPolicy, pruners: dict[str, TokenPruner | None]):
+    def __init__(
+        self, policy: VLAPolicy, pruners: dict[str, TokenPruner | None], instruction: str | None = None
+    ):
         self.network = policy.network
-        first, second = _queries(policy)
+        first, second = _queries(policy, instruction or _own_instruction(policy))
         self._dense = policy.with_pruner(None), second
         self.policies, self.queries = {}, {}
         for name, pruner in pruners.items():
@@ -210,11 +214,17 @@ def _recorded(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> 
     return recorder
 
 
-def _queries(policy: VLAPolicy) -> tuple[TensorDict, TensorDict]:
+def _own_instruction(policy: VLAPolicy) -> str:
+    """Return what the policy was trained on: words that a small tokenizer does not know would be spelled, and take longer."""
+    task = TASKS.get(policy.source.task)
+    return task.instructions[0] if isinstance(task, RobosuiteTask) else _INSTRUCTION
+
+
+def _queries(policy: VLAPolicy, instruction: str) -> tuple[TensorDict, TensorDict]:
     """Make the first two queries of an episode, [1]: noise for images, and the same with some patches drawn anew."""
     config, generator = policy.network.config, torch.Generator().manual_seed(0)
     size, rows = (1, 3, config.image_size, config.image_size), config.grid[0]
-    first = TensorDict({keys.INSTRUCTION: [_INSTRUCTION]}, [1])
+    first = TensorDict({keys.INSTRUCTION: [instruction]}, [1])
     first[keys.STATE] = torch.rand(1, config.state_dim, generator=generator)
     first[keys.IS_INIT] = torch.ones(1, 1, dtype=torch.bool)
     second = first.clone()

@@ -82,7 +82,7 @@ class EngineShape:
         rows: by the name of the variant, ``"<runner> <kind>"``.
         program_build_s: that the program of a new mask takes to build.
         all_pruned_step_s: of a step that computes nothing, by runner.
-        image_parts_s: of whole queries of an image policy: sampler -> part -> seconds, see `image_query_seconds`; None
+        image_parts_s: of whole queries of an image policy: sampler -> part -> seconds, see `stage_seconds`; None
             elsewhere.
     """
 

@@ -22,7 +22,7 @@ class QueryProfile:
     Attributes:
         machine: that was measured on.
         sampler: name of the sampler.
-        parts_s: ``"query"`` and the parts that it is made of, medians; see `query_parts`.
+        parts_s: ``"query"`` and the parts that it is made of, medians; see `call_parts`.
         threads_s: name of a sampler -> number of threads, as text -> median of an unpruned query.
         tails_s: ``"Python"``, and ``"C"`` if the exported policy was asked too -> ``"p50"``, ``"p99"``, ``"p99.9"`` and
             ``"max"`` of ``queries``.
@@ -45,10 +45,15 @@ class QueryProfile:
 def format_query_profile(found: QueryProfile) -> str:
     """Return three tables in Markdown, each below the line that says what it is."""
     tables = query_rows(found)
-    whole = found.parts_s["query"] / found.parts_s["blocks"]
+    parts = found.parts_s
+    whole = (
+        f"{parts['query'] / parts['blocks']:.2f} times its blocks"
+        if "blocks" in parts
+        else f"{1e3 * parts['query']:.2f} ms"
+    )
     return "\n\n".join(
         [
-            f"A query, {found.sampler}: {whole:.2f} times its blocks.",
+            f"A query, {found.sampler}: {whole}.",
             markdown_table(tables["parts"]),
             "Queries by number of threads, milliseconds.",
             markdown_table(tables["threads"]),

@@ -1,8 +1,8 @@
-"""Step one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draws what it looked at.
+"""Step one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draw what it looked at.
 
-    python recipes/libero_smoke.py                         # random weights: does everything fit together?
-    python recipes/libero_smoke.py policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
-    python recipes/libero_smoke.py policy=PATH suites=[libero_spatial] steps=220   # a published folder of OpenVLA-OFT
+    python -m recipes.studies.libero_smoke                         # random weights: does everything fit together?
+    python -m recipes.studies.libero_smoke policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
+    python -m recipes.studies.libero_smoke policy=PATH suites=[libero_spatial] steps=220   # a published folder of OpenVLA-OFT
 
 Needs the extra libero, see `torchrl_sparse.envs.libero`, and a GL library. Writes OUT/<suite>.png.
 """
@@ -19,6 +19,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.options import Positive, Whole, Word, Words
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.cli.vla import load_vla
 from torchrl_sparse.control.action_aware import ActionAwareController
@@ -30,10 +31,12 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.specprune import SpecPrune
 
+OPTIONS = {"policy": Word | None, "preset": Word, "alpha": Positive, "suites": Words | None, "task_id": Whole}
+"""Options that no recipe of the library has, or that may be null here -> type."""
 _SHOWN = 6
 
 
-@recipe("libero_smoke")
+@recipe("libero_smoke", options=OPTIONS)
 def main(config: DictConfig) -> None:
     for suite in config.suites or SUITES:
         print(play(suite, config))

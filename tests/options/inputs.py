@@ -1,0 +1,70 @@
+"""What the runs begin with: demonstrations of random arrays and tiny policies, made without a simulator or a training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+
+from tests.fixtures.demonstrations import describe, describe_state_task, hands
+from torchrl_sparse import DiffusionPolicy, keys
+from torchrl_sparse.data.for_policy import contract_demos
+from torchrl_sparse.envs.contract import task_contract
+from torchrl_sparse.training.diffusion.untrained import untrained_policy
+
+STEPS = 15
+"""Of each demonstration."""
+SMALL = {"horizon": 10, "n_obs_steps": 2, "n_layer": 2, "n_head": 2, "n_emb": 16}
+
+
+def write_demos(path: Path, number: int, *, cameras: Sequence[str] = (), pixels: int = 40) -> Path:
+    """Write demonstrations of Lift; the first two are listed under the key ``few``."""
+    random = np.random.default_rng(number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for index in range(number):
+            demo = file.create_group(f"data/demo_{index}")
+            demo.attrs["num_samples"] = STEPS
+            demo["actions"] = actions = random.uniform(-1, 1, (STEPS, 7))
+            demo["obs/robot0_eef_pos"], demo["obs/robot0_eef_quat_site"] = hands(actions)
+            demo["obs/object"] = random.uniform(-1, 1, (STEPS, 10))
+            demo["obs/robot0_gripper_qpos"] = random.uniform(-1, 1, (STEPS, 2))
+            for camera in cameras:
+                demo[f"obs/{camera}"] = random.integers(256, size=(STEPS, pixels, pixels, 3), dtype=np.uint8)
+        file["mask/few"] = np.array([b"demo_0", b"demo_1"])
+        describe(file)
+    return path
+
+
+def write_state_demos(path: Path, task: str, sizes: tuple[int, int], number: int = 2) -> Path:
+    """Write demonstrations of a task outside robosuite, with states and actions of these sizes."""
+    random = np.random.default_rng(0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for index in range(number):
+            demo = file.create_group(f"data/demo_{index}")
+            demo.attrs["num_samples"] = STEPS
+            demo["obs/state"], demo["actions"] = (random.uniform(-1, 1, (STEPS, size)) for size in sizes)
+        describe_state_task(file, task)
+    return path
+
+
+def write_policy(folder: Path, demos: Path, task: str = "lift", **sizes: int) -> DiffusionPolicy:
+    """Write an untrained policy of a task, whose weights are large enough for every block to matter."""
+    shown = contract_demos(demos, task_contract(task))
+    policy = untrained_policy(shown, SMALL | sizes, poses=shown.data[keys.ACTION].shape[-1] == 10)
+    for parameter in policy.network.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    policy.sampler = policy.sampler.variant("ddpm", 20)
+    policy.save_pretrained(folder)
+    return policy
+
+
+def write_reach(folder: Path, task: str = "Reach", **sizes: int) -> DiffusionPolicy:
+    """Write such a policy for one of the tasks that cost nothing, and its demonstrations where recipes look for them."""
+    demos = folder.parents[1 if folder.parent.name == "assets" else 0] / f"data/{task.lower()}_proficient.h5"
+    write_state_demos(demos, task, (1, 1))
+    return write_policy(folder, demos, task, **sizes)
