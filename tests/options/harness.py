@@ -165,8 +165,8 @@ class Runs:
             changes = () if group is None else self._tests.groups[group]
             words = [_word(self._tests.recipe, change) for change in changes]
             self._made[group] = _play(self._tests, self._make_folder(), words)
-        run = self._made[group]
-        assert run is not None, "the run failed"
+        if (run := self._made[group]) is None:
+            pytest.fail("the run failed, see the first test of it", pytrace=False)
         return run
 
 
