@@ -25,7 +25,7 @@ class TestOptions(OptionTests):
             Row("device", "'cpu:0'", device()),
             Row("episodes", "3", printed(r"success \d/(\d)", int)),
             Row("seed", "170000", first("evaluate", "seeds")),
-            Row("horizon", "7", lambda run: run.call("evaluate")["make_env"].keywords["horizon"]),
+            Row("horizon", "7", lambda run: run.call("evaluate")["make_env"].keywords.get("horizon")),
             Row("n_action_steps", "5", lambda run: played(run).n_action_steps),
             Row("num_envs", "2", argument("evaluate", "num_envs")),
         ],

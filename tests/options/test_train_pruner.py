@@ -25,6 +25,10 @@ def config(name):
     return read
 
 
+def width(run):
+    return run.call("make_gates").arguments.get("width")
+
+
 def trained(run):
     return run.call("PrunerTrainer")["policy"]
 
@@ -37,7 +41,7 @@ class TestOptions(OptionTests):
     recipe = "train_pruner"
     base = (
         *("task=reach", "sampler={kind: ddim, num_inference_steps: 4}", "targets.share=1", "rate=0.5"),
-        *("network={width: 16}", "train.max_updates=2", "train.batch_size=4", "train.lr=0.001"),
+        *("train.max_updates=2", "train.batch_size=4", "train.lr=0.001"),
         *("log_every=1", "checkpoint_every=1", "logger=wandb"),
     )
     watched = (
@@ -53,7 +57,7 @@ class TestOptions(OptionTests):
             Row("sampler", "{kind: ddpm, num_inference_steps: 5}", lambda run: trained(run).num_inference_steps, 5),
             Row("targets.share", "0.5", argument("make_targets", "share")),
             Row("targets.seed", "3", argument("make_targets", "seed")),
-            Row("network", "{width: 8}", argument("make_gates", "width"), 8),
+            Row("network.width", "8", width, 8),
             Row("train.rate", "0.4", config("rate")),
             Row("train.epochs", "1", config("epochs")),
             Row("train.max_updates", "1", config("max_updates")),
@@ -93,7 +97,6 @@ class TestOptions(OptionTests):
             Row("reuse", "type", config("reuse")),
             Row("init", "plan.json", printed(r"(\S+): fitted"), "plan.json"),
             Row("rollouts", "1", lambda run: [call["episodes"] for call in run.calls["closed_loop_queries"]], [1]),
-            "network={}",
         ],
         [
             Row("train.objective", "noise", config("objective")),
