@@ -9,8 +9,10 @@ named as such.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -30,7 +32,7 @@ _NAMED = 12  # differing keys that are named
 def read_json(path: str | os.PathLike, kind: type[T]) -> T:
     """Read a file as ``kind``: a dataclass, or any type with JSON values, such as ``dict[str, Any]``.
 
-    Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown.
+    Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown or stand twice.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -86,6 +88,10 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
         made = _adapter(kind).validate_json(b"[%b]" % data)[0]
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+    try:
+        json.loads(b'{"": %b}' % data, object_pairs_hook=_once)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
     if _names_numbers(kind):
         _check_numbers(read, to_plain(made), where)
     return made
@@ -210,6 +216,24 @@ def _check_numbers(read: Any, made: Any, where: str) -> None:
         and type(read) is not type(made)
     ):
         raise ValueError(f"{where}: expected {made!r}, got {read!r}")
+
+
+def _once(entries: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of its entries; ValueError for an infinity, and for a name that stands twice: parsers keep the last."""
+    made = dict(entries)
+    if len(made) < len(entries):
+        ((twice, count),) = Counter(name for name, _ in entries).most_common(1)
+        raise ValueError(f"{twice}: expected one entry of this name, got {count}")
+    for name, value in entries:
+        if isinstance(value, (float, list)) and _is_infinite(value):
+            raise ValueError(f"{f'{name}: ' if name else ''}expected finite numbers, got one beyond floats")
+    return made
+
+
+def _is_infinite(value: Any) -> bool:
+    if isinstance(value, list):
+        return any(map(_is_infinite, value))
+    return isinstance(value, float) and math.isinf(value)
 
 
 def _check_size(size: int, where: str) -> None:
