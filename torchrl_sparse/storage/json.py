@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torchrl_sparse.networks.fingerprint import is_same_policy
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["check_plain", "describe_differences", "parse_json", "read_json", "to_plain", "write_json"]
@@ -140,6 +141,8 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
 def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """Name the keys in which plain values differ, with both, those within mappings after dots; empty if they are equal.
 
+    A fingerprint of a policy equals what earlier files note of that policy, see `is_same_policy`.
+
     >>> describe_differences({"seed": 1, "task": "lift"}, {"seed": 2, "task": "lift"})
     'seed is 2 here and 1 there'
     >>> describe_differences({"train": {"lr": 1, "seed": 0}}, {"train": {"lr": 2, "seed": 0}})
@@ -150,7 +153,11 @@ def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> 
     def say(values: Mapping[str, Any], key: str) -> str:
         return _short(values[key]) if key in values else "missing"
 
-    keys = [key for key in {**found, **asked} if found.get(key, nothing) != asked.get(key, nothing)]
+    keys = [
+        key
+        for key in {**found, **asked}
+        if not is_same_policy(found.get(key, nothing), asked.get(key, nothing))
+    ]
     return ", ".join(f"{key} is {say(asked, key)} here and {say(found, key)} there" for key in keys[:_NAMED])
 
 

@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
-from torchrl_sparse.networks.fingerprint import networks_fingerprint
+from torchrl_sparse.networks.fingerprint import policy_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
@@ -186,8 +186,12 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        return networks_fingerprint(self.network, *filter(None, [self.vision]))
+        """A name of its weights, at the fp16 precision in which they are saved, and of its normaliser and training steps.
+
+        Planners and episodes belong to one policy. Earlier files name the weights alone, the part before the hyphen.
+        """
+        units = {"normalizer": self.normalizer.state_dict(), "trained": self.sampler.trained}
+        return policy_fingerprint(self.network, *filter(None, [self.vision]), **units)
 
     @property
     def engine(self) -> EngineName:
