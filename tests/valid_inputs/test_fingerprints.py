@@ -1,17 +1,22 @@
 """Policies of the same weights under other units are other policies: what was made for one is refused for the other."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
+from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity as vla_identity
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
+from torchrl_sparse.networks.vla.config import VLAConfig
+from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 NETWORK = TransformerForDiffusion(
     input_dim=2, output_dim=2, horizon=4, n_obs_steps=2, cond_dim=3, n_layer=1, n_head=1, n_emb=8
@@ -64,3 +69,20 @@ def test_files_that_name_the_weights_alone_are_read(tmp_path):
         EpisodeLog(tmp_path / "a.jsonl", json.loads(other))
     with pytest.raises(ValueError, match="made for policy fingerprint"):
         OWN.with_plan(schedule_for(weights[:8]))
+
+
+def test_a_vla_of_other_sizes_that_no_tensor_shows_is_another(tmp_path):
+    """``published.center_crop`` and ``heads`` change what the same weights answer; nothing in the weights tells them."""
+    network = VLANetwork(VLAConfig.tiny())
+    policies = [VLAPolicy(network)]
+    for changes in ({"crop_area": 0.9}, {"llm": replace(network.config.llm, heads=1)}):
+        other = VLANetwork(replace(network.config, **changes))
+        other.load_state_dict(network.state_dict())
+        policies.append(VLAPolicy(other))
+    own, *others = (vla_identity("dense", None, policy, {}) for policy in policies)
+    EpisodeLog(tmp_path / "a.jsonl", own | {"policy": own["policy"].partition("-")[0]}).append(EPISODE)
+    assert EpisodeLog(tmp_path / "a.jsonl", own).episodes[7] == EPISODE
+    EpisodeLog(tmp_path / "b.jsonl", own).append(EPISODE)
+    for identity in others:
+        with pytest.raises(ValueError, match="holds other episodes: policy is"):
+            EpisodeLog(tmp_path / "b.jsonl", identity)

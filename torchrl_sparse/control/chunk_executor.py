@@ -179,7 +179,8 @@ class ChunkExecutor(TensorDictModuleBase):
         """Return the action f32 [A] of this step of a plain loop, for one robot.
 
         Args:
-            observation: ``"state"``, numbers [Ds] of any real dtype, laid out as `DiffusionPolicy.describe` says; ``"image"``
+            observation: ``"state"``, numbers [Ds] of any real dtype, laid out and in the version of robosuite that
+                `DiffusionPolicy.describe` says, for nothing here can tell one from another; ``"image"``
                 and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s,
                 for an `ActionAwareController`. Histories are kept here.
 
@@ -245,6 +246,8 @@ class ChunkExecutor(TensorDictModuleBase):
         """Return all that the policy reads, with the last chunk if it asks for that."""
         wanted = [*self.policy.in_keys, *(self.selector.in_keys if self.selector is not None else ())]
         request = tensordict.select(*wanted, strict=False)
+        if keys.IS_INIT in wanted:  # so it is to a policy that takes over in mid-episode
+            request.set(keys.IS_INIT, self._begins(tensordict))
         if keys.ELAPSED in wanted:
             elapsed = self._age(tensordict) + 1
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-__all__ = ["is_same_policy", "networks_fingerprint", "policy_fingerprint"]
+__all__ = ["full_fingerprint", "is_same_policy", "networks_fingerprint", "policy_fingerprint"]
 
 _DIGITS, _DIGITS_OF_UNITS = 16, 8
 
@@ -38,10 +38,19 @@ def policy_fingerprint(
         normalizer: tensors of the normaliser, f32 in files.
         trained: what a sampler of these networks has in common with all others, see `Sampler.trained`.
     """
-    digest = hashlib.sha256(repr(sorted(trained.items())).encode())
+    units = [repr(sorted(trained.items())).encode()]
     for name, value in sorted(normalizer.items()):
-        digest.update(name.encode() + value.detach().cpu().float().numpy().tobytes())
-    return f"{networks_fingerprint(*networks)}-{digest.hexdigest()[:_DIGITS_OF_UNITS]}"
+        units.append(name.encode() + value.detach().cpu().float().numpy().tobytes())
+    return full_fingerprint(networks_fingerprint(*networks), b"".join(units))
+
+
+def full_fingerprint(weights: str, units: bytes) -> str:
+    """Return the name of weights, a hyphen, and eight digits that name what they mean something under.
+
+    >>> full_fingerprint("0123456789abcdef", b"[-1, 1]")
+    '0123456789abcdef-3981c725'
+    """
+    return f"{weights}-{hashlib.sha256(units).hexdigest()[:_DIGITS_OF_UNITS]}"
 
 
 def is_same_policy(noted: Any, asked: Any) -> bool:

@@ -36,6 +36,7 @@ from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.storage.convention import source_convention
 from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
@@ -262,6 +263,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
+        facts["robosuite"] = source_convention(self.source)  # whose meaning the objects' state has
         export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
