@@ -14,6 +14,7 @@ from torchrl_sparse.cli.trials import check_served, check_trials
 from torchrl_sparse.evaluation.results.sweep_files import parameter_sets, read_sweep, trial_command
 from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial
 from torchrl_sparse.runtime.failure import RunFailed
+from torchrl_sparse.storage.yaml import read_yaml
 
 COMMAND = ["${env}", "python", "${program}", "${args_no_hyphens}", "task=lift"]
 METRIC = {"name": "tested/success", "goal": "maximize"}
@@ -58,6 +59,7 @@ TEXTS = [
     "null", "NULL", "true", "1e3", "nan", "12", "a,b", "a=b", "it's",
     'say "x"', "{a: null", "[a", "a]", " a ", "", "a\\", "a\\'",
     "'q'", "range(1,3)", "glob(*)", "[a],[b]", "a\nb", "#x", "é", "2026-01-01",
+    "007", "0x10", "yes", "1_000", "~", "+3", "inf",
 ]  # fmt: skip
 
 
@@ -84,6 +86,22 @@ def test_a_sweep_is_read_as_hydra_reads_yaml(write, line, values):
     path = write({"lr": {"values": ["VALUES"]}})
     path.write_text(path.read_text().replace("values:\n    - VALUES", f"values: {line}"))
     assert read_sweep(path)["parameters"]["lr"]["values"] == values
+
+
+@pytest.mark.parametrize(
+    ("entry", "merged"),
+    [
+        ("{<<: *base, a: 5}", {"a": 5, "lr": 2}),
+        ("{<<: {<<: *base, a: 5, lr: 6}, b: 7}", {"a": 5, "lr": 6, "b": 7}),
+        ("{<<: [{a: 8, lr: 9}, *base]}", {"a": 8, "lr": 9}),
+        ("{<<: [*base, {a: 8, lr: 9, c: 3}]}", {"a": 1, "lr": 2, "c": 3}),
+    ],
+)
+def test_merged_entries_give_way_to_own_and_earlier_ones(tmp_path, entry, merged):
+    """YAML's merge keys: own entries before merged ones, earlier before later. PyYAML 6.0.4 errs where mappings share names."""
+    path = tmp_path / "sweep.yaml"
+    path.write_text(f"base: &base {{a: 1, lr: 2}}\nsampler: {entry}\n")
+    assert read_yaml(path)["sampler"] == merged
 
 
 @pytest.mark.parametrize(
@@ -118,6 +136,8 @@ def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, messag
         ("lr: {value: !!timestamp 2026-01-01}", "parameters.lr.value: expected a text, number, list or mapp"),
         ("lr: {value: !!int ''}", "expected YAML, got "),
         ("lr: {value: &a [*a]}", "expected YAML, got one that is too deep"),
+        ("lr: {value: &a {<<: *a}}", "expected YAML, got one that is too deep"),
+        ("lr: {<<: 3}", "line 2: <<: expected a mapping or a list of them"),
     ],
 )
 def test_what_a_file_says_twice_or_cannot_mean_is_refused(tmp_path, text, message):

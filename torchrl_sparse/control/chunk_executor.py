@@ -246,8 +246,6 @@ class ChunkExecutor(TensorDictModuleBase):
         """Return all that the policy reads, with the last chunk if it asks for that."""
         wanted = [*self.policy.in_keys, *(self.selector.in_keys if self.selector is not None else ())]
         request = tensordict.select(*wanted, strict=False)
-        if keys.IS_INIT in wanted:  # so it is to a policy that takes over in mid-episode
-            request.set(keys.IS_INIT, self._begins(tensordict))
         if keys.ELAPSED in wanted:
             elapsed = self._age(tensordict) + 1
             request.set(keys.ELAPSED, elapsed.masked_fill(keys.read(tensordict, keys.IS_INIT), 0))

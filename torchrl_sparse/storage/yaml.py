@@ -20,7 +20,7 @@ __all__ = ["read_yaml"]
 MAX_ENTRIES = (
     1 << 17
 )  # of a file whose aliases stand for others, which are few lines for any number of entries
-_FLOAT, _DATE = "tag:yaml.org,2002:float", "tag:yaml.org,2002:timestamp"
+_FLOAT, _DATE, _MERGE = (f"tag:yaml.org,2002:{name}" for name in ("float", "timestamp", "merge"))
 
 
 class _Loader(yaml.SafeLoader):
@@ -28,16 +28,37 @@ class _Loader(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
-        names: set[tuple[str, str]] = set()
+        names: set[Any] = set()
         for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode):
-                if (key.tag, key.value) in names:
-                    line = key.start_mark.line + 1
-                    raise ValueError(
-                        f"line {line}: {key.value}: expected one entry of this name, got another"
-                    )
-                names.add((key.tag, key.value))
+            if (name := _name(key)) in names:
+                raise ValueError(f"{_line(key)}: {key.value}: expected one entry of this name, got another")
+            names.add(name)
         return node
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Put merged entries (``<<: *other``) in, of which own ones, then earlier ones count: PyYAML's choice varies."""
+        merged: dict[Any, Any] = {}
+        own: dict[Any, Any] = {}
+        for key, value in node.value:
+            if key.tag != _MERGE:
+                own[_name(key)] = key, value
+                continue
+            for source in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                if not isinstance(source, yaml.MappingNode):
+                    raise ValueError(
+                        f"{_line(key)}: <<: expected a mapping or a list of them, got another value"
+                    )
+                self.flatten_mapping(source)
+                merged = {_name(pair[0]): pair for pair in source.value} | merged
+        node.value = [*(merged | own).values()]
+
+
+def _name(key: yaml.Node) -> Any:
+    return (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else id(key)
+
+
+def _line(node: yaml.Node) -> str:
+    return f"line {node.start_mark.line + 1}"
 
 
 _Loader.yaml_implicit_resolvers = {

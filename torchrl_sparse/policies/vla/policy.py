@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.carried import carried_keys, check_carried
 from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import Decoded
@@ -162,10 +161,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             raise ValueError(
                 f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
             )
-        query = tensordict.select(*self.in_keys, strict=False).reshape(rows)
-        if (started := query.get(keys.IS_INIT, None)) is not None:
-            check_carried(query, carried_keys(self), ~started)
-        return query
+        return tensordict.select(*self.in_keys, strict=False).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
