@@ -24,6 +24,7 @@ from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
+from torchrl_sparse.training.diffusion.begun import begun_policy as read_begun
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
@@ -47,9 +48,10 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
     begun = None if config.init is None else begun_policy(config)
+    if not cameras and (seen := given(config.vision)):
+        raise ValueError(f"vision: expected null without cameras, got {seen}")
     source, train = begun.source if begun else {}, config.train
     train.n_action_steps = executed_steps(task.name, source, train.n_action_steps)
-    config.network = with_published(task.name, config.network)
     config.train = with_published(task.name, train)
     contract = task_contract(task.name, cameras) if begun is None else policy_contract(task.name, begun)
     demos = contract_demos(
@@ -58,16 +60,18 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     if begun is None:
         policy = untrained_policy(
             demos,
-            config.network,
+            given(with_published(task.name, config.network)),
             state_mode=config.state_normalization,
             poses=task.acts_in_poses,
             cameras=[*cameras],
-            **config.vision,
+            **given(config.vision),
             seed=config.seed,
         )
         policy.source = {"task": task.alias, "cameras": cameras} if cameras else {}
     else:
         policy = begun
+    config.network = {name: policy.network.config[name] for name in config.network}
+    config.vision = {"crop": 0.905, "width": 64, **given(config.vision)}
     trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
     size = sum(p.numel() for p in policy.network.parameters())
     data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"
@@ -75,10 +79,15 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     return trainer
 
 
+def given(options: DictConfig | dict) -> dict:
+    """Return the options that are not left open."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
 def begun_policy(config: DictConfig) -> DiffusionPolicy:
     """Read the policy of ``init``, whose ``source`` then says that it is trained for this task."""
-    policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
     cameras = chosen_cameras(config.cameras)
+    policy = read_begun(config.init, config.network, state_mode=config.state_normalization, **config.vision)
     if policy.vision is not None:
         policy.source = {"cameras": cameras} | policy.source
     policy.source = continued_source(config.task, policy)

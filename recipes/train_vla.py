@@ -35,7 +35,7 @@ from torchrl_sparse.training.demonstrations import TrainConfig, trained_paramete
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
-from torchrl_sparse.training.vla.untrained import untrained_policy
+from torchrl_sparse.training.vla.untrained import check_sizes, untrained_policy
 
 
 @recipe("train_vla")
@@ -56,15 +56,19 @@ def make_trainer(config: DictConfig) -> VLATrainer:
     """Read the demonstrations and build what is trained on them."""
     cameras = chosen_cameras(config.cameras)
     policy = None
+    changes = {name: value for name, value in config.network.items() if value is not None}
     if config.init is not None:
         policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
         policy.source = continued_vla_source(config.task, policy, cameras)
+        check_sizes(policy, config.init, size=config.size, rank=config.rank, changes=changes)
     images = Path(config.out) / "images"
     episodes = instructed_demos(config.demos, config.task, cameras, policy, image_folder=images)
     stages = GroundingConfig(**config.grounding)
     objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
     if policy is None:
+        config.size, config.rank = config.size or "small", config.rank or 16
+        config.network = {"chunk_size": 8, **changes}
         sizes = {"changes": config.network, "base": config.base, "rank": config.rank}
         policy = untrained_policy(demos, config.size, cameras=[*cameras], seed=config.seed, **sizes)
         policy.source = VLASource(find_robosuite_task(config.task).name, cameras)

@@ -179,7 +179,8 @@ class ChunkExecutor(TensorDictModuleBase):
         """Return the action f32 [A] of this step of a plain loop, for one robot.
 
         Args:
-            observation: ``"state"``, numbers [Ds] of any real dtype, laid out as `DiffusionPolicy.describe` says; ``"image"``
+            observation: ``"state"``, numbers [Ds] of any real dtype, laid out and in the version of robosuite that
+                `DiffusionPolicy.describe` says, for nothing here can tell one from another; ``"image"``
                 and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s,
                 for an `ActionAwareController`. Histories are kept here.
 

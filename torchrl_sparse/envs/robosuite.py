@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
-from torchrl_sparse.envs.conventions import Convention, check_convention, object_state
+from torchrl_sparse.envs.conventions import check_convention, object_state
 from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
@@ -25,6 +25,7 @@ from torchrl_sparse.rotations import (
     fixes_rotation,
     matrix_to_rot6d,
 )
+from torchrl_sparse.storage.convention import Convention
 
 
 @dataclass(frozen=True)

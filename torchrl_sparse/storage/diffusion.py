@@ -65,8 +65,9 @@ class StoredPolicy:
         source: where an imported policy comes from and how to feed it; empty for policies trained here.
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
             chunk, ``"abs_action"``, whether actions say where to go, ``"robosuite"``, the version whose observations
-            it was trained on, ``"state_keys"``, robomimic's names of the observations that make up the state, in
-            order, and ``"cameras"``, name of the image here -> robomimic's; None for what a checkpoint does not say.
+            it was trained on, ``"control_freq"``, its actions a second, ``"state_keys"``, robomimic's names of the
+            observations that make up the state, in order, and ``"cameras"``, name of the image here -> robomimic's; None or
+            nothing for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
         warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
         engine: that rounds weights and activations; None if nothing is rounded.

@@ -30,10 +30,6 @@ __all__ = [
 ]
 
 
-_DEBUGGING = ("HYDRA_FULL_ERROR",)
-"""Variables of the sweep's own process that are none of its trials'."""
-
-
 @dataclass(frozen=True)
 class Trial:
     """One trial: the id of its wandb run, which also names its folder, its parameters, and whether it is through."""
@@ -154,8 +150,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
         RunFailed: if its command fails.
         FileNotFoundError: if it left no results.
     """
-    inherited = {name: value for name, value in os.environ.items() if name not in _DEBUGGING}
-    environment = inherited | {
+    environment = os.environ | {
         "WANDB_MODE": "offline",
         "WANDB_RUN_ID": trial.id,
         "WANDB_RUN_GROUP": sweep.out.name,

@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
-from torchrl_sparse.networks.fingerprint import networks_fingerprint
+from torchrl_sparse.networks.fingerprint import policy_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
@@ -36,6 +36,7 @@ from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.storage.convention import source_convention
 from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
@@ -186,8 +187,12 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        return networks_fingerprint(self.network, *filter(None, [self.vision]))
+        """A name of its weights, at the fp16 precision in which they are saved, and of its normaliser and training steps.
+
+        Planners and episodes belong to one policy. Earlier files name the weights alone, the part before the hyphen.
+        """
+        units = {"normalizer": self.normalizer.state_dict(), "trained": self.sampler.trained}
+        return policy_fingerprint(self.network, *filter(None, [self.vision]), **units)
 
     @property
     def engine(self) -> EngineName:
@@ -258,6 +263,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
+        facts["robosuite"] = source_convention(self.source)  # whose meaning the objects' state has
         export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
