@@ -29,6 +29,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/mypy
 
 # The pages and the API reference, in site/. The variables silence the theme's and a plugin's announcements.
 docs: install

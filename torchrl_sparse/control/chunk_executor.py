@@ -196,7 +196,7 @@ class ChunkExecutor(TensorDictModuleBase):
             (10,)
         """
         if self._plain is None:
-            self.reset()
+            self._plain = PlainLoop(self, None)
         return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:

@@ -88,7 +88,10 @@ class BlockPushScene:
         ImportError: without pybullet, with the command that installs it.
     """
 
-    def __init__(self):
+    _anchor: np.ndarray  # where the tip is drawn to, f64 [2], m
+    _hold: int  # the constraint that draws it
+
+    def __init__(self) -> None:
         self._bullet = import_extra("pybullet", "blockpush")
         client = import_extra("pybullet_utils.bullet_client", "blockpush")
         self.client = client.BulletClient(self._bullet.DIRECT)
@@ -104,9 +107,9 @@ class BlockPushScene:
         for (x, y, yaw), colour in zip(start.targets, reversed(_COLOURS), strict=True):
             half = ZONE_SIZE / 2
             self._add_box((half, half, 5e-4), (x, y, 0), yaw, mass=0, colour=colour, solid=False)
-        half = (BLOCK_SIZE / 2,) * 3
+        size = (BLOCK_SIZE / 2,) * 3
         self.blocks = [
-            self._add_box(half, (x, y, half[2]), yaw, mass=_BLOCK_MASS, colour=colour)
+            self._add_box(size, (x, y, size[2]), yaw, mass=_BLOCK_MASS, colour=colour)
             for (x, y, yaw), colour in zip(start.blocks, _COLOURS, strict=True)
         ]
         for block in self.blocks:

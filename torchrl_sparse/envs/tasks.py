@@ -40,7 +40,7 @@ class _Named:
             raise ValueError(f"task: expected one that tells its ways, got {self.name!r}, which does not")
         return _load(self.way_of)
 
-    def load_expert(self) -> type:
+    def load_expert(self) -> type[Any]:
         """See `Task.load_expert`."""
         if self.expert is None:
             having = ", ".join(name for name, task in TASKS.items() if getattr(task, "expert", None))
@@ -109,7 +109,7 @@ class RobosuiteTask(_Named):
         return ABSOLUTE_DIM * self.arms
 
     @property
-    def demonstrator(self) -> type:
+    def demonstrator(self) -> type[Any]:
         return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
 
     def pose_slices(self, state_keys: Sequence[str] | None = None) -> list[tuple[slice, slice]]:
@@ -183,7 +183,7 @@ class StateTask(_Named):
         return False
 
     @property
-    def demonstrator(self) -> type:
+    def demonstrator(self) -> type[Any]:
         """See `Task`."""
         return _load(f"{_EXPERTS}.demonstrators:StateDemonstrator")
 
@@ -274,7 +274,8 @@ _OTHERS = (
     StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv", abs_action=True),
 )
 
-TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}
+_TASKS: tuple[Task, ...] = (*_ROBOSUITE, *_OTHERS)
+TASKS: dict[str, Task] = {task.name: task for task in _TASKS}
 """Every task by its name; assign to it to add one."""
 
 

@@ -83,10 +83,10 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     except ValueError as error:
         raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
     try:
-        made = _adapter(kind).validate_json(b"[%b]" % data)[0]
+        made = _adapter(kind).validate_json(b"[%b]" % data)[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
-    if _names_numbers(kind):
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(read, to_plain(made), where)
     return made
 
@@ -105,10 +105,10 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     from pydantic import ValidationError
 
     try:
-        made = _adapter(kind).validate_python((value,))[0]
+        made = _adapter(kind).validate_python((value,))[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
-    if _names_numbers(kind):
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(value, to_plain(made), where)
     return made
 

@@ -269,6 +269,7 @@ class SpecPrune(TokenPruner):
 
     def _accumulate(self, index: int, state: LayerState) -> None:
         """Eqs. 7 to 10, and the score to carry."""
+        assert state.scores is not None  # `after_layer` has looked
         td, alive = state.td, state.visual_alive
         weight = rank_weight(ranks(state.scores, alive), alive, self.options.steepness)
         now = layer_score(weight, confidence(state.scores, alive))

@@ -185,9 +185,11 @@ class PrunerNetwork(nn.Module):
 
     # What is kept follows from the weights: training changes them, as do files and devices, and a copy makes its own.
 
+    _cells: Tensor | None
+    _native: NativePruner | None
+
     def _forget(self) -> None:
-        self._cells: Tensor | None = None
-        self._native: NativePruner | None = None
+        self._cells = self._native = None
 
     def train(self, mode: bool = True) -> PrunerNetwork:
         self._forget()

@@ -138,14 +138,15 @@ class ActionDenoiser(TensorDictModuleBase):
     ) -> tuple[Tensor, Tensor]:
         """Return normalised actions [B, H, A] and FLOPs [B] of queries, each with as many steps as it takes."""
         whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
-        numbers = [whole] if num_steps is None else sorted(set(num_steps.flatten().tolist()))
-        if numbers in ([], [whole]):
+        steps = None if num_steps is None else num_steps.flatten()
+        numbers = [whole] if steps is None else sorted(set(steps.tolist()))
+        if steps is None or start is None or numbers in ([], [whole]):
             return self.run(noise, cond, mask, self.reuse, None, guide), mask_flops(sizes, mask)
         if not 1 <= numbers[0] <= numbers[-1] <= whole:
             raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
         actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
         for number in numbers:
-            rows = num_steps.flatten() == number
+            rows = steps == number
             part = self._last_steps(number, noise[rows], mask[rows], start[rows].to(noise))
             drawn = None if guide is None else guide.rows(rows)
             actions[rows] = self.run(part[0], cond[rows], part[1], self.reuse, number, drawn)
