@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,7 +154,16 @@ class BlockPushScene:
         """Free the simulator."""
         self._ending()
 
-    def _add_box(self, half, position, yaw, *, mass, colour, solid=True) -> int:
+    def _add_box(
+        self,
+        half: Sequence[float],
+        position: Sequence[float],
+        yaw: float,
+        *,
+        mass: float,
+        colour: Sequence[float],
+        solid: bool = True,
+    ) -> int:
         client, box = self.client, self._bullet.GEOM_BOX
         shape = client.createCollisionShape(box, halfExtents=half) if solid else -1
         look = client.createVisualShape(box, halfExtents=half, rgbaColor=colour)

@@ -46,7 +46,7 @@ class LiftCrowded(LiftNamed):
         angle = self.rng.uniform(0, 2 * np.pi)
         self._put(np.array(RADII) * [np.cos(angle), np.sin(angle)])
 
-    def _pre_action(self, action, policy_step: bool = False) -> None:
+    def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
         super()._pre_action(action, policy_step)
         data = self.sim.data
         if self._orbit is None:

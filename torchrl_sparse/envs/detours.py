@@ -86,7 +86,7 @@ class Detour:
         super()._reset_internal()  # type: ignore[misc]  # these are of robosuite's class behind it
         self.way = NO_WAY
 
-    def _pre_action(self, action, policy_step: bool = False) -> None:
+    def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
         super()._pre_action(action, policy_step)  # type: ignore[misc]
         place = self._place()
         if self.obstacle.holds(place):

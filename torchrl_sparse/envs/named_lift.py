@@ -83,7 +83,7 @@ class LiftNamed(Lift):
 class SpacedSampler(UniformRandomSampler):
     """Draws all places again until centres are at least `SPACING` apart."""
 
-    def sample(self, *args, **kwargs) -> dict:
+    def sample(self, *args: Any, **kwargs: Any) -> dict:
         while True:
             placed = super().sample(*args, **kwargs)
             centres = [np.array(position[:2]) for position, _, _ in placed.values()]

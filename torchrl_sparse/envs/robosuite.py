@@ -151,7 +151,11 @@ class RobosuiteEnv(SeededEnv):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        initial_state: InitialState | None = None,
+        **kwargs: Any,
     ) -> TensorDictBase:
         self._unseen = False
         if initial_state is None:

@@ -24,7 +24,7 @@ CONTROL_FREQ = 20
 _LOADING = threading.Lock()
 
 
-def import_robosuite():
+def import_robosuite() -> Any:
     """Import robosuite without its start-up warnings, and also where no GL library is installed.
 
     Raises:

@@ -118,7 +118,12 @@ def denoise(
 
 
 def _block_output(
-    network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor | None
+    network: TransformerForDiffusion,
+    block: int,
+    x: Tensor,
+    memory: Tensor,
+    rows: Tensor | bool,
+    latest: Tensor | None,
 ) -> Tensor:
     """Return what ``block`` adds: computed for ``rows`` (True: all, False: none), ``latest`` for the others."""
     if rows is True:

@@ -195,7 +195,7 @@ class PrunerNetwork(nn.Module):
         self._forget()
         return super().train(mode)
 
-    def _apply(self, fn, recurse: bool = True) -> PrunerNetwork:
+    def _apply(self, fn: Any, recurse: bool = True) -> PrunerNetwork:
         self._forget()
         return super()._apply(fn, recurse)
 

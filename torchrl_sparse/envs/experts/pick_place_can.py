@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class PickPlaceCanExpert(Expert):
         return [Waypoint(self.above(hand, grasp), aligned, OPEN)]
 
     @property
-    def _object(self):
+    def _object(self) -> Any:
         return self.sim_env.objects[self.sim_env.object_id]
 
     @property

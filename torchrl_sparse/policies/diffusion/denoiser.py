@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -64,7 +64,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self._counted: tuple[Tensor | None, float] = (None, 0.0)
 
     @property
-    def in_keys(self):
+    def in_keys(self) -> list[NestedKey]:
         own = [keys.COND, keys.SEED, keys.PRUNE_MASK]
         return [*own, *self._begin_keys(), *self._guide_keys()]
 
@@ -75,7 +75,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return [keys.KNOWN, keys.PULL] if self.guided else []
 
     @property
-    def out_keys(self):
+    def out_keys(self) -> list[NestedKey]:
         return [keys.CHUNK, keys.FLOPS]
 
     @property

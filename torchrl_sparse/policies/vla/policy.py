@@ -144,7 +144,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     # -- running it ----------------------------------------------------------------------------------------------------
 
     def forward(
-        self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None, **kwargs
+        self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
