@@ -260,7 +260,7 @@ _ROBOSUITE = (
         expert=_expert("tool_hang:ToolHangExpert"),
     ),
 )
-_OTHERS = (
+_OTHERS: tuple[Task, ...] = (
     StateTask(
         "PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert"), by_degrees=True
     ),
@@ -274,8 +274,7 @@ _OTHERS = (
     StateTask("FrankaKitchen", "kitchen", 60, 9, f"{_ENVS}.kitchen:KitchenEnv", abs_action=True),
 )
 
-_TASKS: tuple[Task, ...] = (*_ROBOSUITE, *_OTHERS)
-TASKS: dict[str, Task] = {task.name: task for task in _TASKS}
+TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}
 """Every task by its name; assign to it to add one."""
 
 

@@ -177,14 +177,8 @@ class Sampler:
         written, asked = parts.num_inference_steps, num_inference_steps
         if None not in (written, asked) and written != asked:
             raise ValueError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
-        return cls(
-            parts.kind,
-            written or asked,
-            num_train_timesteps,
-            timesteps=parts.timesteps,
-            eta=parts.eta,
-            spacing=parts.spacing,
-        )
+        options: dict[str, Any] = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
+        return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
     def variant(self, kind: str = "ddpm", num_inference_steps: int | None = None, **options: Any) -> Sampler:
         """Return another sampler of the same network: what it was trained with stays, see :attr:`trained`.
