@@ -42,6 +42,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/mypy
 
 # Tables that sort and filter, from npm: a site that needs no network to be read.
 VENDOR := .ci/site/vendor

@@ -90,7 +90,7 @@ class ChunkExecutor(TensorDictModuleBase):
         self._written: dict[NestedKey, Entry] = {}  # what the policy writes for one environment
 
     @property
-    def in_keys(self):
+    def in_keys(self) -> list[NestedKey]:
         return _unique(
             [
                 keys.IS_INIT,
@@ -100,7 +100,7 @@ class ChunkExecutor(TensorDictModuleBase):
         )
 
     @property
-    def out_keys(self):
+    def out_keys(self) -> list[NestedKey]:
         chosen = [keys.CHOSEN] if self.selector is not None else []
         own = [keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
         return _unique(
@@ -197,7 +197,7 @@ class ChunkExecutor(TensorDictModuleBase):
             (10,)
         """
         if self._plain is None:
-            self.reset()
+            self._plain = PlainLoop(self, None)
         return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:

@@ -53,7 +53,7 @@ class Demonstrations:
 
     data: TensorDict
     starts: Tensor
-    driven: Tensor = field(default=None)  # type: ignore[assignment]  # never None once made
+    driven: Tensor = field(default=None)  # never None once made
     contract: Contract | None = None
 
     def __post_init__(self) -> None:

@@ -107,8 +107,8 @@ class RobosuiteEnv(SeededEnv):
         horizon = self.task.horizon if horizon is None else horizon
         super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.way_of is not None, device=device)
         self.action_mode = action_mode
-        named = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
-        named = {key: name for key, name in named.items() if name is not None}
+        asked = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
+        named = {key: name for key, name in asked.items() if name is not None}
         if image_size is not None and not named:
             raise ValueError(
                 f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
@@ -152,7 +152,11 @@ class RobosuiteEnv(SeededEnv):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        initial_state: InitialState | None = None,
+        **kwargs: Any,
     ) -> TensorDictBase:
         self._unseen = False
         if initial_state is None:

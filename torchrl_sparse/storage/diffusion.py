@@ -32,7 +32,7 @@ from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
-FORMAT = "torchrl_sparse.diffusion_policy/1"
+FORMAT: Literal["torchrl_sparse.diffusion_policy/1"] = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
 PlanName = Literal["plan.json", "plan"]  # of fixed names alone: a file cannot ask for one elsewhere
 RoundedEngine = Literal["native_bf16", "native_int8"]  # what is no choice of speed alone
@@ -116,7 +116,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
         network, vision = _networks(path / "config.json", config)
         expected = _state(network, vision)
     tensors = read_tensors(path / "model.safetensors", expected)
-    seen = None if vision is None else read_tensors(path / "vision.safetensors", vision.state_dict())
+    seen = {} if vision is None else read_tensors(path / "vision.safetensors", vision.state_dict())
     network, vision = _networks(path / "config.json", config)
     _load(network, take(tensors, _NETWORK))
     if vision is not None:

@@ -86,14 +86,14 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     except ValueError as error:
         raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
     try:
-        made = _adapter(kind).validate_json(b"[%b]" % data)[0]
+        made = _adapter(kind).validate_json(b"[%b]" % data)[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
     try:
         json.loads(b'{"": %b}' % data, object_pairs_hook=_once)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-    if _names_numbers(kind):
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(read, to_plain(made), where)
     return made
 
@@ -112,10 +112,10 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     from pydantic import ValidationError
 
     try:
-        made = _adapter(kind).validate_python((value,))[0]
+        made = _adapter(kind).validate_python((value,))[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
-    if _names_numbers(kind):
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(value, to_plain(made), where)
     return made
 

@@ -101,6 +101,7 @@ class Sampler:
     previous_timesteps: tuple[int, ...]
     alphas_cumprod: Tensor
     coefficients: StepCoefficients
+    _chosen: tuple[int, ...] | None
 
     def __init__(
         self,
@@ -176,7 +177,7 @@ class Sampler:
         written, asked = parts.num_inference_steps, num_inference_steps
         if None not in (written, asked) and written != asked:
             raise ValueError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
-        options = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
+        options: dict[str, Any] = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
     def variant(self, kind: str = "ddpm", num_inference_steps: int | None = None, **options: Any) -> Sampler:

@@ -60,6 +60,7 @@ def spaced_timesteps(
     if spacing not in SPACINGS:
         raise ValueError(f"spacing: expected one of {', '.join(SPACINGS)}, got {spacing!r}")
     num_train, points = len(alphas_cumprod), num_steps + without_last
+    rising: np.ndarray
     if spacing == "leading":
         rising = np.arange(points) * (num_train // points)
     elif spacing == "linspace":

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -95,45 +95,39 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
         super().__init__(stages)
-        self.plan, self.source = plan, {}  # the plan is bound to this network and sampler
+        self.plan = plan  # it is bound to this network and sampler
+        self.source: dict[str, Any] = {}
         self.engine = engine  # which decides how the cameras are encoded, too
         self.eval()
-
-    @property
-    def network(self) -> TransformerForDiffusion:
-        return self.module["denoise"].network
-
-    @property
-    def normalizer(self) -> Normalizer:
-        return self.module["denoise"].normalizer
-
-    @property
-    def vision(self) -> VisionEncoder | None:
-        """Encoder of the cameras."""
-        return self.module["encode"].condition.vision
 
     @property
     def plan(self) -> Planner:
         return self.module["plan"]
 
+    @plan.setter
+    def plan(self, plan: Planner | None) -> None:
+        self._install(plan, self.sampler, self.start)
+
     @property
     def start(self) -> ColdStart:
         return self.module["start"]
+
+    @start.setter
+    def start(self, start: ColdStart | None) -> None:
+        self._install(self.plan, self.sampler, start)
 
     @property
     def sampler(self) -> Sampler:
         return self.module["denoise"].sampler
 
+    @sampler.setter
+    def sampler(self, sampler: Sampler) -> None:
+        self._install(self.plan, sampler, self.start)
+
     def __setattr__(self, name: str, value: Any) -> None:
-        # nn.Module registers any module that is assigned, so properties with setters never see it.
-        if name == "plan":
-            self._install(value, self.sampler, self.start)
-        elif name == "sampler":
-            self._install(self.plan, value, self.start)
-        elif name == "start":
-            self._install(self.plan, self.sampler, value)
-        elif name == "noise":
-            self.module["denoise"].noise = check_noise(value)
+        # nn.Module registers any module that is assigned, so that of itself a property's setter would never see it.
+        if name in ("plan", "start", "sampler", "noise"):
+            object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
 
@@ -161,8 +155,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
                 other training steps.
         """
-        shared = {"vision": self.vision, "engine": self.engine, "sampler": self.sampler}
-        policy = DiffusionPolicy(self.network, self.normalizer, **shared)
+        policy = DiffusionPolicy(
+            self.network, self.normalizer, vision=self.vision, sampler=self.sampler, engine=self.engine
+        )
         policy.source = self.source
         policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
@@ -184,6 +179,10 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     def noise(self) -> str:
         """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
+
+    @noise.setter
+    def noise(self, name: str) -> None:
+        self.module["denoise"].noise = check_noise(name)
 
     @property
     def fingerprint(self) -> str:
@@ -253,12 +252,11 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
                 None nor a `WarmStart`; nothing is written.
         """
+        parts = self.network, self.normalizer, self.sampler, self.vision, self.source
         warm = stored_start(self.start)
-        rounds = self.engine if self.engine in get_args(RoundedEngine) else None
-        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm, rounds
-        write_pretrained(
-            Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
-        )
+        rounds = cast(RoundedEngine, self.engine) if self.engine in get_args(RoundedEngine) else None
+        stored = StoredPolicy(*parts, save_beside(self.plan, Path(path)), warm, rounds)
+        write_pretrained(Path(path), stored, half=half)
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
@@ -298,8 +296,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
         if engine == "auto" and stored.engine is not None:
             engine = stored.engine
-        options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
-        policy = cls(stored.network, stored.normalizer, **options)
+        policy = cls(
+            stored.network, stored.normalizer, vision=stored.vision, sampler=stored.sampler, engine=engine
+        )
         policy.source = stored.source
         policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
         return policy

@@ -116,10 +116,8 @@ def _read_images(
                 f"normalizer: {key}: expected scale 2, offset -1, got {scale.item()}, {offset.item()}"
             )
     states = [read_affine(archive, entries, key, size) for key, size in layout.states.items()]
-    normalizer = Normalizer(
-        *(torch.cat(part) for part in zip(*states, strict=True)),
-        *read_affine(archive, entries, "action", network.input_dim),
-    )
+    scale, offset = (torch.cat(part) for part in zip(*states, strict=True))
+    normalizer = Normalizer(scale, offset, *read_affine(archive, entries, "action", network.input_dim))
     _nothing_left(entries)
     source |= {"state_keys": list(layout.states), "cameras": layout.cameras}
     return network, normalizer, vision
