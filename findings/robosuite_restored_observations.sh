@@ -8,7 +8,7 @@
 # Hurts: demonstrations whose observations are made anew from recorded states, as robomimic's files ask for: each row is then the row
 #   of another state, and a policy is trained on a delay that it will not meet.
 # Live with it: `force_update=True` after every restore.
-# torchrl_sparse: right; it forces the update wherever it observes, and a test makes observations from states in any order.
+# torchrl_sparse: right; it forces the update wherever it observes, and a test restores a state after others.
 set -eu
 dir=$(mktemp -d)
 trap 'rm -rf "$dir"' EXIT
