@@ -63,9 +63,9 @@ class Sampler:
             ``timesteps``, or without those for all training steps.
         num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
         timesteps: K falling diffusion timesteps, where no spacing shall decide.
-        eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance.
+        eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance, and is DDPM where nothing is clipped.
         spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
-            :mod:`~torchrl_sparse.networks.diffusion.spacing`.
+            :mod:`~torchrl_sparse.networks.diffusion.spacing`; a warning says where one begins far from noise.
         clip_sample_range: largest absolute value of a predicted clean action, as in diffusers; 1 for normalised actions.
 
     Attributes:
