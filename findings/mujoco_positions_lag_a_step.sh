@@ -9,7 +9,7 @@
 # Hurts: observations that are made anew from recorded states: they differ from those that were recorded, most where the hand is fast, and
 #   "the replay is exact" fails at the fourth decimal.
 # Live with it: `mj_forward` before reading, on both sides; or a tolerance that knows of it.
-# torchrl_sparse: knows: observations that `convert_robomimic` makes anew are the state's own, 2 ms newer than an environment's;
+# torchrl_sparse: knows: observations that `convert_demos` makes anew are the state's own, 2 ms newer than an environment's;
 #   `data/absolute.py` and the page of recipes say so.
 set -eu
 dir=$(mktemp -d)
