@@ -31,6 +31,9 @@ from torchrl_sparse.storage.json import write_json
 
 @recipe("report", out="file")
 def main(config: DictConfig) -> None:
+    asked = [name for name in ("aggregate", "budgets") if config[name]]
+    if len(asked) > 1:
+        raise ValueError(f"{asked[1]}: expected [] with {asked[0]}, got {list(config[asked[1]])}")
     if config.aggregate:
         results = aggregate_results(config.aggregate)
         write_json(config.out, results)

@@ -72,6 +72,8 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         policy = begun
     config.network = {name: policy.network.config[name] for name in config.network}
     config.vision = {"crop": 0.905, "width": 64, **given(config.vision)}
+    if train.n_action_steps != executed_steps(task.name, policy.source):  # what whoever plays it takes
+        policy.source = policy.source | {"n_action_steps": train.n_action_steps}
     trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
     size = sum(p.numel() for p in policy.network.parameters())
     data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"

@@ -31,7 +31,7 @@ from tests.recipe_modules import load_recipe, options_file, script
 from torchrl_sparse.envs.tasks import TASKS
 from torchrl_sparse.storage.json import read_json
 
-__all__ = ["AS_TYPED", "OTHER", "Call", "OptionTests", "Row", "Run", "Runs", "returning"]
+__all__ = ["AS_TYPED", "OTHER", "Call", "OptionTests", "Row", "Run", "Runs", "play", "returning"]
 
 AS_TYPED = object()
 OTHER = object()
@@ -161,7 +161,7 @@ class Runs:
             self._made[group] = None  # one that fails is not tried again
             changes = () if group is None else self._tests.groups[group]
             words = [_word(self._tests.recipe, change) for change in changes]
-            self._made[group] = _play(self._tests, self._make_folder(), words)
+            self._made[group] = play(self._tests, self._make_folder(), words)
         if (run := self._made[group]) is None:
             pytest.fail("the run failed, see the first test of it", pytrace=False)
         return run
@@ -204,7 +204,7 @@ def _leaves(options: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield prefix + name
 
 
-def _play(tests: type[OptionTests], folder: Path, changes: Sequence[str]) -> Run:
+def play(tests: type[OptionTests], folder: Path, changes: Sequence[str]) -> Run:
     """Run a recipe in this process as its program does, in a folder of its own."""
     module = load_recipe(tests.recipe)
     changed = {word.lstrip("+").partition("=")[0] for word in changes}

@@ -10,7 +10,9 @@ import numpy as np
 import torch
 
 from tests.fixtures.demonstrations import describe, describe_state_task, hands
-from torchrl_sparse import DiffusionPolicy, keys
+from torchrl_sparse import DiffusionPolicy, SAGPruner, keys
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo
 from torchrl_sparse.data.for_policy import contract_demos
 from torchrl_sparse.envs.contract import task_contract
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
@@ -61,6 +63,14 @@ def write_policy(folder: Path, demos: Path, task: str = "lift", **sizes: int) ->
     policy.sampler = policy.sampler.variant("ddpm", 20)
     policy.save_pretrained(folder)
     return policy
+
+
+def write_pruner(folder: Path, policy: DiffusionPolicy) -> None:
+    """Write an untrained pruner of a policy, for chains of two steps."""
+    sampler = policy.sampler.variant("ddim", 2)
+    shape = (policy.n_obs_steps, policy.network.cond_dim)
+    network = PrunerNetwork(sampler.timesteps.tolist(), policy.num_blocks, shape, width=16)
+    SAGPruner(network, PrunerInfo(policy.fingerprint, sampler.name, 0.5)).save_pretrained(folder)
 
 
 def write_reach(folder: Path, task: str = "Reach", **sizes: int) -> DiffusionPolicy:
