@@ -107,15 +107,13 @@ def main(config: DictConfig) -> None:
     if left_out := [name for name in config.videos if name not in actors]:
         print(f"no video of {', '.join(left_out)}: not among the methods")
     try:
-        for name in config.videos:
-            if name in actors:
-                film_masks(name, actors[name], make_env, seeds[0], out, config.threads)
+        for name in filter(actors.__contains__, config.videos):
+            film_masks(name, actors[name], make_env, seeds[0], out, config.threads)
     except RuntimeError as error:  # no GL library
         print(f"no video: {error}")
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}")
-    print(f"\nFiles are in {out}")
+    print(f"\n{format_table(results)}\n\nFiles are in {out}")
 
 
 if __name__ == "__main__":

@@ -33,11 +33,7 @@ from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms
-from torchrl_sparse.evaluation.results.realtime import (
-    RealtimeRun,
-    build_realtime,
-    format_realtime,
-)
+from torchrl_sparse.evaluation.results.realtime import RealtimeRun, build_realtime, format_realtime
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import check_method
 from torchrl_sparse.methods.names import MethodName

@@ -16,15 +16,15 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_sparse.cli.options import given
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.for_policy import contract_demos
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.envs.contract import continued_source, policy_contract, task_contract
+from torchrl_sparse.envs.contract import policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
-from torchrl_sparse.training.diffusion.begun import begun_policy as read_begun
+from torchrl_sparse.training.diffusion.begun import begun_policy
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
@@ -47,7 +47,10 @@ def main(config: DictConfig) -> None:
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
-    begun = None if config.init is None else begun_policy(config)
+    begun = None
+    if config.init is not None:
+        asked = {"state_mode": config.state_normalization, **config.vision}
+        begun = begun_policy(config.init, task.name, config.network, cameras=cameras, **asked)
     if not cameras and (seen := given(config.vision)):
         raise ValueError(f"vision: expected null without cameras, got {seen}")
     source, train = begun.source if begun else {}, config.train
@@ -79,26 +82,6 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"
     print(f"{config.demos}: {data}; {size:,} parameters")
     return trainer
-
-
-def given(options: DictConfig | dict) -> dict:
-    """Return the options that are not left open."""
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def begun_policy(config: DictConfig) -> DiffusionPolicy:
-    """Read the policy of ``init``, whose ``source`` then says that it is trained for this task."""
-    cameras = chosen_cameras(config.cameras)
-    policy = read_begun(config.init, config.network, state_mode=config.state_normalization, **config.vision)
-    if policy.vision is not None:
-        policy.source = {"cameras": cameras} | policy.source
-    policy.source = continued_source(config.task, policy)
-    own = policy_contract(config.task, policy).cameras
-    for name, key in cameras.items():
-        if own.get(name) != key:
-            expected = f"{own.get(name)}, as of the policy in {config.init}"
-            raise ValueError(f"cameras.{name}: expected {expected}, got {key}")
-    return policy
 
 
 def export(trainer: PolicyTrainer, config: DictConfig) -> Path:

@@ -288,3 +288,12 @@ def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> Non
     for pair in options["pairs"]:
         if not set(pair) <= set(methods):
             raise ValueError(f"pairs: expected two of {', '.join(methods)}, got {list(pair)}")
+
+
+def given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that are not left open.
+
+    >>> given({"size": None, "rank": 16})
+    {'rank': 16}
+    """
+    return {name: value for name, value in options.items() if value is not None}

@@ -46,9 +46,7 @@ class InitialState:
 
 
 class RobosuiteEnv(SeededEnv):
-    """One robosuite task with Panda arms at 20 Hz.
-
-    Episodes begin and end as in every `SeededEnv`.
+    """One robosuite task with Panda arms at 20 Hz; episodes begin and end as in every `SeededEnv`.
 
     Args:
         task: one of `torchrl_sparse.envs.tasks.TASKS`.
@@ -110,9 +108,7 @@ class RobosuiteEnv(SeededEnv):
         asked = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         named = {key: name for key, name in asked.items() if name is not None}
         if image_size is not None and not named:
-            raise ValueError(
-                f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
-            )
+            raise ValueError(f"image_size: expected a camera or wrist_camera with it, got {image_size} alone")
         if seen_frames is not None and seen_frames < 1:
             raise ValueError(f"seen_frames: expected None or at least 1, got {seen_frames}")
         self._cameras = Cameras(named, 84 if image_size is None else image_size, fast=fast_render)

@@ -138,8 +138,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         check_trained(sampler, self.sampler)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
-        self.module["denoise"].sampler = sampler
         denoise = self.module["denoise"]
+        denoise.sampler = sampler
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
         denoise.follow(plan)
         self.module["plan"], self.module["start"] = plan, start
@@ -155,9 +155,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
                 other training steps.
         """
-        policy = DiffusionPolicy(
-            self.network, self.normalizer, vision=self.vision, sampler=self.sampler, engine=self.engine
-        )
+        same: dict[str, Any] = {"vision": self.vision, "sampler": self.sampler, "engine": self.engine}
+        policy = DiffusionPolicy(self.network, self.normalizer, **same)
         policy.source = self.source
         policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
@@ -232,8 +231,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        device = self.device
-        start = synchronised_clock(device)
+        start = synchronised_clock(device := self.device)
         # Made now: after the engine's call nothing is in the caches of what makes tensors.
         latency = torch.zeros(*tensordict.batch_size, 1, device=device)
         try:
@@ -294,11 +292,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
-        if engine == "auto" and stored.engine is not None:
-            engine = stored.engine
-        policy = cls(
-            stored.network, stored.normalizer, vision=stored.vision, sampler=stored.sampler, engine=engine
-        )
+        engine = stored.engine or engine if engine == "auto" else engine
+        parts: dict[str, Any] = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
+        policy = cls(stored.network, stored.normalizer, **parts)
         policy.source = stored.source
         policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
         return policy

@@ -167,8 +167,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             raise ValueError(
                 f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
             )
-        query = tensordict.select(*self.in_keys, strict=False)
-        return keys.dense(query, carried_keys(self)).reshape(rows)
+        return keys.dense(tensordict.select(*self.in_keys, strict=False), carried_keys(self)).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
@@ -269,8 +268,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
 
         The policy reads upright images of the published size and crops them itself. What the published evaluation did to
         LIBERO's images before that belongs to the environment, see `torchrl_sparse.envs.instructed.instructed_env`: a turn by
-        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers of the
-        gripper.
+        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers.
 
         Weights stay in the shards, of which the system reads what is used and keeps what there is room for, unless another
         ``dtype`` is asked for or the policy goes to another device. So the files have to stay as they are.

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrl_sparse.envs.contract import continued_source, policy_contract
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -17,18 +18,24 @@ _DROPOUT = ("p_drop_emb", "p_drop_attn")
 
 def begun_policy(
     path: str | Path,
+    task: str,
     sizes: Mapping[str, Any],
     *,
+    cameras: Mapping[str, str],
     state_mode: str | None = None,
     crop: float | None = None,
     width: int | None = None,
 ) -> DiffusionPolicy:
     """Read a policy to train on: its weights, sizes, normaliser, sampler and source stay, its planner does not.
 
+    Its ``source`` then says that it is trained for the task.
+
     Args:
         path: see `DiffusionPolicy.from_pretrained`.
+        task: that it is trained for.
         sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, which no weight
             depends on, is changed to what is asked for.
+        cameras: name -> key of the demonstrations, those of the policy.
         state_mode, crop, width: as of `untrained_policy`; None for the policy's own.
 
     Raises:
@@ -49,7 +56,11 @@ def begun_policy(
         network.load_state_dict(policy.network.state_dict())
     shared = {"vision": policy.vision, "sampler": policy.sampler, "engine": "reference"}
     begun = DiffusionPolicy(network, policy.normalizer, **shared)
-    begun.source = policy.source
+    begun.source = {"cameras": dict(cameras)} | policy.source if policy.vision is not None else policy.source
+    begun.source = continued_source(task, begun)
+    own = policy_contract(task, begun).cameras
+    for name, key in cameras.items():
+        _check(f"cameras.{name}", key, own.get(name), path)
     return begun
 
 
