@@ -130,6 +130,7 @@ class TestOptions(OptionTests):
             Row("init", "other", network("n_emb"), 8),
             Row("train.val_ratio", "0.5", windows, 2 * WINDOWS),
             Row("log_every", "2", first_step("train/loss")),
+            *(f"network.{size}=null" for size in ("n_layer", "n_emb", "n_head")),  # its own
         ],
         [
             Row("task", "block_push", network("input_dim"), 2),
