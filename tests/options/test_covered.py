@@ -9,7 +9,6 @@ from tests.recipe_modules import RECIPES
 NOT_YET = {
     *("benchmark_engine", "profile_query", "profile_vla", "libero_smoke"),
     *("convert_pusht", "convert_robomimic", "render_demos"),
-    *("benchmark_vla", "calibrate_tokens", "realtime", "train_vla"),
 }
 
 
