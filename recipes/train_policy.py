@@ -24,7 +24,7 @@ from torchrl_sparse.envs.contract import policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.training.demonstrations import TrainConfig
-from torchrl_sparse.training.diffusion.begun import begun_policy
+from torchrl_sparse.training.diffusion.begun import continued_policy
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
@@ -50,7 +50,7 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     begun = None
     if config.init is not None:
         asked = {"state_mode": config.state_normalization, **config.vision}
-        begun = begun_policy(config.init, task.name, config.network, cameras=cameras, **asked)
+        begun = continued_policy(config.init, task.name, cameras, config.network, **asked)
     if not cameras and (seen := given(config.vision)):
         raise ValueError(f"vision: expected null without cameras, got {seen}")
     source, train = begun.source if begun else {}, config.train

@@ -11,31 +11,25 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["begun_policy"]
+__all__ = ["begun_policy", "continued_policy"]
 
 _DROPOUT = ("p_drop_emb", "p_drop_attn")
 
 
 def begun_policy(
     path: str | Path,
-    task: str,
     sizes: Mapping[str, Any],
     *,
-    cameras: Mapping[str, str],
     state_mode: str | None = None,
     crop: float | None = None,
     width: int | None = None,
 ) -> DiffusionPolicy:
     """Read a policy to train on: its weights, sizes, normaliser, sampler and source stay, its planner does not.
 
-    Its ``source`` then says that it is trained for the task.
-
     Args:
         path: see `DiffusionPolicy.from_pretrained`.
-        task: that it is trained for.
         sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, which no weight
             depends on, is changed to what is asked for.
-        cameras: name -> key of the demonstrations, those of the policy.
         state_mode, crop, width: as of `untrained_policy`; None for the policy's own.
 
     Raises:
@@ -56,12 +50,31 @@ def begun_policy(
         network.load_state_dict(policy.network.state_dict())
     shared = {"vision": policy.vision, "sampler": policy.sampler, "engine": "reference"}
     begun = DiffusionPolicy(network, policy.normalizer, **shared)
-    begun.source = {"cameras": dict(cameras)} | policy.source if policy.vision is not None else policy.source
-    begun.source = continued_source(task, begun)
-    own = policy_contract(task, begun).cameras
+    begun.source = policy.source
+    return begun
+
+
+def continued_policy(
+    path: str | Path, task: str, cameras: Mapping[str, str], sizes: Mapping[str, Any], **asked: Any
+) -> DiffusionPolicy:
+    """Read a policy to train on for a task of the library: its ``source`` then names the task.
+
+    Args:
+        path, sizes, asked: see `begun_policy`.
+        task: a name or alias.
+        cameras: image -> camera of the demonstrations; they have to be the policy's.
+
+    Raises:
+        FileNotFoundError, ValueError: as `begun_policy` and `continued_source`; and naming a camera that is not the policy's.
+    """
+    policy = begun_policy(path, sizes, **asked)
+    if policy.vision is not None:
+        policy.source = {"cameras": dict(cameras)} | policy.source
+    policy.source = continued_source(task, policy)
+    own = policy_contract(task, policy).cameras
     for name, key in cameras.items():
         _check(f"cameras.{name}", key, own.get(name), path)
-    return begun
+    return policy
 
 
 def _check(option: str, asked: Any, own: Any, path: str | Path) -> None:
