@@ -20,7 +20,7 @@ $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 
 demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
-		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
+		methods=[dense_noise,ddpm5_logsnr,ddpm5_logsnr:int8,bac,sag] videos=[dense,ddpm5_logsnr,bac]
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 

@@ -34,8 +34,8 @@ from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
 from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
-from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.short_table import print_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
@@ -113,7 +113,7 @@ def main(config: DictConfig) -> None:
         print(f"no video: {error}")
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}\n\nFiles are in {out}")
+    print_results(results, config.table, out)
 
 
 if __name__ == "__main__":

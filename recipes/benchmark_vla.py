@@ -36,8 +36,8 @@ from torchrl_sparse.evaluation.benchmarks.vla import (
 from torchrl_sparse.evaluation.benchmarks.vla_measure import draw_methods, measure_methods
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
-from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
+from torchrl_sparse.evaluation.results.short_table import print_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
@@ -110,7 +110,7 @@ def main(config: DictConfig) -> None:
         film_tokens(video, actors[name], make_env, seeds[0], out, config.threads)
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}\n\nFiles are in {out}")
+    print_results(results, config.table, out)
 
 
 if __name__ == "__main__":

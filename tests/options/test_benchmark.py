@@ -108,6 +108,7 @@ class TestOptions(OptionTests):
             Row("split", "test", lambda run: played("seeds")(run)[0], 210_000),
             Row("out", "elsewhere", lambda run: (run.folder / "elsewhere/results.json").is_file(), True),
             Row("logger", "null", lambda run: "wandb" if run.calls["log_benchmark"] else None),
+            Row("table", "full", lambda run: "McNemar's p" in run.printed, True),
             "n_action_steps=8",
         ],
         [

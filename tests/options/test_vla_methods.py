@@ -37,7 +37,7 @@ LOADED = (
     Row("base", "base.gguf", said("base")),
     Row("heads", "[2,2,4]", said("heads")),
     Row("published.chunk_size", "3", said("chunk_size")),
-    Row("device", "'cpu:0'", device("VLAPolicy.to")),
+    Row("device", "'cpu:0'", device("torchrl_sparse.policies.vla.policy.VLAPolicy.to")),
     Row("cameras.image", "frontview_image", lambda run: run.call("instructed_env")["cameras"]["image"]),
     Row("cameras.wrist_image", "side_image", lambda run: run.call("instructed_env")["cameras"]["wrist_image"]),
     Row("horizon", "9", argument("instructed_env", "horizon")),
@@ -73,7 +73,12 @@ def points(policy, episodes, tried, *_):
 class TestCalibrateTokens(OptionTests):
     recipe = "calibrate_tokens"
     base = ("numbers=[0.5,0.9]", "tolerance=0.03")
-    watched = ("load_vla", "VLAPolicy.to", "executor", "ActionAwareController.from_options")
+    watched = (
+        "load_vla",
+        "torchrl_sparse.policies.vla.policy.VLAPolicy.to",
+        "executor",
+        "ActionAwareController.from_options",
+    )
     replaced = {
         LOAD: load,
         "instructed_env": returning(None),
@@ -121,7 +126,12 @@ def played(name, method="dense"):
 class TestBenchmark(OptionTests):
     recipe = "benchmark_vla"
     base = ("methods=[fastv@0.5]", "pairs=[]", "videos=[]", "logger=wandb")
-    watched = ("load_vla", "VLAPolicy.to", "make_design", "describe_policy")
+    watched = (
+        "load_vla",
+        "torchrl_sparse.policies.vla.policy.VLAPolicy.to",
+        "make_design",
+        "describe_policy",
+    )
     replaced = {
         LOAD: load,
         "instructed_env": returning(None),
@@ -131,7 +141,7 @@ class TestBenchmark(OptionTests):
         "matched_number": returning(None),
         "play_rounds": lambda names, play, terms: {name: play(name, terms.design.max_episodes) for name in names},
         "log_benchmark": lambda results, folder, config: wandb_arguments(config, folder, "default"),
-        "format_table": returning("table"),
+        "print_results": returning(None),
         "backend_runtime": lambda *_: nullcontext(),
         **dict.fromkeys(
             ("evaluate", "measure_methods", "build_results", "save_results", "draw_methods", "film_tokens"),
@@ -167,6 +177,7 @@ class TestBenchmark(OptionTests):
             Row("split", "test", first("evaluate", "seeds"), 210_000),
             Row("out", "elsewhere", lambda run: str(run.call("draw_methods")["out"])),
             Row("logger", "null", lambda run: "wandb" if run.calls["log_benchmark"] else None),
+            Row("table", "full", argument("print_results", "style")),
         ],
         [
             Row("task", "lift_crowded", argument("build_results", "task")),

@@ -107,6 +107,7 @@ OPTIONS: dict[str, Any] = {
     # episodes
     "episodes": Count,
     "split": Literal["development", "test"],
+    "table": Literal["short", "full"],
     "accelerate_policy.episodes": Whole,
     **dict.fromkeys(("finalists", "windows"), Count),
     "until": Literal["episodes", "decided"],
