@@ -222,7 +222,7 @@ class EngineCase:
             queries[f"ddim{count}"] = QueryKind(self._ddim(count))
             mask = self._random_mask(count, _SHORT_PRUNE_RATE, generator)
             queries[f"ddim{count}-random50"] = QueryKind(self._ddim(count), mask)
-        for count in (3, 2, 1):
+        for count in range(min(3, steps), 0, -1):
             queries[f"ddim{count}"] = QueryKind(self._ddim(count))
         return queries
 
