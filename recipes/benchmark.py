@@ -105,6 +105,8 @@ def main(config: DictConfig) -> None:
     draw_methods(results, methods, queries, calibration(), out)
     if ways := told_ways(episodes):
         plot_ways(ways, out / "ways.png", title=f"{task.name}, {config.split} seeds: ways that were taken")
+    if left_out := [name for name in config.videos if name not in actors]:
+        print(f"no video of {', '.join(left_out)}: not among the methods")
     try:
         for name in config.videos:
             if name in actors:

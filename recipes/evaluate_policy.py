@@ -70,9 +70,10 @@ def summarize(episodes: list[EpisodeResult]) -> str:
     n, k = len(episodes), sum(episode.success for episode in episodes)
     low, high = wilson_interval(k, n)
     scores = torch.tensor([episode.score for episode in episodes])
+    spread = f" (standard error {scores.std() / n**0.5:.3f})" if n > 1 else ""  # one tells none
     told = [
         f"success {k}/{n} [{low:.2f}, {high:.2f}]",
-        f"score {scores.mean():.3f} (standard error {scores.std() / n**0.5:.3f})",
+        f"score {scores.mean():.3f}{spread}",
         f"steps {sum(episode.length for episode in episodes) / n:.1f}",
     ]
     if parts := [episode.completed for episode in episodes if episode.completed is not None]:

@@ -38,6 +38,9 @@ from torchrl_sparse.methods.token_budget import TokenBudget
 
 @recipe("report", out="file")
 def main(config: DictConfig) -> None:
+    asked = [name for name in ("upgrade", "aggregate", "fronts", "spending", "budgets") if config[name]]
+    if len(asked) > 1:
+        raise ValueError(f"{asked[1]}: expected [] with {asked[0]}, got {list(config[asked[1]])}")
     if config.upgrade:
         for path in map(Path, config.upgrade):
             upgrade(path)

@@ -68,6 +68,8 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         policy.source = {"task": task.alias, "cameras": cameras} if cameras else {}
     else:
         policy = begun
+    if train.n_action_steps != executed_steps(task.name, policy.source):  # what whoever plays it takes
+        policy.source = policy.source | {"n_action_steps": train.n_action_steps}
     trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
     size = sum(p.numel() for p in policy.network.parameters())
     data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"

@@ -1,18 +1,15 @@
 """The table of options knows those of every recipe, and says what each may be."""
 
-import ast
 from pathlib import Path
 
 import hydra
 import pytest
-import yaml
 from omegaconf import OmegaConf
 
-from tests.recipe_modules import RECIPES, options_file, script
+from tests.recipe_modules import RECIPES
 from torchrl_sparse.cli.options import OPTIONS, check_options
 
 NAMES = sorted(path.stem for path in RECIPES.glob("*.yaml"))
-STUDIES = sorted(path.parent.name for path in RECIPES.glob("studies/*/__main__.py"))
 NEEDED = {"convert_demos": ["demos=a", "out=b"]}
 
 
@@ -119,35 +116,3 @@ def test_the_shipped_policy_is_found_from_any_folder_and_one_that_is_here_comes_
     assert shipped.none == "assets/nope"
     (tmp_path / "assets" / "lift").mkdir(parents=True)
     assert shipped.policy == "assets/lift"
-
-
-def leaves(options, prefix=""):
-    for name, value in options.items():
-        if name not in ("defaults", "hydra"):
-            yield prefix + name
-            if isinstance(value, dict):
-                yield from leaves(value, f"{prefix}{name}.")
-
-
-def read_words(path, deep=True):
-    """Attributes and texts in a program and in the modules of the library that it imports: what reads an option names it."""
-    words = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Attribute):
-            words.add(node.attr)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            words.add(node.value)
-        elif deep and isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl_sparse"):
-            module = RECIPES.parent / f"{node.module.replace('.', '/')}.py"
-            words |= read_words(module, deep=False) if module.exists() else set()
-    return words
-
-
-@pytest.mark.parametrize("recipe", [*NAMES, *(f"studies.{name}" for name in STUDIES)])
-def test_every_option_is_read(recipe):
-    file = options_file(recipe)
-    text, words = file.read_text(), read_words(script(recipe))
-    options = leaves(yaml.safe_load(text))
-    # a section may be handed over whole; an option may be there for others to refer to
-    unread = [o for o in options if not words & set(o.split(".")) and f"${{{o}}}" not in text]
-    assert not unread

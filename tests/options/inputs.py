@@ -10,10 +10,17 @@ import numpy as np
 import torch
 
 from tests.fixtures.demonstrations import describe, describe_state_task, hands
-from torchrl_sparse import DiffusionPolicy, keys
-from torchrl_sparse.data.for_policy import contract_demos
+from torchrl_sparse import DiffusionPolicy, SAGPruner, keys
+from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.blocks.sag.planner import PrunerInfo
+from torchrl_sparse.data.for_policy import contract_demos, instructed_demos
+from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.envs.contract import task_contract
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.storage.vla import VLASource
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
+from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
+from torchrl_sparse.training.vla.untrained import untrained_policy as untrained_vla
 
 STEPS = 15
 """Of each demonstration."""
@@ -63,8 +70,25 @@ def write_policy(folder: Path, demos: Path, task: str = "lift", **sizes: int) ->
     return policy
 
 
+def write_pruner(folder: Path, policy: DiffusionPolicy) -> None:
+    """Write an untrained pruner of a policy, for chains of two steps."""
+    sampler = policy.sampler.variant("ddim", 2)
+    shape = (policy.n_obs_steps, policy.network.cond_dim)
+    network = PrunerNetwork(sampler.timesteps.tolist(), policy.num_blocks, shape, width=16)
+    SAGPruner(network, PrunerInfo(policy.fingerprint, sampler.name, 0.5)).save_pretrained(folder)
+
+
 def write_reach(folder: Path, task: str = "Reach", **sizes: int) -> DiffusionPolicy:
     """Write such a policy for one of the tasks that cost nothing, and its demonstrations where recipes look for them."""
     demos = folder.parents[1 if folder.parent.name == "assets" else 0] / f"data/{task.lower()}_proficient.h5"
     write_state_demos(demos, task, (1, 1))
     return write_policy(folder, demos, task, **sizes)
+
+
+def write_vla(folder: Path, demos: Path, task: str = "lift_named", **sizes: int) -> None:
+    """Write a tiny untrained vision-language-action policy of a task."""
+    cameras = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+    shown = InstructedDemonstrations(instructed_demos(demos, task, cameras), read_instructions(demos))
+    policy = untrained_vla(shown, "tiny", cameras=[*cameras], changes=sizes)
+    policy.source = VLASource(find_task(task).name, cameras)
+    policy.save_pretrained(folder)

@@ -80,7 +80,6 @@ class TestOptions(OptionTests):
     }
     groups = (
         [
-            Row("engine", "reference", lambda run: played("actor")(run).policy.engine),
             Row("device", "'cpu:0'", lambda run: str(run.call("DiffusionPolicy.to")["args"][0])),
             Row("planners", "plans", results("methods", "saved", "prune_rate"), 0.5),
             Row("pairs", "[[saved,uniform]]", pairs),
@@ -104,6 +103,7 @@ class TestOptions(OptionTests):
         ],
         [
             Row("methods", "[ddim2]", lambda run: [*results("methods")(run)], ["dense", "ddim2"]),
+            Row("engine", "reference", lambda run: played("actor")(run).policy.engine),
             Row("policy", "other", results("policy", "horizon"), 12),
             Row("split", "test", lambda run: played("seeds")(run)[0], 210_000),
             Row("out", "elsewhere", lambda run: (run.folder / "elsewhere/results.json").is_file(), True),

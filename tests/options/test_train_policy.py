@@ -57,6 +57,11 @@ def windows(run):
     return int(re.search(r"(\d+) training windows", run.printed)[1])
 
 
+def windows_and_noted(run):
+    """And what the policy says, for whoever plays it."""
+    return windows(run), exported("source", "n_action_steps")(run)
+
+
 def scales_of_the_state(run):
     return len(load_file(run.out / "policy/model.safetensors")["normalizer.state_scale"].unique()) > 1
 
@@ -116,7 +121,7 @@ class TestOptions(OptionTests):
             Row("seed", "5", lambda run: run.call("untrained_policy")["seed"]),
             Row("filter_key", "few", demonstrations, 2),
             Row("state_normalization", "range", scales_of_the_state, True),
-            Row("train.n_action_steps", "4", windows, WINDOWS - 4),
+            Row("train.n_action_steps", "4", windows_and_noted, (WINDOWS - 4, 4)),
             Row("out", "elsewhere", lambda run: (run.folder / "elsewhere/policy").is_dir(), True),
             Row("logger", "csv", logger_kind),
             "train.val_ratio=0.5",

@@ -35,7 +35,9 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
         >>> make(seeds=[7]).reset()["history", "state"].shape
         torch.Size([2, 19])
     """
-    contract, options = policy_contract(task, policy), {"n_obs_steps": policy.n_obs_steps, "horizon": horizon}
+    contract, options = policy_contract(task, policy), {"n_obs_steps": policy.n_obs_steps}
+    if horizon is not None:  # else an environment has its own default
+        options["horizon"] = horizon
     if isinstance(found := find_task(task), RobosuiteTask):
         options |= {"state_keys": contract.state_keys, "convention": contract.convention}
     if policy.vision is not None:

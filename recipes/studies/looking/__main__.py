@@ -52,6 +52,10 @@ def main(config: DictConfig) -> None:
         torch.set_num_threads(config.threads)
     if config.oracle.attempts and not config.pruner:
         raise ValueError(f"oracle.attempts: expected 0 without a pruner, got {config.oracle.attempts}")
+    if config.sampler and config.pruner:
+        raise ValueError(
+            f"sampler: expected null with a pruner, which brings its own, got {config.sampler!r}"
+        )
     policy, task = make_policy(config), find_task(config.task).name
     n_action_steps = published_shape(task).n_action_steps
     seeds = tuning_seeds(DEVELOPMENT_SEED, config.episodes)
