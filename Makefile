@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs install sanitize torture findings
+.PHONY: demo test test-rest test-all lint docs install sanitize torture findings
 
 install: $(VENV)/.installed
 
@@ -22,16 +22,39 @@ demo: install
 	$(BIN)/python recipes/benchmark.py task=lift episodes=10 latency_repeats=10 out=outputs/demo \
 		methods=[ddim10,ddim_87_20,uniform,bac_unified,bac_blockwise,bac,l2c,sag] videos=[dense,bac,sag]
 
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# The quick tier: a few minutes on two cores.
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -m "not full and not slow"
+
+# What the quick tier leaves out, but for gigabytes; with workers on Ray.
+test-rest: $(VENV)/.ray
+	$(PYTEST) -m "full and not slow"
+
+test-all: test test-rest
+
+$(VENV)/.ray: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[ray]"
+	touch $@
 
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/mypy
+
+# Tables that sort and filter, from npm: a site that needs no network to be read.
+VENDOR := .ci/site/vendor
+$(VENDOR): Makefile
+	rm -rf $@ $@.part && mkdir -p $@.part
+	cd $@.part && npm pack --silent datatables.net@3.1.5 datatables.net-dt@3.1.2
+	tar xzf $@.part/datatables.net-3.1.5.tgz -C $@.part --strip-components=2 package/js/dataTables.min.js
+	tar xzf $@.part/datatables.net-dt-3.1.2.tgz -C $@.part --strip-components=2 package/css/dataTables.dataTables.min.css
+	rm $@.part/*.tgz && mv $@.part $@
 
 # The pages and the API reference, in site/. The variables silence the theme's and a plugin's announcements.
-docs: install
+docs: install $(VENDOR)
 	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict --quiet
 
 # The native engine under AddressSanitizer and UndefinedBehaviorSanitizer: any error ends the tests. Linux with g++.

@@ -42,6 +42,7 @@ setup(
     package_dir=BESIDE,
     package_data={
         "torchrl_sparse": [
+            "py.typed",
             "evaluation/figures/*.jinja",
             "blocks/engine/native/*.[ch]*",
             "blocks/engine/native/CMakeLists.txt",

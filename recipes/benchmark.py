@@ -31,13 +31,12 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import (
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
 from torchrl_sparse.evaluation.benchmarks.summary import describe_policy
-from torchrl_sparse.evaluation.figures.ways import plot_ways
+from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms, build_results
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
-from torchrl_sparse.evaluation.results.ways import told_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import check_method, method_identity
@@ -108,15 +107,13 @@ def main(config: DictConfig) -> None:
     if left_out := [name for name in config.videos if name not in actors]:
         print(f"no video of {', '.join(left_out)}: not among the methods")
     try:
-        for name in config.videos:
-            if name in actors:
-                film_masks(name, actors[name], make_env, seeds[0], out, config.threads)
+        for name in filter(actors.__contains__, config.videos):
+            film_masks(name, actors[name], make_env, seeds[0], out, config.threads)
     except RuntimeError as error:  # no GL library
         print(f"no video: {error}")
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
-    print(f"\n{format_table(results)}")
-    print(f"\nFiles are in {out}")
+    print(f"\n{format_table(results)}\n\nFiles are in {out}")
 
 
 if __name__ == "__main__":

@@ -43,7 +43,6 @@ from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
 from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
-from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 
 
@@ -55,7 +54,7 @@ def main(config: DictConfig) -> None:
     filmed = filmed_methods(config.videos, methods)
     options = token_settings(OmegaConf.to_container(config, resolve=True))
     task = find_instructed_task(config.task)  # before a policy is loaded that may be large
-    dense = load_policy(config)
+    dense = load_vla(config, config.task).to(config.device)
     check_budgets(methods, dense.network.config.visual_spec, options)
     make_env = instructed_env(config.task, dense, chosen_cameras(config.cameras), config.horizon)
     design = make_design(config.until, config.episodes, config.max_episodes)
@@ -112,10 +111,6 @@ def main(config: DictConfig) -> None:
     if config.logger == "wandb":
         log_benchmark(results, out, OmegaConf.to_container(config, resolve=True))
     print(f"\n{format_table(results)}\n\nFiles are in {out}")
-
-
-def load_policy(config: DictConfig) -> VLAPolicy:
-    return load_vla(config, config.task).to(config.device)
 
 
 if __name__ == "__main__":

@@ -23,11 +23,10 @@ from torchrl_sparse.envs.contract import task_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.evaluation.results.completed import count_levels
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
-from torchrl_sparse.evaluation.statistics.ways import way_entropy
+from torchrl_sparse.evaluation.statistics.ways import count_levels, way_entropy
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps

@@ -33,17 +33,13 @@ from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.results.build import Terms
-from torchrl_sparse.evaluation.results.realtime import (
-    RealtimeRun,
-    build_realtime,
-    format_realtime,
-    save_realtime,
-)
+from torchrl_sparse.evaluation.results.realtime import RealtimeRun, build_realtime, format_realtime
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import check_method
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
+from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.state_model import fit_state_model
@@ -98,7 +94,7 @@ def main(config: DictConfig) -> None:
         machine=describe_machine(config.device, config.threads),
         terms=terms,
     )
-    save_realtime(results, out / "realtime.json")
+    write_json(out / "realtime.json", results)
     plot_realtime(results, out / "realtime.png")
     print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
 

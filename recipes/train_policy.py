@@ -16,14 +16,15 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_sparse.cli.options import given
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.for_policy import contract_demos
 from torchrl_sparse.data.images import chosen_cameras
-from torchrl_sparse.envs.contract import continued_source, policy_contract, task_contract
+from torchrl_sparse.envs.contract import policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.demonstrations import TrainConfig
+from torchrl_sparse.training.diffusion.begun import continued_policy
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
 from torchrl_sparse.training.diffusion.trainer import PolicyTrainer
 from torchrl_sparse.training.diffusion.untrained import untrained_policy
@@ -46,10 +47,14 @@ def main(config: DictConfig) -> None:
 def make_trainer(config: DictConfig) -> PolicyTrainer:
     """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
-    begun = None if config.init is None else begun_policy(config)
+    begun = None
+    if config.init is not None:
+        asked = {"state_mode": config.state_normalization, **config.vision}
+        begun = continued_policy(config.init, task.name, cameras, config.network, **asked)
+    if not cameras and (seen := given(config.vision)):
+        raise ValueError(f"vision: expected null without cameras, got {seen}")
     source, train = begun.source if begun else {}, config.train
     train.n_action_steps = executed_steps(task.name, source, train.n_action_steps)
-    config.network = with_published(task.name, config.network)
     config.train = with_published(task.name, train)
     contract = task_contract(task.name, cameras) if begun is None else policy_contract(task.name, begun)
     demos = contract_demos(
@@ -58,16 +63,18 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     if begun is None:
         policy = untrained_policy(
             demos,
-            config.network,
+            given(with_published(task.name, config.network)),
             state_mode=config.state_normalization,
             poses=task.acts_in_poses,
             cameras=[*cameras],
-            **config.vision,
+            **given(config.vision),
             seed=config.seed,
         )
         policy.source = {"task": task.alias, "cameras": cameras} if cameras else {}
     else:
         policy = begun
+    config.network = {name: policy.network.config[name] for name in config.network}
+    config.vision = {"crop": 0.905, "width": 64, **given(config.vision)}
     if train.n_action_steps != executed_steps(task.name, policy.source):  # what whoever plays it takes
         policy.source = policy.source | {"n_action_steps": train.n_action_steps}
     trainer = PolicyTrainer(policy.to(config.device), demos, TrainConfig(**config.train))
@@ -75,21 +82,6 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
     data = f"{len(demos)} demonstrations, {len(demos.data)} steps, {len(trainer.train_rows)} training windows"
     print(f"{config.demos}: {data}; {size:,} parameters")
     return trainer
-
-
-def begun_policy(config: DictConfig) -> DiffusionPolicy:
-    """Read the policy of ``init``, whose ``source`` then says that it is trained for this task."""
-    policy = DiffusionPolicy.from_pretrained(config.init, engine="reference")
-    cameras = chosen_cameras(config.cameras)
-    if policy.vision is not None:
-        policy.source = {"cameras": cameras} | policy.source
-    policy.source = continued_source(config.task, policy)
-    own = policy_contract(config.task, policy).cameras
-    for name, key in cameras.items():
-        if own.get(name) != key:
-            expected = f"{own.get(name)}, as of the policy in {config.init}"
-            raise ValueError(f"cameras.{name}: expected {expected}, got {key}")
-    return policy
 
 
 def export(trainer: PolicyTrainer, config: DictConfig) -> Path:

@@ -21,6 +21,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_sparse import keys
+from torchrl_sparse.cli.options import given
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.for_policy import instructed_demos
 from torchrl_sparse.data.images import chosen_cameras
@@ -35,7 +36,7 @@ from torchrl_sparse.training.demonstrations import TrainConfig, trained_paramete
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.vla.grounding import GroundingConfig, ObjectPositions
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations, VLATrainer
-from torchrl_sparse.training.vla.untrained import untrained_policy
+from torchrl_sparse.training.vla.untrained import check_sizes, untrained_policy
 
 
 @recipe("train_vla")
@@ -43,10 +44,9 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     trainer = make_trainer(config)
-    settings = OmegaConf.to_container(config, resolve=True)
     train(
         trainer,
-        settings,
+        OmegaConf.to_container(config, resolve=True),
         export=partial(export, trainer, config),
         evaluate=partial(closed_loop_success, trainer, config),
     )
@@ -54,17 +54,18 @@ def main(config: DictConfig) -> None:
 
 def make_trainer(config: DictConfig) -> VLATrainer:
     """Read the demonstrations and build what is trained on them."""
-    cameras = chosen_cameras(config.cameras)
-    policy = None
+    cameras, policy, changes = chosen_cameras(config.cameras), None, given(config.network)
     if config.init is not None:
         policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
         policy.source = continued_vla_source(config.task, policy, cameras)
-    images = Path(config.out) / "images"
+        check_sizes(policy, config.init, size=config.size, rank=config.rank, changes=changes)
+    stages, images = GroundingConfig(**config.grounding), Path(config.out) / "images"
     episodes = instructed_demos(config.demos, config.task, cameras, policy, image_folder=images)
-    stages = GroundingConfig(**config.grounding)
     objects = None if stages == GroundingConfig() else read_objects(config)
     demos = InstructedDemonstrations(episodes, read_instructions(config.demos), objects)
     if policy is None:
+        config.size, config.rank = config.size or "small", config.rank or 16
+        config.network = {"chunk_size": 8, **changes}
         sizes = {"changes": config.network, "base": config.base, "rank": config.rank}
         policy = untrained_policy(demos, config.size, cameras=[*cameras], seed=config.seed, **sizes)
         policy.source = VLASource(find_robosuite_task(config.task).name, cameras)
@@ -85,8 +86,7 @@ def read_objects(config: DictConfig) -> ObjectPositions:
 
 
 def export(trainer: VLATrainer, config: DictConfig) -> Path:
-    path = Path(config.out) / "policy"
-    averaged_policy(trainer).save_pretrained(path)
+    averaged_policy(trainer).save_pretrained(path := Path(config.out) / "policy")
     return path
 
 

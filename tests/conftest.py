@@ -16,6 +16,15 @@ def ctrl_c_interrupts():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """What runs on Ray waits for the tier that installs it."""
+    for item in items:
+        parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        if "ray_cluster" in item.fixturenames or "ray" in map(str, parameters):
+            item.add_marker(pytest.mark.full)
+
+
 def pytest_collection_finish():
     """Robosuite collects garbage whenever a simulator closes, 0.4 s each time if all that was imported is looked through."""
     gc.freeze()

@@ -104,11 +104,14 @@ def test_distributions_install_with_and_without_a_compiler(tmp_path, compiler):
         "recipes/benchmark.yaml",
         "recipes/examples/robot_loop.py",
         "assets/lift/model.safetensors",
+        "py.typed",
+        "policies/__init__.pyi",
     ):
         assert f"torchrl_sparse/{packed}" in names
     assert any(name.endswith(".so") for name in names) == (compiler is None)
     with tarfile.open(sdist) as archive:
-        assert any(name.endswith("native.cpp") for name in archive.getnames())
+        for packed in ("native.cpp", "torchrl_sparse/py.typed"):
+            assert any(name.endswith(packed) for name in archive.getnames())
     pip("install", "--no-deps", "--target", str(tmp_path / "installed"), str(wheel))
     code = "import torchrl_sparse, sys; from torchrl_sparse.cli.console import main; print(torchrl_sparse.__file__); main([])"
     outside = {name: value for name, value in environment.items() if name != "PYTHONPATH"}

@@ -4,9 +4,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 
+from tests.counting import CountEnv, counting_policy, episode_length
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.envs.transforms import state_history
 
 NOTE = ("diffusion", "note")
 
@@ -88,6 +91,26 @@ def test_gate_replans_single_samples_in_the_middle_of_a_chunk():
     assert td[keys.AGE].flatten().tolist() == [2, 1]
     assert td[keys.UNTIL_QUERY].flatten().tolist() == [0, 0]  # the controller may ask at any step
     assert keys.REPLAN in executor.out_keys
+
+
+class PayingEnv(CountEnv):
+    """Pays 1 for the step that solves it, wherever in a chunk that falls."""
+
+    def _advance(self, action):
+        super()._advance(action)
+        return float(self._is_solved())
+
+
+@pytest.mark.parametrize("seed", range(4))  # episodes of 7, 5, 10 and 8 steps
+def test_the_reward_of_a_step_inside_a_chunk_is_not_lost(seed):
+    """`MultiAction` loses it (findings/torchrl_multiaction_loses_the_last_reward.sh)."""
+    executor = ChunkExecutor(counting_policy(4), n_action_steps=4)
+    primer = executor.make_tensordict_primer()
+    env = TransformedEnv(PayingEnv([seed]), Compose(InitTracker(), *state_history(2), primer))
+    steps = env.rollout(20, executor)
+    assert len(steps) == episode_length(seed)
+    assert steps["next", "reward"].flatten().tolist() == [0.0] * (len(steps) - 1) + [1.0]
+    assert steps["next", "terminated"][-1]
 
 
 def test_every_key_of_the_policy_is_declared():

@@ -7,6 +7,7 @@ from functools import cache, partial
 
 import pytest
 import torch
+from tensordict import lazy_stack
 from torchrl.collectors import AsyncBatchedCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 
@@ -102,6 +103,21 @@ def test_async_batched_collector(name):
     options = {"frames_per_batch": BATCH, "transport": "driver", "env_backend": "threading"}
     collector = AsyncBatchedCollector(MAKERS, policy=EXECUTORS[name](), total_frames=-1, **options)
     collect(name, collector, in_step=False)
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("name", EXECUTORS)
+def test_rows_that_an_asynchronous_collector_stacks(name, together):
+    actor, steps = EXECUTORS[name](), []
+    envs = [make_count_env(seeds) for seeds in SEEDS]
+    rows = [env.reset() for env in envs]
+    for turn in range(BATCH):
+        served = [0, 1] if together and turn > 2 else [0] if turn < 3 else [turn % 2]
+        answers = actor(lazy_stack([rows[i] for i in served]))
+        for i, answer in zip(served, answers.unbind(0), strict=True):
+            step, rows[i] = envs[i].step_and_maybe_reset(answer)
+            steps.append(step.select(*COMPARED))
+    assert check(name, torch.stack(steps)) == {0, 1, 2, 3}
 
 
 @pytest.mark.usefixtures("forked_workers")

@@ -13,7 +13,6 @@ from torchrl_sparse.control.realtime_executor import RealtimeExecutor
 from torchrl_sparse.control.roll_forward import RollForward, StateModel
 from torchrl_sparse.control.temporal_ensemble import TemporalEnsemble
 from torchrl_sparse.methods.executor import make_executor, make_realtime_executor
-from torchrl_sparse.methods.names import MethodName
 
 LENGTH = 5
 HOLD = TensorDictModule(lambda state: state - 100, in_keys=["state"], out_keys=[keys.HOLD])
@@ -89,7 +88,6 @@ def test_methods_are_ensembled_by_name():
     made = make_executor("ddim2_every2_of3_ensembled", policy, 8)
     assert isinstance(made.policy, TemporalEnsemble)
     assert (made.policy.policy, made.n_action_steps, made.num_samples) == (policy, 2, 3)
-    assert not MethodName.parse("ddim2_ensembled").asked_as_usual
     # What is averaged are chunks that begin at the present step, so the state is rolled inside.
     model = StateModel.fit([(torch.rand(9, 19), torch.rand(9, 10))])
     options = {"hold": HOLD, "latency": 0.1, "control_freq": 20.0, "model": model}

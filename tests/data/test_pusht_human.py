@@ -78,6 +78,9 @@ def test_the_simulator_observes_the_same(source, tmp_path):
         ({"episode_ends": np.array([3, 3])}, r"human\.npz, episode_ends: expected increasing rows above 0, got"),
         ({"episode_ends": np.array([], int)}, r"human\.npz, episode_ends: expected increasing rows above 0, got"),
         ({"action": np.full((7, 2), np.nan)}, r"human\.npz, action: expected finite numbers"),
+        ({"action": np.full((7, 2), "left")}, r"human\.npz, action: expected numbers, got <U4"),
+        ({"action": np.ones((7, 2), complex)}, r"human\.npz, action: expected numbers, got complex128"),
+        ({"episode_ends": np.array([3.0, 7.0])}, r"human\.npz, episode_ends: expected whole numbers, got floa"),
         ({"keypoint": np.zeros((7, 9, 2))}, r"human\.npz, keypoint: expected them where 'state' puts them, got"),
     ],
 )  # fmt: skip
@@ -88,12 +91,29 @@ def test_a_wrong_file_is_refused_by_name(source, tmp_path, changes, message):
     assert not (tmp_path / "human.h5").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", None])
-def test_damaged_files_are_refused(source, tmp_path, content):
-    np.savez(source, **recording())
-    source.write_bytes(source.read_bytes()[:-30] if content is None else content)
-    with pytest.raises(ValueError, match=r"human\.npz: expected a complete npz file"):
+def flip(content, place):
+    return content[:place] + bytes([content[place] ^ 255]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda _: b"",
+        lambda _: b"hello",
+        lambda content: content[:-30],
+        lambda content: content[100:],
+        lambda content: flip(content, 200),  # within an array: its checksum fails, or its compression
+        lambda content: flip(content, content.index(b"PK\x01\x02") + 10),  # how an array is compressed
+    ],
+)
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_damaged_files_are_refused(source, tmp_path, damage, save):
+    save(source, **recording())
+    source.write_bytes(damage(source.read_bytes()))
+    with pytest.raises(ValueError, match=r"human\.npz: expected a complete npz file") as error:
         convert_pusht(source, tmp_path / "human.h5")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "human.h5").exists()
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -8,9 +8,10 @@ import pytest
 
 from torchrl_sparse import DiffusionPolicy, keys
 from torchrl_sparse.envs.contract import policy_contract
-from torchrl_sparse.envs.conventions import source_convention, translate_objects
+from torchrl_sparse.envs.conventions import translate_objects
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
+from torchrl_sparse.storage.convention import source_convention
 
 # joint positions and observations after five steps; by robosuite 1.4.1 with mujoco 3.9
 RECORDED = json.loads(Path(__file__).with_name("robosuite_1_4_1.json").read_text())

@@ -1,7 +1,5 @@
 """Realistic made-up measurements, for tables and figures without a trained policy."""
 
-from pathlib import Path
-
 import numpy as np
 
 from torchrl_sparse.evaluation.latency.measure import Machine, summarize_latency
@@ -23,7 +21,6 @@ MACHINE = Machine("Imaginary CPU @ 2.5 GHz", 1, "cpu", "2.13.0", "2026-01-31T12:
 POLICY = PolicyShape(params=8967434, num_inference_steps=100, horizon=10, n_obs_steps=2, n_action_steps=8)
 DENSE_FLOPS = 15.74e9
 HORIZON = 400
-VERSION_1 = Path(__file__).with_name("version_1.json")  # a results.json as it was written before version 2
 
 
 def make_runs(episodes=100, names=tuple(METHODS), seed=0):

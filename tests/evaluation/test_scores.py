@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import norm, ttest_1samp, ttest_rel
 
 from recipes.studies.pages.page_rows import read_table
+from recipes.studies.pages.scores import score_rows, told_scores
 from tests.evaluation.synthetic import MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.benchmarks.rounds import play_rounds
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
@@ -12,7 +13,6 @@ from torchrl_sparse.evaluation.results.acceleration import Played
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
-from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.evaluation.statistics.scores import difference_interval, difference_z, mean_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design

@@ -1,8 +1,8 @@
 """The ways that episodes took: counted, and as a picture."""
 
+from recipes.studies.pages.ways import way_rows
 from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
-from torchrl_sparse.evaluation.figures.ways import plot_ways
-from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
+from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
 WAYS = {"dense": [0, 1, 0, 1], "ddim10": [0, 0, BETWEEN, NO_WAY]}

@@ -96,3 +96,8 @@ def test_a_method_from_outside_is_one_line(monkeypatch):
     assert dense.with_pruner(make_pruner("mine", number=share))(query(1))[keys.KEPT] == pytest.approx(
         12.0, abs=1
     )
+
+
+def test_a_number_that_a_method_does_not_take_is_refused():
+    with pytest.raises(ValueError, match=r"number: expected none for dense, got 0\.5"):
+        make_pruner("dense", number=0.5)

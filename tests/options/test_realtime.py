@@ -26,7 +26,7 @@ class TestOptions(OptionTests):
         "format_realtime": returning("table"),
         "episode_horizon": returning(9),
         **dict.fromkeys(
-            ("record_queries", "evaluate_late", "build_realtime", "save_realtime", "plot_realtime"),
+            ("record_queries", "evaluate_late", "build_realtime", "write_json", "plot_realtime"),
             returning(None),
         ),
         "backend_runtime": lambda *_: nullcontext(),

@@ -28,9 +28,8 @@ def put_together(run):
 class TestOptions(OptionTests):
     recipe = "report"
     replaced = {
-        "upgrade": returning(None),
         "aggregate_results": lambda paths: SimpleNamespace(tasks={}),
-        "save_aggregate": returning(None),
+        "write_json": returning(None),
         "aggregate_rows": returning([{"method": "dense"}]),
     }
     groups = (
@@ -39,13 +38,10 @@ class TestOptions(OptionTests):
             Row("runs", "others", lambda run: "ddim10" in page(run), True),
             Row("out", "elsewhere.html", written("elsewhere.html"), True),
         ],
-        [Row("upgrade", "[old.json]", lambda run: [str(call["path"]) for call in run.calls["upgrade"]])],
         [
             Row("aggregate", "[others/results.json,can.json]", put_together),
             "out=together.json",
         ],
-        [Row("fronts", "[others/results.json]", drawn, ["fronts.png"]), "out=fronts.png"],
-        [Row("spending", "[others/results.json]", drawn, ["spending.png"]), "out=spending.png"],
         [Row("budgets", "[budget.json]", drawn, ["budgets.png"]), "out=budgets.png"],
     )  # fmt: skip
 

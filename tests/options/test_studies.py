@@ -194,3 +194,21 @@ class TestPages(OptionTests):
     def prepare(folder):
         save_results(make_results(20, names=("dense", "bac")), folder / "below/results.json")
         (folder / "below/page.md").write_text("<!-- table: results.json -->\n<!-- end -->\n")
+
+
+class TestFronts(OptionTests):
+    recipe = "studies.fronts"
+    base = ("results=[one.json]",)
+    replaced = dict.fromkeys(("plot_fronts", "plot_spending"), lambda results, path: path)
+    groups = (
+        [
+            Row("results", "[two.json]", lambda run: [*argument("plot_fronts", "results")(run)[0].methods][-1], "ddim10"),
+            Row("out", "elsewhere.png", argument("plot_fronts", "path")),
+        ],
+        [Row("by", "spending", lambda run: len(run.calls["plot_spending"]), 1)],
+    )  # fmt: skip
+
+    @staticmethod
+    def prepare(folder):
+        save_results(make_results(20, names=("dense", "bac")), folder / "one.json")
+        save_results(make_results(20, names=("dense", "ddim10")), folder / "two.json")

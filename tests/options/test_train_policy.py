@@ -31,6 +31,7 @@ EVALUATE = "torchrl_sparse.evaluation.rollouts.evaluate.evaluate"
 AGENT, WRIST = "agentview_image", "robot0_eye_in_hand_image"
 WINDOWS = STEPS - 10 + 8 + 1
 """Of a demonstration: horizon 10, 8 executed actions, two observations."""
+MOVED = "torchrl_sparse.policies.diffusion.policy.DiffusionPolicy.to"
 
 
 def exported(*names):
@@ -77,7 +78,7 @@ class TestOptions(OptionTests):
         *("network.n_layer=1", "network.n_emb=16", "network.n_head=2"),
         *("log_every=1", "checkpoint_every=2", "eval_every=1", "logger=wandb"),
     )
-    watched = (*WATCHED, AVERAGE, "untrained_policy", "DiffusionPolicy.to")
+    watched = (*WATCHED, AVERAGE, "untrained_policy", MOVED)
     replaced = {
         LOGGER: csv_logger,
         EVALUATE: lambda *_, **__: [EpisodeResult(0, True, 8, 1, 10.0, 0.5)],
@@ -104,7 +105,7 @@ class TestOptions(OptionTests):
             Row("train.ema_max_decay", "0.5", average("decay")),
             Row("train.precision", "bf16", precision),
             Row("train.seed", "5", batch("seed")),
-            Row("device", "'cpu:0'", lambda run: str(run.call("DiffusionPolicy.to")["args"][0])),
+            Row("device", "'cpu:0'", lambda run: str(run.call(MOVED)["args"][0])),
             Row("threads", "2", threads),
             Row("checkpoint_every", "3", first_step("held_out/loss")),
             Row("eval_every", "2", first_step("eval/success")),
@@ -130,6 +131,7 @@ class TestOptions(OptionTests):
             Row("init", "other", network("n_emb"), 8),
             Row("train.val_ratio", "0.5", windows, 2 * WINDOWS),
             Row("log_every", "2", first_step("train/loss")),
+            *(f"network.{size}=null" for size in ("n_layer", "n_emb", "n_head")),  # its own
         ],
         [
             Row("task", "block_push", network("input_dim"), 2),

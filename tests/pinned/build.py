@@ -15,12 +15,13 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
-from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
+from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results, compare_pair
 from torchrl_sparse.evaluation.results.engine_report import format_engine_table, load_engine_results
 from torchrl_sparse.evaluation.results.realtime import format_realtime, load_realtime
-from torchrl_sparse.evaluation.results.report import format_pairs, format_table
+from torchrl_sparse.evaluation.results.report import comparison_rows, format_table
 from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
+from torchrl_sparse.evaluation.results.tables import markdown_table, select_columns
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
@@ -41,7 +42,6 @@ __all__ = [
     "diffusion_query",
     "episodes_of",
     "format_engine_table",
-    "format_pairs",
     "format_realtime",
     "format_table",
     "format_vla_table",
@@ -51,6 +51,7 @@ __all__ = [
     "load_vla_results",
     "merge_trials",
     "native_available",
+    "pairs_against",
     "results_of",
     "to_plain",
     "trial_metrics",
@@ -171,3 +172,13 @@ def results_of(episodes: dict[str, list[EpisodeResult]], like: Results) -> Resul
     about = {name: getattr(like, name) for name in ("task", "split", "seed", "machine", "policy")}
     terms = Terms(Design(len(episodes["dense"])), like.episode_horizon, like.early_cut)
     return build_results(runs, terms=terms, **about)
+
+
+_OF_PAIRS = ("method", "against", "success", "difference, points", "verdict", "McNemar's p")
+
+
+def pairs_against(other: str, episodes: dict[str, list[EpisodeResult]], horizon: int) -> str:
+    """A table of each method's difference in success to one of them, paired by seed."""
+    terms = Terms(Design(len(episodes[other])), horizon)
+    pairs = [compare_pair(name, each, other, episodes[other], terms) for name, each in episodes.items()]
+    return markdown_table(select_columns(comparison_rows(pairs), _OF_PAIRS))

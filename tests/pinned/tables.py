@@ -97,7 +97,7 @@ def _episodes(folder: Path) -> list[str]:
         results = build.results_of(episodes, like=build.load_results(folder.parent / "results.json"))
         made.append(build.format_table(results))
         made += [f"{name}: {_numbers(build.to_plain(method))}" for name, method in results.methods.items()]
-        made.append(build.format_pairs(episodes, [(name, other) for name in episodes]))
+        made.append(build.pairs_against(other, episodes, results.episode_horizon))
     return made
 
 

@@ -59,6 +59,12 @@ def test_a_field_without_a_default_is_written_where_it_is_none():
         (table('{"k": true, "ci95": [0, 1]}'), "f.json: rates.a.k: expected a valid integer, got True"),
         (table('{"k": 1, "ci95": [0, "1"]}'), "f.json: rates.a.ci95.1: expected a valid number, got '1'"),
         (table('{"k": 1, "ci95": [0, 1e999]}'), "f.json: rates.a.ci95.1: expected a finite number, got inf"),
+        (
+            table(settings='{"tried": [1, 1e999]}'),
+            "f.json: tried: expected finite numbers, got one beyond floats",
+        ),
+        (table(settings='{"a": 1, "b": 2, "a": 3}'), "f.json: a: expected one entry of this name, got 2"),
+        (table('{"k": 1, "ci95": [0, 1], "k": 1}'), "f.json: k: expected one entry of this name, got 2"),
         (table('{"k": -1, "ci95": [0, 1]}'), "f.json: rates.a.k: expected at least 0, got -1"),
     ],
 )

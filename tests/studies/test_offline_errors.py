@@ -11,6 +11,7 @@ from recipes.studies.offline_errors.agreement import (
     together_rows,
 )
 from recipes.studies.offline_errors.agreement_figure import plot_agreement
+from recipes.studies.offline_errors.errors import OfflineErrors
 from recipes.studies.offline_errors.figure import plot_offline
 from recipes.studies.offline_errors.results import (
     OfflineResults,
@@ -24,7 +25,6 @@ from recipes.studies.offline_errors.results import (
 )
 from recipes.studies.pages.page_rows import read_table
 from torchrl_sparse.evaluation.results.schema import load_results
-from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
 
 
 @pytest.fixture

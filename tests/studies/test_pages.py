@@ -132,7 +132,7 @@ def test_pairs_count_the_episodes_beside_the_results(root):
     for name, outcomes in {"bac": [True] * 20, "ddim10": [True] * 15 + [False] * 5}.items():
         log = EpisodeLog(root / "episodes" / f"{name}.jsonl")
         for index, success in enumerate([*outcomes, False]):  # the last is not of these results
-            log.append(EpisodeResult(100_000 + index, success, 30, 4, 1e9, 0.0))
+            log.append(EpisodeResult(100_000 + index, success, 30 if success else 400, 4, 1e9, 0.0))
     heading, row = table('results.json pairs="bac : ddim10"', root)
     assert heading == ["method", "against", "success", "difference, points", "verdict", "McNemar's p"]
     assert row[:3] == ["bac", "ddim10", "20 : 15"]

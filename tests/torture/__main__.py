@@ -32,6 +32,7 @@ from tests.torture.report import Campaign, Report, Verdict, added, format_report
 
 SANITIZED = Path(__file__).parents[2] / "build" / "sanitize" / "native.so"
 PARTS = ("archives", "files", "engines", "folders", "kills")
+_SHARES = {"archives": 0.1, "files": 0.3, "engines": 0.2}  # of the minutes at most; recipes have what is left
 _SAVED_EVERY = 10.0  # seconds
 
 
@@ -42,7 +43,7 @@ class Options:
     Attributes:
         seed: of everything that is drawn; a new one unless given, printed.
         parts: of the campaign, of archives, files, engines, folders and kills.
-        minutes: after which no further recipe is killed; the other parts come first and are not cut short.
+        minutes: after which no further case is begun. Each part has a share of them and takes its cases in random order.
         kills: after which there are enough; None goes on until ``minutes`` are over.
         files: share of the malformed files that is tried.
         queries: that engines are fuzzed with.
@@ -67,14 +68,16 @@ class Book:
         self._began, self._campaign = time.monotonic(), Campaign(options.seed, command)
         self.note = self._campaign.note
 
-    def take(self, verdicts: Iterable[Verdict]) -> None:
-        """Count verdicts as they come."""
+    def take(self, verdicts: Iterable[Verdict], until: float = float("inf")) -> None:
+        """Count verdicts as they come, none after ``until`` on the monotonic clock."""
         saved = time.monotonic()
         for verdict in verdicts:
             self._campaign.add(verdict)
             if time.monotonic() - saved > _SAVED_EVERY:
                 self.save()
                 saved = time.monotonic()
+            if time.monotonic() > until:
+                break
         self.save()
 
     def save(self) -> Report:
@@ -94,33 +97,38 @@ def run(options: Options, command: str) -> Report:
     """
     if unknown := set(options.parts) - set(PARTS):
         raise ValueError(f"parts: expected some of {', '.join(PARTS)}, got {', '.join(sorted(unknown))}")
-    deadline, book = time.monotonic() + 60 * options.minutes, Book(options, command)
-    parts: dict[str, Callable[[], Iterable[Verdict]]] = {
-        "archives": torture_archives,
-        "files": lambda: torture_files(options.seed, options.files),
-        "engines": lambda: _engines(options, book),
+    length, book = 60 * options.minutes, Book(options, command)
+    deadline = time.monotonic() + length
+    parts: dict[str, Callable[[float], Iterable[Verdict]]] = {
+        "archives": lambda seconds: torture_archives(options.seed),
+        "files": lambda seconds: torture_files(options.seed, options.files),
+        "engines": lambda seconds: _engines(options, book, seconds),
     }
     for name, torture in parts.items():
         if name in options.parts:
-            book.take(torture())
+            seconds = length if options.parts == [name] else length * _SHARES[name]
+            # the engines' process keeps the time itself
+            book.take(torture(seconds), float("inf") if name == "engines" else time.monotonic() + seconds)
     if {"folders", "kills"} & set(options.parts):
         _disturb(options, book, deadline)
     return book.save()
 
 
-def _engines(options: Options, book: Book) -> Iterable[Verdict]:
+def _engines(options: Options, book: Book, seconds: float) -> Iterable[Verdict]:
     library = SANITIZED if SANITIZED.exists() else None
     if library is None:
         book.note("Without the sanitizers: `make sanitize` builds their library.")
-    return torture_engines(options.seed, options.queries, library, 60 + options.queries)
+    return torture_engines(options.seed, options.queries, library, seconds)
 
 
 def _disturb(options: Options, book: Book, deadline: float) -> None:
-    """Run every recipe undisturbed, then share and fill its folder, then kill it."""
+    """Run each recipe undisturbed, share and fill its folder, and kill it; then kill all in turn while there is time."""
     with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        rng, killers = random.Random(options.seed), []
-        for number, tiny in enumerate(list(tiny_recipes(work))):
+        work, rng = Path(folder), random.Random(options.seed)
+        recipes, killers = list(tiny_recipes(work)), []
+        for number, tiny in enumerate(rng.sample(recipes, len(recipes))):
+            if number and time.monotonic() > deadline:
+                return
             runs = work / f"runs{number}"  # Hydra's options cannot hold every name
             try:
                 killers.append(Killer(tiny, runs, rng))
@@ -129,6 +137,8 @@ def _disturb(options: Options, book: Book, deadline: float) -> None:
                 continue
             if "folders" in options.parts:
                 book.take(torture_folder(killers[-1], runs, rng))
+            if "kills" in options.parts:
+                book.take(killers[-1].chain(deadline=deadline))
         if "kills" in options.parts:
             book.take(torture_recipes(killers, deadline, options.kills))
 

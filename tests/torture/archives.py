@@ -118,7 +118,7 @@ def torture_archives(seed: int = 0, share: float = 1.0) -> Iterator[Verdict]:
     """Read hostile archives; the payloads are shown to work on Python's own pickle first.
 
     Args:
-        seed: of the choice.
+        seed: of the choice and of the order.
         share: of them that is tried.
     """
     rng = random.Random(seed)
@@ -129,9 +129,9 @@ def torture_archives(seed: int = 0, share: float = 1.0) -> Iterator[Verdict]:
             raise RuntimeError("expected the payload to work on Python's own pickle, it did not")
         canary.unlink()
         whole = write_checkpoint(Path(work) / "whole.ckpt", LowDimPolicy())
-        for name, write in _archives(whole, canary):
-            if rng.random() < share:
-                yield _try(name, write, Path(work) / "case", canary)
+        archives = list(_archives(whole, canary))
+        for name, write in rng.sample(archives, round(share * len(archives))):
+            yield _try(name, write, Path(work) / "case", canary)
 
 
 def _try(name: str, write: Callable[[Path], None], folder: Path, canary: Path) -> Verdict:

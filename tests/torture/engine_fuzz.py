@@ -1,6 +1,6 @@
 """Engines and the pruner's compiled MLP under random queries, right and wrong ones, against the reference in double precision.
 
-    python -m tests.torture.engine_fuzz seed=0 queries=200
+    python -m tests.torture.engine_fuzz seed=0 queries=200 seconds=300
 
 With ``SANITIZED_NATIVE``, as `make sanitize` sets it, the first error of memory ends the process.
 """
@@ -12,6 +12,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ TOLERANCE = 2e-4
 """Largest difference to double precision, of actions in [-1, 1]."""
 
 _REFUSALS = (ValueError, TypeError)
+_LAST = 240.0  # seconds that the last query may take, and the start
 
 
 @dataclass
@@ -217,14 +219,21 @@ def _prune(rng: random.Random) -> tuple[str, str | None]:
 
 
 def torture_engines(seed: int, queries: int, library: Path | None, seconds: float) -> Iterator[Verdict]:
-    """Fuzz in a process of its own, under the sanitizers where their library is given; the process' end is a case too."""
-    command = [sys.executable, "-m", "tests.torture.engine_fuzz", f"seed={seed}", f"queries={queries}"]
+    """Fuzz in a process of its own, under the sanitizers where their library is given; the process' end is a case too.
+
+    Args:
+        seconds: after which no further query is asked.
+    """
+    words = (f"seed={seed}", f"queries={queries}", f"seconds={seconds}")
+    command = [sys.executable, "-m", "tests.torture.engine_fuzz", *words]
     environment = os.environ | (_sanitizers(library) if library else {})
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=seconds)
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=seconds + _LAST
+        )
         output, fault = done.stdout, done.stderr[-300:] if done.returncode else None
     except subprocess.TimeoutExpired as late:
-        output, fault = (late.stdout or b"").decode(), f"did not end within {seconds:.0f} s"
+        output, fault = (late.stdout or b"").decode(), f"did not end within {seconds + _LAST:.0f} s"
     for line in output.splitlines():
         yield Verdict(**json.loads(line))
     yield Verdict(
@@ -245,7 +254,10 @@ def _sanitizers(library: Path) -> dict[str, str]:
 
 if __name__ == "__main__":
     options = OmegaConf.from_cli()
+    until = time.monotonic() + options.seconds
     for verdict in fuzz(options.seed, options.queries):
         print(json.dumps(vars(verdict)), flush=True)
+        if time.monotonic() > until:
+            break
     if SANITIZED and SANITIZED not in Path("/proc/self/maps").read_text():
         sys.exit(f"expected the engine's library to be {SANITIZED}, it was never loaded")

@@ -42,17 +42,17 @@ class Case:
 
 
 def torture_files(seed: int, share: float = 1.0) -> Iterator[Verdict]:
-    """Read malformed files of every kind.
+    """Read malformed files of every kind, in random order.
 
     Args:
-        seed: of random bytes, and of the choice.
-        share: of the cases of each kind that is tried.
+        seed: of random bytes, of the choice and of the order.
+        share: of all cases that is tried.
     """
     rng = random.Random(seed)
     with tempfile.TemporaryDirectory() as work:
-        for case in _cases(Path(work), rng):
-            if rng.random() < share:
-                yield _try(case, Path(work) / "case")
+        cases = list(_cases(Path(work), rng))
+        for case in rng.sample(cases, round(share * len(cases))):
+            yield _try(case, Path(work) / "case")
 
 
 def _try(case: Case, folder: Path) -> Verdict:

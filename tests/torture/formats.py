@@ -20,7 +20,7 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule
-from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, save_realtime
+from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime
 from torchrl_sparse.evaluation.results.schema import Results, load_results, save_results
 from torchrl_sparse.evaluation.results.sweeps import LocalSweep, SavedSweep, Trial
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
@@ -180,7 +180,7 @@ JSON_FORMATS = [
     ),
     Format(
         "realtime.json",
-        lambda folder: save_realtime(build(dense=DENSE, bac=FAST), folder / "realtime.json"),
+        lambda folder: write_json(folder / "realtime.json", build(dense=DENSE, bac=FAST)),
         lambda folder: load_realtime(folder / "realtime.json"),
         "realtime.json",
         optional={"dense", "bac", *defaulted(Realtime)},

@@ -11,10 +11,8 @@ from tests.options.harness import play
 
 def test_a_report_is_asked_for_one_thing(tmp_path):
     """Own: the recipe's page says "or"; all but the first were passed over."""
-    with pytest.raises(
-        ValueError, match=r"fronts: expected \[\] with upgrade, got \['others/results.json'\]"
-    ):
-        play(report.TestOptions, tmp_path, ["upgrade=[old.json]", "fronts=[others/results.json]"])
+    with pytest.raises(ValueError, match=r"budgets: expected \[\] with aggregate, got \['budget.json'\]"):
+        play(report.TestOptions, tmp_path, ["aggregate=[can.json]", "budgets=[budget.json]"])
 
 
 def test_a_sampler_beside_a_pruner_is_refused(tmp_path):

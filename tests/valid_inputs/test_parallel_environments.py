@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict, lazy_stack
 from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import step_mdp
@@ -90,3 +91,13 @@ def test_a_loop_that_keeps_the_specs_keys_alone_keeps_the_state():
     assert played == [0, 1, 2, 3, 40, 41]
     with pytest.raises(ValueError, match=DROPPED.format("age", 1).replace("2 rows", "1 rows")):
         actor(step_mdp(bare.step(actor(bare.reset())), keep_other=False))
+
+
+def test_rows_that_disagree_about_what_they_have_are_refused():
+    """tensordict: a lazy stack shows the keys of all rows alone; one that a policy reads must not vanish."""
+    first = TensorDict({"state": torch.zeros(2), "budget": torch.ones(1)})
+    second = TensorDict({"state": torch.ones(2), "memory": torch.ones(1)})
+    with pytest.raises(KeyError, match="'budget' in all of 2 rows or in none"):
+        keys.dense(lazy_stack([first, second]), ["memory"])
+    whole = keys.dense(lazy_stack([first.exclude("budget"), second]), ["memory"])
+    assert whole["memory"].tolist() == [[0.0], [1.0]]

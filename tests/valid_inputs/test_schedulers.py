@@ -112,6 +112,7 @@ REFUSED = [
     (DDPM, 10, {"thresholding": True}, "thresholding: expected false"),
     (DDPM, 10, {"rescale_betas_zero_snr": True}, "rescale_betas_zero_snr: expected false"),
     (DDPM, 10, {"variance_type": "fixed_small_log"}, "variance_type: expected 'fixed_small'"),
+    (DDPM, 10, {"variance_type": "fixed_large"}, "variance_type: expected 'fixed_small', got 'fixed_large'"),
     (DDPM, 100, {"steps_offset": 1}, "steps_offset: timesteps: expected 100"),
     (DDPM, 10, {"_target_": "mine.schedulers.DDPMScheduler"}, "expected diffusers' DDPMScheduler or DDIM"),
     (DDIM, 10, {"set_alpha_to_one": False}, "set_alpha_to_one: expected true, got false"),

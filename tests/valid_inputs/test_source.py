@@ -12,6 +12,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from recipes.studies.carried_noise.chains import carried_noise
+from recipes.studies.offline_errors.errors import draw_answers, offline_errors
+from recipes.studies.search_schedule.schedules import Judge
 from tests.data.published_demos import env_args_14, env_args_15
 from tests.evaluation.accelerate.small import GRID, ask, fixed_times
 from tests.recipe_modules import RECIPES, load_recipe
@@ -23,8 +25,6 @@ from torchrl_sparse.envs.contract import continued_source, task_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate import run
-from torchrl_sparse.evaluation.accelerate.schedules import Judge
-from torchrl_sparse.evaluation.statistics.offline import draw_answers, offline_errors
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.calibration import calibrate_policy
 from torchrl_sparse.training.diffusion.targets import make_targets

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from recipes.studies.pages.choices import headline
 from recipes.studies.simulate_stopping.coverage import pair_rates, verdict_errors
 from tests.evaluation.results.test_report import ABOUT, run
 from torchrl_sparse.evaluation.results.build import Terms, build_results
-from torchrl_sparse.evaluation.results.choices import headline
 from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.statistics.aggregate import TaskPairs, aggregate_tasks
 from torchrl_sparse.evaluation.statistics.intervals import mcnemar_p

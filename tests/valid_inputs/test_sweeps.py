@@ -1,18 +1,20 @@
 """Valid W&B sweep files whose trials went wrong: each value arrives as it stands, or is refused by name before a trial runs."""
 
 import json
-import os
 import sys
 
 import pytest
 import yaml
+from hydra import compose, initialize
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from tests.evaluation.results.test_sweeps import finish
+from tests.recipe_modules import load_recipe
 from torchrl_sparse.cli.trials import check_served, check_trials
 from torchrl_sparse.evaluation.results.sweep_files import parameter_sets, read_sweep, trial_command
-from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial, run_trial
+from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial
 from torchrl_sparse.runtime.failure import RunFailed
+from torchrl_sparse.storage.yaml import read_yaml
 
 COMMAND = ["${env}", "python", "${program}", "${args_no_hyphens}", "task=lift"]
 METRIC = {"name": "tested/success", "goal": "maximize"}
@@ -51,6 +53,99 @@ def test_a_value_arrives_as_it_stands(write, tmp_path, parameters, name, read):
     value = override.value()
     plain = {str(key): entry for key, entry in value.items()} if isinstance(value, dict) else value
     assert (override.key_or_group, json.loads(json.dumps(plain, default=str))) == (name, read)
+
+
+TEXTS = [
+    "null", "NULL", "true", "1e3", "nan", "12", "a,b", "a=b", "it's",
+    'say "x"', "{a: null", "[a", "a]", " a ", "", "a\\", "a\\'",
+    "'q'", "range(1,3)", "glob(*)", "[a],[b]", "a\nb", "#x", "é", "2026-01-01",
+    "007", "0x10", "yes", "1_000", "~", "+3", "inf",
+]  # fmt: skip
+
+
+def test_a_text_is_the_text_that_it_is(write):
+    """Source: Hydra's grammar of overrides, in which each of these unquoted is another value, several values, or an error."""
+    path = write({"name": {"values": ["VALUES"]}})
+    path.write_text(path.read_text().replace("values:\n    - VALUES", f"values: {json.dumps(TEXTS)}"))
+    read = read_sweep(path)
+    words = [trial_command(read, parameters)[3] for parameters in parameter_sets(read)]
+    with initialize(version_base=None):
+        arrived = [compose(overrides=[f"+{word}"]).name for word in words]
+    assert arrived == TEXTS
+
+
+@pytest.mark.parametrize(
+    ("line", "values"),
+    [
+        ("[1e-4, 1e3, +1e+2]", [1e-4, 1e3, 1e2]),
+        ("['1e-4', 2026-01-01]", ["1e-4", "2026-01-01"]),
+    ],
+)
+def test_a_sweep_is_read_as_hydra_reads_yaml(write, line, values):
+    """YAML 1.2 and Hydra: an exponent makes a number. PyYAML follows YAML 1.1: a text; and a date, which JSON has not."""
+    path = write({"lr": {"values": ["VALUES"]}})
+    path.write_text(path.read_text().replace("values:\n    - VALUES", f"values: {line}"))
+    assert read_sweep(path)["parameters"]["lr"]["values"] == values
+
+
+@pytest.mark.parametrize(
+    ("entry", "merged"),
+    [
+        ("{<<: *base, a: 5}", {"a": 5, "lr": 2}),
+        ("{<<: {<<: *base, a: 5, lr: 6}, b: 7}", {"a": 5, "lr": 6, "b": 7}),
+        ("{<<: [{a: 8, lr: 9}, *base]}", {"a": 8, "lr": 9}),
+        ("{<<: [*base, {a: 8, lr: 9, c: 3}]}", {"a": 1, "lr": 2, "c": 3}),
+    ],
+)
+def test_merged_entries_give_way_to_own_and_earlier_ones(tmp_path, entry, merged):
+    """YAML's merge keys: own entries before merged ones, earlier before later. PyYAML 6.0.4 errs where mappings share names."""
+    path = tmp_path / "sweep.yaml"
+    path.write_text(f"base: &base {{a: 1, lr: 2}}\nsampler: {entry}\n")
+    assert read_yaml(path)["sampler"] == merged
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (
+            {"out": {"value": "${oc.env:HOME}/a"}},
+            r"out: expected a value that .*\$\{...\}.*, got '\$\{oc.env:HOME",
+        ),
+        ({"train": {"parameters": {"lr": {"values": [1, "${lr}"]}}}}, r"train.lr: expected a value that"),
+        ({"sampler": {"value": {"true": 1}}}, r"sampler: expected a value that .* got \{'true': 1\}"),
+        (
+            {"train": {"value": {"lr": 1}}, "train.lr": {"values": [1, 2]}},
+            "parameters: expected each option once, got train.lr twice",
+        ),
+    ],
+)
+def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, message):
+    """A reference would stand for something else; of two parameters that set one option the last would count."""
+    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+        read_sweep(write(parameters))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed: {values: [1]}\n  seed: {values: [2]}", "line 3: seed: expected one entry of this name, got"),
+        ("seed: {value: 1, value: 2}", "line 2: value: expected one entry of this name, got another"),
+        ("lr: {value: 1e400}", "parameters.lr.value: expected a finite number, got inf"),
+        ("lr: {values: [1, .nan]}", "parameters.lr.values.1: expected a finite number, got nan"),
+        ("on: {value: 1}", "parameters.True: expected a text as a name, got True"),
+        ("lr: {value: !!timestamp 2026-01-01}", "parameters.lr.value: expected a text, number, list or mapp"),
+        ("lr: {value: !!int ''}", "expected YAML, got "),
+        ("lr: {value: &a [*a]}", "expected YAML, got one that is too deep"),
+        ("lr: {value: &a {<<: *a}}", "expected YAML, got one that is too deep"),
+        ("lr: {<<: 3}", "line 2: <<: expected a mapping or a list of them"),
+    ],
+)
+def test_what_a_file_says_twice_or_cannot_mean_is_refused(tmp_path, text, message):
+    """YAML: the names of a mapping are unique. PyYAML keeps the last without a word."""
+    path = tmp_path / "sweep.yaml"
+    path.write_text(f"parameters:\n  {text}\n")
+    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+        read_sweep(path)
 
 
 @pytest.mark.parametrize(
@@ -152,11 +247,12 @@ def test_a_file_without_a_command_gets_what_recipes_need(write, monkeypatch):
 
 
 def test_what_the_servers_agent_cannot_say_is_refused_online(write):
-    path = write({"horizon": {"values": [None, 60]}})
-    with pytest.raises(
-        ValueError, match=r"sweep.yaml: horizon: expected numbers, words or lists with mode=online"
-    ):
-        check_served(path, read_sweep(path), "torchrl_sparse")
+    for value in (None, {"a": 1}, "true", "a=b", ["dense", None]):
+        path = write({"horizon": {"values": [value, 60]}})
+        with pytest.raises(
+            ValueError, match=r"sweep.yaml: horizon: expected numbers, plain words .*mode=online"
+        ):
+            check_served(path, read_sweep(path), "torchrl_sparse")
     path = write({"horizon": {"values": [60]}}, project="mine")
     with pytest.raises(
         ValueError, match=r"project: expected that of .*sweep.yaml, 'mine', got 'torchrl_sparse'"
@@ -164,19 +260,21 @@ def test_what_the_servers_agent_cannot_say_is_refused_online(write):
         check_served(path, read_sweep(path), "torchrl_sparse")
 
 
-def test_a_trial_fails_with_its_own_line(write, tmp_path, monkeypatch):
-    """The sweep's process has Hydra raise its errors; a trial that inherited that would print a traceback."""
+def test_a_trial_shows_a_traceback_where_its_user_asks_for_one(write, tmp_path, monkeypatch, capsys):
+    """Hydra is to raise its errors within the sweep's own process; a trial that inherits that prints tracebacks."""
     program = tmp_path / "trial.py"
-    program.write_text("import os, sys; sys.exit(os.environ.get('HYDRA_FULL_ERROR', 3))")
-    path = write(
-        {"seed": {"values": [1]}},
-        program=str(program),
-        command=[sys.executable, "${program}", "${args_no_hyphens}"],
-    )
+    program.write_text("import os, sys; sys.exit(int(os.environ.get('HYDRA_FULL_ERROR', 3)))")
+    command = [sys.executable, "${program}", "${args_no_hyphens}"]
+    path = write({"seed": {"values": [1]}}, program=str(program), command=command)
+    monkeypatch.setattr(sys, "argv", ["sweep.py", f"sweep={path}", f"out={tmp_path / 'out'}"])
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit):
+        load_recipe("sweep").main()
+    assert "trial seed=1: expected exit code 0, got 3" in capsys.readouterr().err
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    sweep = LocalSweep(read_sweep(path), tmp_path / "out")
-    lock = os.open(os.devnull, os.O_RDONLY)
-    with pytest.raises(RunFailed, match="expected exit code 0, got 3"):
-        run_trial(sweep, sweep.next_trial(), lock)
-    os.close(lock)
+    with pytest.raises(RunFailed, match="trial seed=1: expected exit code 0, got 1"):
+        load_recipe("sweep").main()
+
+
+def test_a_trial_is_called_by_its_parameters():
     assert Trial("a", {"horizon": None}).label == "horizon=None"

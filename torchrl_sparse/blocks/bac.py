@@ -257,7 +257,7 @@ def _schedule(
     method: str,
     calibration: Calibration,
     policy: str,
-    steps: Sequence[Sequence[int]],
+    steps: Sequence[tuple[int, ...]],
     settings: dict[str, Any],
 ) -> CacheSchedule:
     num_blocks, num_steps = calibration.similarity.shape[:2]

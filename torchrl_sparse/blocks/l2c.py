@@ -108,7 +108,7 @@ def _predict(
     outputs = []
     for block in range(network.num_blocks):
         output = network.block(block, x, memory)
-        if cached is not None:
+        if cached is not None and gate is not None:
             output = gate[:, block] * cached[block] + (1 - gate[:, block]) * output
         x = x + output
         outputs.append(output)

@@ -47,7 +47,6 @@ __all__ = [
     "num_buffers",
     "prune_rate",
     "query_flops",
-    "reuse_source",
     "steps_from_mask",
     "validate_mask",
 ]
@@ -161,31 +160,6 @@ def mask_from_steps(steps: Sequence[Iterable[int]], num_steps: int) -> Tensor:
 def steps_from_mask(mask: Tensor) -> tuple[tuple[int, ...], ...]:
     """Return the computed steps of every block of a mask bool [K, 3L]: the inverse of :func:`mask_from_steps`."""
     return tuple(tuple((~column).nonzero().flatten().tolist()) for column in mask.unbind(dim=1))
-
-
-def reuse_source(mask: Tensor, reuse: Reuse = "block") -> tuple[Tensor, Tensor]:
-    """Find which evaluation produced the output that a block adds: its own, or an earlier one if it is pruned.
-
-    Args:
-        mask: bool [*B, K, 3L], row 0 all False.
-        reuse: the reuse rule.
-
-    Returns:
-        (step, column): two i64 [*B, K, 3L]; block c of step t adds what block ``column[t, c]`` computed in
-        step ``step[t, c]``.
-
-    >>> step, column = reuse_source(mask_from_steps([[0, 2], [0], [0, 1]], num_steps=3))
-    >>> step.tolist()
-    [[0, 0, 0], [0, 0, 1], [2, 0, 1]]
-    """
-    check_reuse(reuse)
-    *batch, num_steps, num_blocks = mask.shape
-    # With evaluations numbered in order of execution, the newest computed one is a running maximum.
-    order = torch.arange(num_steps * num_blocks, device=mask.device).view(num_steps, num_blocks)
-    written = order.expand(mask.shape).masked_fill(mask, -1)
-    written = written.reshape(*batch, -1, num_buffers(reuse, num_blocks))
-    newest = written.cummax(dim=-2).values.reshape(mask.shape)
-    return newest // num_blocks, newest % num_blocks
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, MaskError, Reuse, check_form, check_reuse, validate_mask
 from torchrl_sparse.keys import COND, PRUNE_MASK, read
+from torchrl_sparse.networks.fingerprint import is_same_policy
 
 __all__ = ["Dense", "PlanSpec", "Planner", "StaticPlanner"]
 
@@ -55,7 +56,8 @@ class PlanSpec:
         ValueError: BAC: made for policy fingerprint 'a policy', got 'another'
         """
         for name in (field.name for field in fields(self)):
-            if (made_for := getattr(self, name)) != (got := getattr(asked, name)):
+            made_for, got = getattr(self, name), getattr(asked, name)
+            if made_for != got and not (name == "policy" and is_same_policy(made_for, got)):
                 label, remedy = name, ""
                 if name == "policy":
                     label = "policy fingerprint"

@@ -103,7 +103,8 @@ def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] 
     """
     if isinstance(planner, Dense):
         return None
-    storable, name = _storable(planner), "plan.json" if planner.is_static else "plan"
+    storable = _storable(planner)
+    name: Literal["plan.json", "plan"] = "plan.json" if planner.is_static else "plan"
     storable.save_pretrained(folder / name)
     return name
 

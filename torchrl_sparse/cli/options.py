@@ -56,7 +56,7 @@ OPTIONS: dict[str, Any] = {
     "out": Word,
     "dense_log": Word | None,
     "runs": Word,
-    **dict.fromkeys(("upgrade", "aggregate", "fronts", "spending", "budgets"), list[Word]),
+    **dict.fromkeys(("aggregate", "budgets"), list[Word]),
     "title": str,
     "sweep": Word,
     "project": Word,
@@ -78,7 +78,8 @@ OPTIONS: dict[str, Any] = {
     ],
     "pairs": list[Pair],
     "videos": list[Word],
-    **dict.fromkeys(("rank", "num_updates"), Count),
+    "rank": Count | None,
+    "num_updates": Count,
     "calibration_samples": Count,
     "samples": Count,
     "objective": Word,
@@ -198,21 +199,19 @@ OPTIONS: dict[str, Any] = {
     "eval_ddim_steps": Count | None,
     "logger": Literal["csv", "wandb"] | None,
     # sizes of networks
-    "size": Word,
+    "size": Word | None,
     "network": Section,
     "vision": Section,
-    "crop": Share,
+    "crop": Share | None,
     "width": Count,
+    **dict.fromkeys(("train_policy.vision.width", "n_layer", "n_head"), Count | None),
     "obs_width": Count,
     "hidden": Count,
     "reads": Literal["all", "state"],
-    "n_layer": Count,
-    "n_head": Count,
     **dict.fromkeys(("n_emb", "n_obs_steps"), Count | None),
-    "n_cond_layers": Whole,
-    "p_drop_emb": BelowOne,
-    "p_drop_attn": BelowOne | None,
-    "causal_attn": bool,
+    "n_cond_layers": Whole | None,
+    **dict.fromkeys(("p_drop_emb", "p_drop_attn"), BelowOne | None),
+    "causal_attn": bool | None,
     "chunk_size": Count,
 }
 """Option, of one recipe alone after its name and a dot -> type. Of nested options the last word counts."""
@@ -289,3 +288,12 @@ def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> Non
     for pair in options["pairs"]:
         if not set(pair) <= set(methods):
             raise ValueError(f"pairs: expected two of {', '.join(methods)}, got {list(pair)}")
+
+
+def given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that are not left open.
+
+    >>> given({"size": None, "rank": 16})
+    {'rank': 16}
+    """
+    return {name: value for name, value in options.items() if value is not None}

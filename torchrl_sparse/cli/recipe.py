@@ -12,6 +12,7 @@ from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal
+from unittest.mock import patch
 
 import hydra
 from hydra.errors import HydraException
@@ -129,7 +130,8 @@ def _read_options(folder: Path, name: str) -> list[DictConfig]:
     def note(config: DictConfig) -> None:
         read.append(config)
 
-    hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
+    with patch.dict(os.environ, {_FULL: "1"}):  # so that Hydra raises its errors instead of printing them
+        hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
     return read
 
 
@@ -138,14 +140,11 @@ def _one_line_errors() -> Iterator[None]:
     if os.environ.get(_FULL, "0") != "0":
         yield
         return
-    os.environ[_FULL] = "1"  # so that Hydra raises its errors instead of printing them
     try:
         yield
     except _MISTAKES as error:
         print(_one_line(error), file=sys.stderr)
         sys.exit(2)
-    finally:
-        del os.environ[_FULL]
 
 
 def _one_line(error: Exception) -> str:

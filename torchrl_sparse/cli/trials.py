@@ -9,7 +9,13 @@ from typing import Any
 from unittest.mock import patch
 
 from torchrl_sparse.cli.recipe import check_command
-from torchrl_sparse.evaluation.results.sweep_files import find_program, parameter_sets, trial_command
+from torchrl_sparse.evaluation.results.sweep_files import (
+    find_program,
+    hydra_word,
+    parameter_sets,
+    parameter_values,
+    trial_command,
+)
 from torchrl_sparse.evaluation.results.sweeps import Trial
 
 __all__ = ["check_served", "check_trials"]
@@ -38,13 +44,18 @@ def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> Non
 def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
     """Refuse what W&B's own agent hands to a trial in words that Hydra does not read, or to another project."""
     for name, entry in settings["parameters"].items():
-        values = (
-            [entry.get("value"), *entry.get("values", ())] if "value" in entry else entry.get("values", ())
-        )
-        if "parameters" in entry or any(value is None or isinstance(value, dict) for value in values):
-            raise ValueError(
-                f"{file}: {name}: expected numbers, words or lists with mode=online, whose agent writes null and mappings "
-                f"as Hydra does not read them, got {entry!r}"
-            )
+        for option, value in parameter_values(name, entry):
+            if option != name or _agent_changes(value):
+                raise ValueError(
+                    f"{file}: {option}: expected numbers, plain words or lists of them with mode=online, whose agent writes "
+                    f"null, mappings and texts such as 'true' or 'a=b' as Hydra does not read them, got {value!r}"
+                )
     if settings.get("project", project) != project:
         raise ValueError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
+
+
+def _agent_changes(value: Any) -> bool:
+    """Tell whether W&B's agent, which writes a value as Python prints it, writes what Hydra reads as another."""
+    if isinstance(value, list):
+        return any(isinstance(entry, (list, dict)) or entry is None for entry in value)
+    return value is None or isinstance(value, dict) or (isinstance(value, str) and hydra_word(value) != value)

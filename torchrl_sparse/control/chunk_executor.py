@@ -90,7 +90,7 @@ class ChunkExecutor(TensorDictModuleBase):
         self._written: dict[NestedKey, Entry] = {}  # what the policy writes for one environment
 
     @property
-    def in_keys(self):
+    def in_keys(self) -> list[NestedKey]:
         return _unique(
             [
                 keys.IS_INIT,
@@ -100,7 +100,7 @@ class ChunkExecutor(TensorDictModuleBase):
         )
 
     @property
-    def out_keys(self):
+    def out_keys(self) -> list[NestedKey]:
         chosen = [keys.CHOSEN] if self.selector is not None else []
         own = [keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
         return _unique(
@@ -179,7 +179,8 @@ class ChunkExecutor(TensorDictModuleBase):
         """Return the action f32 [A] of this step of a plain loop, for one robot.
 
         Args:
-            observation: ``"state"``, numbers [Ds] of any real dtype, laid out as `DiffusionPolicy.describe` says; ``"image"``
+            observation: ``"state"``, numbers [Ds] of any real dtype, laid out and in the version of robosuite that
+                `DiffusionPolicy.describe` says, for nothing here can tell one from another; ``"image"``
                 and ``"wrist_image"``, u8 [h, w, 3] or [3, h, w], where the policy has cameras; ``"eef_vel"``, m/s and rad/s,
                 for an `ActionAwareController`. Histories are kept here.
 
@@ -196,7 +197,7 @@ class ChunkExecutor(TensorDictModuleBase):
             (10,)
         """
         if self._plain is None:
-            self.reset()
+            self._plain = PlainLoop(self, None)
         return self._plain.act(observation)
 
     def _age(self, tensordict: TensorDictBase) -> Tensor:
@@ -252,7 +253,7 @@ class ChunkExecutor(TensorDictModuleBase):
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
         if keys.DELAY in wanted:
             request.set(keys.DELAY, self._expected_delay(tensordict))
-        return request
+        return keys.dense(request, carried_keys(self.policy))
 
     def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
         """Return i64 [*B, 1]: steps that a query asked now will take; none in a world that waits."""

@@ -33,9 +33,10 @@ class PlainLoop:
                 f"policy: expected one that reads {keys.HISTORY_STATE}, got {type(policy).__name__}"
             )
         self._policy, self._seed, self._step = policy, seed, 0
-        past = {key[1]: deque(maxlen=policy.n_obs_steps) for key in executor.in_keys if key[0] == "history"}
-        self._past: dict[str, deque[Tensor]] = past
-        self._now = {key[1] for key in executor.in_keys if key[0] == "observation"} - past.keys()
+        self._past: dict[str, deque[Tensor]] = {
+            key[1]: deque(maxlen=policy.n_obs_steps) for key in executor.in_keys if key[0] == "history"
+        }
+        self._now = {key[1] for key in executor.in_keys if key[0] == "observation"} - self._past.keys()
         self._carried: TensorDictBase = TensorDict()
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -77,11 +77,11 @@ class RealtimeExecutor(ChunkExecutor):
         self.control_freq = control_freq
 
     @property
-    def in_keys(self):
+    def in_keys(self) -> list[NestedKey]:
         return list(dict.fromkeys([*super().in_keys, *self.hold.in_keys]))
 
     @property
-    def out_keys(self):
+    def out_keys(self) -> list[NestedKey]:
         return [*super().out_keys, keys.DELAY, keys.MEANWHILE]
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:

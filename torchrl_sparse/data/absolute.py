@@ -260,9 +260,9 @@ def _merge(source: Node, out: Path, names: Sequence[str], parts: Path, attribute
         total += open_demo(demos, name)[1]
         with open_demos(_part(parts, name)) as part:
             clipped += part.count("clipped", default=0)
-    told = {"total": total} | ({"clipped": clipped} if clipped else {})
+    told: dict[str, Any] = {"total": total} | ({"clipped": clipped} if clipped else {})
     with new_hdf5(out) as file:
-        data = lay_out(file, names, attributes | told)
+        data = lay_out(file, names, {**attributes, **told})
         source.copy(file, "mask")
         for name in names:
             with open_demos(_part(parts, name)) as part:
@@ -278,7 +278,9 @@ def _fill(target: h5py.Group, demo: Node, part: Node) -> None:
     for name in ("states", "rewards", "dones"):
         demo.copy(target, name)
     observed = demo.find("obs")
-    for name in observed.names() if observed is not None and observed.is_group else ():
+    if observed is None or not observed.is_group:
+        return
+    for name in observed.names():
         item = observed.find(name)
         if (
             item is not None

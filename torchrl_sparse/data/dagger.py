@@ -31,6 +31,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.contract import Contract, policy_contract, task_contract
 from torchrl_sparse.methods.diffusion import make_method
+from torchrl_sparse.networks.fingerprint import is_same_policy
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = ["Driver", "Driving", "load_driver"]
@@ -138,7 +139,7 @@ def load_driver(task: str, driving: Driving) -> Driver:
 
 
 def _check_policy(policy: DiffusionPolicy, driving: Driving) -> None:
-    if policy.fingerprint != driving.fingerprint:
+    if not is_same_policy(driving.fingerprint, policy.fingerprint):
         raise ValueError(
             f"policy: expected the weights {driving.fingerprint} in {driving.policy}, got {policy.fingerprint}"
         )

@@ -11,7 +11,7 @@ import signal
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from itertools import count
@@ -28,8 +28,8 @@ _FAILURES = 3
 
 
 def in_order(
-    task: Callable[[int], None], first: int, workers: int, *, backend: str = "process"
-) -> Iterator[int]:
+    task: Callable[[int], object], first: int, workers: int, *, backend: str = "process"
+) -> Generator[int, None, None]:
     """Call ``task(first)``, ``task(first + 1)``, ... in workers and yield each number once it is done, in order.
 
     A worker that dies, be it while it starts, is reported as a warning; what it and the others had under way is done again.
@@ -84,7 +84,7 @@ def _pool(backend: str, workers: int) -> Executor:
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin_worker)
 
 
-def _submit(pool: Executor, task: Callable[[int], None], number: int) -> Future:
+def _submit(pool: Executor, task: Callable[[int], object], number: int) -> Future:
     try:
         return pool.submit(task, number)
     except OSError:
@@ -122,9 +122,9 @@ class _RayPool(Executor):
         self._call = ray.remote(num_cpus=1, max_retries=0)(_call)
         self._open: set[Any] = set()
 
-    def submit(self, task: Callable[[int], None], number: int) -> Future:
+    def submit(self, task: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """Hand a task out."""
-        reference = self._call.remote(task, number)
+        reference = self._call.remote(task, *args, **kwargs)
         self._open.add(reference)
         future = reference.future()
         future.add_done_callback(lambda _: self._open.discard(reference))
@@ -141,5 +141,5 @@ class _RayPool(Executor):
             ray.wait(running, num_returns=len(running))
 
 
-def _call(task: Callable[[int], None], number: int) -> None:
+def _call(task: Callable[[int], object], number: int) -> None:
     task(number)

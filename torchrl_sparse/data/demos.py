@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache, partial
@@ -164,7 +164,7 @@ def collect(
 
 def _seeds_made(
     parts: Path, collection: Collection, env: EnvBase | None, workers: int, backend: str
-) -> Iterator[int]:
+) -> Generator[int, None, None]:
     """Make one episode after the other, and yield its seed."""
     if workers == 1 and backend == "process":
         own = cache(lambda: find_task(collection.task).make() if env is None else env)

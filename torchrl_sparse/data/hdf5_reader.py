@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -122,7 +123,7 @@ class ArrayReader:
             ValueError: naming it, if it is missing, damaged, too large or of another shape.
         """
         array = _array(demo, name)
-        shape = self._room.enter(array, np.dtype(np.float64).itemsize).shape
+        shape = self._room.enter(array, np.dtype(np.float64).itemsize).shape or ()
         if len(shape) != 2 or shape[0] != length or not length:
             raise ValueError(
                 f"{array.where}: expected shape [{length} = num_samples > 0, n], got {list(shape)}"
@@ -140,7 +141,7 @@ class ArrayReader:
         """
         array = _array(demo, name)
         layout = self._room.enter(array, 1)
-        shape = layout.shape
+        shape = layout.shape or ()
         if layout.dtype != np.uint8 or len(shape) != 4 or (shape[0], shape[3]) != (length, 3):
             raise ValueError(
                 f"{array.where}: expected uint8 [{length}, h, w, 3], got {layout.dtype} {list(shape)}"
@@ -210,7 +211,7 @@ class _Endless(io.RawIOBase):
     def tell(self) -> int:
         return self._at
 
-    def readinto(self, buffer) -> int:
+    def readinto(self, buffer: Any) -> int:
         self._raw.seek(self._at)
         read = self._raw.readinto(buffer)
         if read < len(buffer):

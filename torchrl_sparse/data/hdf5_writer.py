@@ -90,12 +90,12 @@ def merge_episodes(
 
     Equal episodes give equal bytes. A kill leaves either the whole file or none.
     """
-    parts = {f"demo_{index}": part for index, part in enumerate(parts)}
-    total = sum(episode_outcome(part).length for part in parts.values())
+    named = {f"demo_{index}": part for index, part in enumerate(parts)}
+    total = sum(episode_outcome(part).length for part in named.values())
     attributes = {"total": total, "env_args": env_args, "collection": collection}
     with new_hdf5(path) as file:
-        data = lay_out(file, parts, attributes)
-        for name, part in parts.items():
+        data = lay_out(file, named, attributes)
+        for name, part in named.items():
             with open_demos(part) as source:
                 demo = source.group("demo")
                 demo.copy_attributes(data[name])

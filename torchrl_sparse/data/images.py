@@ -69,7 +69,7 @@ def read_images(files: Sequence[RecordedImages], key: str, folder: str | Path | 
     # Written as a file, not through the map: the pages of a map that were touched count as this process's memory.
     with atomic_path(filename) as temporary, open(temporary, "wb") as written:
         for episode in episodes:
-            written.write(episode)
+            written.write(episode.data)
             frame = episode.shape[1:]
     shape = (sum(sum(file.lengths.values()) for file in files), *frame)
     return MemoryMappedTensor.from_filename(filename, dtype=torch.uint8, shape=shape)

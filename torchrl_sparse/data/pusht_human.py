@@ -10,10 +10,11 @@ Observations are made anew from the states, as `PushTEnv` observes: the recorded
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from zipfile import is_zipfile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 
@@ -27,6 +28,17 @@ __all__ = ["convert_pusht"]
 _ROWS = {"state": (5,), "keypoint": KEYPOINTS.shape, "action": (2,)}
 # Pixels between a recorded keypoint and the same state's here; other keypoints or another order of the state are far off
 _TOLERANCE = 5.0
+# What zipfile, zlib and numpy raise of bytes that are not those that were written
+_DAMAGES = (
+    BadZipFile,
+    zlib.error,
+    ValueError,
+    NotImplementedError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    MemoryError,
+)
 
 
 def convert_pusht(path: str | Path, out: str | Path) -> int:
@@ -85,15 +97,26 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise FileNotFoundError(f"{path}: expected a file of demonstrations, got none")
     if not is_zipfile(path):
         raise ValueError(f"{path}: expected a complete npz file, got another or a part of one")
-    with np.load(path, allow_pickle=False) as file:
-        if missing := {*_ROWS, "episode_ends"} - {*file}:
-            raise ValueError(f"{path}: expected an array {min(missing)!r}, got {sorted(file)}")
-        arrays = {name: file[name] for name in (*_ROWS, "episode_ends")}
+    names = (*_ROWS, "episode_ends")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not (missing := {*names} - {*file}):
+                arrays = {name: file[name] for name in names}
+            found = sorted(file)
+    except _DAMAGES as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: expected a complete npz file, got a damaged one: {reason}") from error
+    if missing:
+        raise ValueError(f"{path}: expected an array {min(missing)!r}, got {found}")
     _check(path, arrays)
     return arrays
 
 
 def _check(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        kinds, words = ("iu", "whole numbers") if name == "episode_ends" else ("iuf", "numbers")
+        if array.dtype.kind not in kinds:
+            raise ValueError(f"{path}, {name}: expected {words}, got {array.dtype}")
     ends = arrays["episode_ends"]
     if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) < 1).any():
         raise ValueError(f"{path}, episode_ends: expected increasing rows above 0, got {ends.tolist()}")

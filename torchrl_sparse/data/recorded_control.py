@@ -19,9 +19,9 @@ from torchrl_sparse.data.controller_settings import (
 )
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import demo_group
-from torchrl_sparse.envs.conventions import Convention
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
 from torchrl_sparse.rotations import POSE_DIM
+from torchrl_sparse.storage.convention import Convention
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["RecordedControl", "check_recorded_task", "read_control"]

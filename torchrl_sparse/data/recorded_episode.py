@@ -11,8 +11,9 @@ from torchrl_sparse.data.hdf5_reader import ArrayReader, open_demo
 from torchrl_sparse.data.recorded_control import RecordedControl
 from torchrl_sparse.data.recorded_poses import check_poses
 from torchrl_sparse.envs.contract import OBJECTS, Contract
-from torchrl_sparse.envs.conventions import Convention, translate_objects
+from torchrl_sparse.envs.conventions import translate_objects
 from torchrl_sparse.rotations import POSE_DIM, downward_quaternion, pose_to_absolute
+from torchrl_sparse.storage.convention import Convention
 
 __all__ = ["read_episode"]
 

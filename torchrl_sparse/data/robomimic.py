@@ -32,7 +32,7 @@ from torchrl_sparse.data.images import RecordedImages, read_images
 from torchrl_sparse.data.recorded_control import check_recorded_task, read_control
 from torchrl_sparse.data.recorded_episode import read_episode
 from torchrl_sparse.envs.contract import Contract
-from torchrl_sparse.envs.conventions import Convention
+from torchrl_sparse.storage.convention import Convention
 
 __all__ = ["Demonstrations", "join_demos", "read_demos"]
 
@@ -53,7 +53,7 @@ class Demonstrations:
 
     data: TensorDict
     starts: Tensor
-    driven: Tensor = field(default=None)  # type: ignore[assignment]  # never None once made
+    driven: Tensor = field(default=None)  # never None once made
     contract: Contract | None = None
 
     def __post_init__(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,7 +89,10 @@ class BlockPushScene:
         ImportError: without pybullet, with the command that installs it.
     """
 
-    def __init__(self):
+    _anchor: np.ndarray  # where the tip is drawn to, f64 [2], m
+    _hold: int  # the constraint that draws it
+
+    def __init__(self) -> None:
         self._bullet = import_extra("pybullet", "blockpush")
         client = import_extra("pybullet_utils.bullet_client", "blockpush")
         self.client = client.BulletClient(self._bullet.DIRECT)
@@ -104,9 +108,9 @@ class BlockPushScene:
         for (x, y, yaw), colour in zip(start.targets, reversed(_COLOURS), strict=True):
             half = ZONE_SIZE / 2
             self._add_box((half, half, 5e-4), (x, y, 0), yaw, mass=0, colour=colour, solid=False)
-        half = (BLOCK_SIZE / 2,) * 3
+        size = (BLOCK_SIZE / 2,) * 3
         self.blocks = [
-            self._add_box(half, (x, y, half[2]), yaw, mass=_BLOCK_MASS, colour=colour)
+            self._add_box(size, (x, y, size[2]), yaw, mass=_BLOCK_MASS, colour=colour)
             for (x, y, yaw), colour in zip(start.blocks, _COLOURS, strict=True)
         ]
         for block in self.blocks:
@@ -150,7 +154,16 @@ class BlockPushScene:
         """Free the simulator."""
         self._ending()
 
-    def _add_box(self, half, position, yaw, *, mass, colour, solid=True) -> int:
+    def _add_box(
+        self,
+        half: Sequence[float],
+        position: Sequence[float],
+        yaw: float,
+        *,
+        mass: float,
+        colour: Sequence[float],
+        solid: bool = True,
+    ) -> int:
         client, box = self.client, self._bullet.GEOM_BOX
         shape = client.createCollisionShape(box, halfExtents=half) if solid else -1
         look = client.createVisualShape(box, halfExtents=half, rgbaColor=colour)

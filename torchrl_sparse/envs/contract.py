@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from torchrl_sparse.envs.conventions import Convention, source_convention
+from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask, Task, find_task
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
+from torchrl_sparse.storage.convention import Convention, source_convention
 
 __all__ = [
     "OBJECTS",
@@ -76,7 +77,7 @@ def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
 
     Raises:
         ValueError: if the policy was trained for another task, has cameras and its ``source`` does not say which, or observes
-            or acts in other names or sizes than the task's; the message names both.
+            or acts in other names, sizes or at another rate than the task's; the message names both.
 
     >>> policy_contract("lift", DiffusionPolicy.from_pretrained("assets/lift")).state_keys[0]
     'object'
@@ -90,6 +91,11 @@ def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
 
 def _shown(task: Task, policy: DiffusionPolicy) -> Contract:
     _check_actions(task, policy.source)
+    rate = policy.source.get("control_freq")
+    if isinstance(task, RobosuiteTask) and rate not in (None, CONTROL_FREQ):
+        raise ValueError(
+            f"policy: expected one of {CONTROL_FREQ} actions a second, as {task.name} takes, got one of {rate}"
+        )
     cameras = _cameras(policy)
     own = task_contract(task.name, cameras)
     keys = tuple(policy.source.get("state_keys") or own.state_keys)

@@ -46,7 +46,7 @@ class LiftCrowded(LiftNamed):
         angle = self.rng.uniform(0, 2 * np.pi)
         self._put(np.array(RADII) * [np.cos(angle), np.sin(angle)])
 
-    def _pre_action(self, action, policy_step: bool = False) -> None:
+    def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
         super()._pre_action(action, policy_step)
         data = self.sim.data
         if self._orbit is None:
@@ -92,6 +92,7 @@ def _ball(centre: np.ndarray) -> ET.Element:
         ET.SubElement(body, "joint", name=joint, type="slide", axis=axis)
     # robosuite takes no mass from what is only seen.
     ET.SubElement(body, "inertial", pos="0 0 0", mass="0.01", diaginertia="1e-5 1e-5 1e-5")
+    seen = {"type": "sphere", "size": str(BALL_RADIUS), "rgba": _RGBA}
     untouchable = {"contype": "0", "conaffinity": "0", "group": "1"}
-    ET.SubElement(body, "geom", type="sphere", size=str(BALL_RADIUS), rgba=_RGBA, **untouchable)
+    ET.SubElement(body, "geom", seen | untouchable)
     return body

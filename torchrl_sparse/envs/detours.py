@@ -83,11 +83,11 @@ class Detour:
         return self.sim.data.site_xpos[self.robots[0].eef_site_id["right"]] - self.centre
 
     def _reset_internal(self) -> None:
-        super()._reset_internal()
+        super()._reset_internal()  # type: ignore[misc]  # these are of robosuite's class behind it
         self.way = NO_WAY
 
-    def _pre_action(self, action, policy_step: bool = False) -> None:
-        super()._pre_action(action, policy_step)
+    def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
+        super()._pre_action(action, policy_step)  # type: ignore[misc]
         place = self._place()
         if self.obstacle.holds(place):
             self.way = BETWEEN
@@ -95,4 +95,5 @@ class Detour:
             self.way = self.obstacle.side(place)
 
     def _check_success(self) -> bool:
-        return bool(super()._check_success()) and self.way != BETWEEN
+        solved = super()._check_success()  # type: ignore[misc]
+        return bool(solved) and self.way != BETWEEN

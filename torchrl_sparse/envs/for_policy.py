@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from torchrl.envs import EnvBase
 
@@ -35,7 +36,8 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
         >>> make(seeds=[7]).reset()["history", "state"].shape
         torch.Size([2, 19])
     """
-    contract, options = policy_contract(task, policy), {"n_obs_steps": policy.n_obs_steps}
+    contract = policy_contract(task, policy)
+    options: dict[str, Any] = {"n_obs_steps": policy.n_obs_steps}
     if horizon is not None:  # else an environment has its own default
         options["horizon"] = horizon
     if isinstance(found := find_task(task), RobosuiteTask):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from torchrl.envs import EnvBase
 
@@ -89,12 +90,17 @@ def instructed_env(
         ValueError: policy: expected one that was trained for Lift, got one for LiftNamed
     """
     found = check_instructed(task, policy, cameras)
-    options = {"image_size": policy.network.config.image_size, "horizon": horizon}
+    options: dict[str, Any] = {"image_size": policy.network.config.image_size, "horizon": horizon}
     if found.name in SUITES:
         return partial(
             make_suite_env, found.name, as_released=policy.source.images == "openvla_oft", **options
         )
-    shown = {"n_obs_steps": 1, "object_state": False, "instruction": True, **camera_options(cameras)}
+    shown: dict[str, Any] = {
+        "n_obs_steps": 1,
+        "object_state": False,
+        "instruction": True,
+        **camera_options(cameras),
+    }
     return partial(make_env, found.name, **shown, **options)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, InitTracker, LiberoEnv, RenameTransform, TransformedEnv
 from torchrl.envs.transforms import Transform
 
@@ -159,7 +159,7 @@ def _base_of_floor_robots() -> Iterator[None]:
 class RotationVectorState(Transform):
     """Writes OpenVLA-OFT's state, f32 [*B, 8]: position, rotation vector (rad), both fingers."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__(in_keys=[_POSE], out_keys=[keys.STATE])
 
     def _apply_transform(self, pose: Tensor) -> Tensor:
@@ -169,7 +169,7 @@ class RotationVectorState(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
 
-    def transform_observation_spec(self, observation_spec):
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape = (*observation_spec[_POSE].shape[:-1], 8)
         observation_spec[keys.STATE] = Unbounded(shape, device=observation_spec.device)
         return observation_spec

@@ -33,7 +33,7 @@ class LiftWays(Detour, Lift):
         self._centre: np.ndarray | None = None
 
     @property
-    def centre(self) -> np.ndarray:
+    def centre(self) -> np.ndarray:  # type: ignore[override]  # it is only read
         """See `Detour.centre`."""
         if self._centre is None:  # not at the reset: a restored state is only set after it
             self._centre = self.sim.data.body_xpos[self.cube_body_id] + _FROM_CUBE

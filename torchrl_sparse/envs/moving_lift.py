@@ -38,7 +38,7 @@ class LiftMoving(Lift):
         super()._reset_internal()
         self._path: Path | None = None
 
-    def _pre_action(self, action, policy_step: bool = False) -> None:
+    def _pre_action(self, action: np.ndarray, policy_step: bool = False) -> None:
         super()._pre_action(action, policy_step)
         data = self.sim.data
         if self._path is None:

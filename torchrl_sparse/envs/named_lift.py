@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,7 @@ class LiftNamed(Lift):
 
     colours: tuple[str, ...] = COLOURS
     x_range, y_range = X_RANGE, Y_RANGE
+    placement_initializer: Any
 
     def _load_model(self) -> None:
         if self.placement_initializer is None:
@@ -81,7 +83,7 @@ class LiftNamed(Lift):
 class SpacedSampler(UniformRandomSampler):
     """Draws all places again until centres are at least `SPACING` apart."""
 
-    def sample(self, *args, **kwargs) -> dict:
+    def sample(self, *args: Any, **kwargs: Any) -> dict:
         while True:
             placed = super().sample(*args, **kwargs)
             centres = [np.array(position[:2]) for position, _, _ in placed.values()]

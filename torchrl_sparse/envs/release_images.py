@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 __all__ = ["RENDERED_SIZE", "ReleaseImages", "as_released"]
@@ -60,7 +60,7 @@ class ReleaseImages(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
 
-    def transform_observation_spec(self, observation_spec):
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         for key in self.in_keys:
             spec = observation_spec[key]
             shape = (*spec.shape[:-2], self.size, self.size)

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
-from torchrl_sparse.envs.conventions import Convention, check_convention, object_state
+from torchrl_sparse.envs.conventions import check_convention, object_state
 from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
@@ -25,6 +25,7 @@ from torchrl_sparse.rotations import (
     fixes_rotation,
     matrix_to_rot6d,
 )
+from torchrl_sparse.storage.convention import Convention
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,7 @@ class InitialState:
 
 
 class RobosuiteEnv(SeededEnv):
-    """One robosuite task with Panda arms at 20 Hz.
-
-    Episodes begin and end as in every `SeededEnv`.
+    """One robosuite task with Panda arms at 20 Hz; episodes begin and end as in every `SeededEnv`.
 
     Args:
         task: one of `torchrl_sparse.envs.tasks.TASKS`.
@@ -106,12 +105,10 @@ class RobosuiteEnv(SeededEnv):
         horizon = self.task.horizon if horizon is None else horizon
         super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.way_of is not None, device=device)
         self.action_mode = action_mode
-        named = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
-        named = {key: name for key, name in named.items() if name is not None}
+        asked = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
+        named = {key: name for key, name in asked.items() if name is not None}
         if image_size is not None and not named:
-            raise ValueError(
-                f"image_size: expected a camera or wrist_camera with it, such as camera='agentview', got {image_size} alone"
-            )
+            raise ValueError(f"image_size: expected a camera or wrist_camera with it, got {image_size} alone")
         if seen_frames is not None and seen_frames < 1:
             raise ValueError(f"seen_frames: expected None or at least 1, got {seen_frames}")
         self._cameras = Cameras(named, 84 if image_size is None else image_size, fast=fast_render)
@@ -151,7 +148,11 @@ class RobosuiteEnv(SeededEnv):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, initial_state: InitialState | None = None, **kwargs
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        initial_state: InitialState | None = None,
+        **kwargs: Any,
     ) -> TensorDictBase:
         self._unseen = False
         if initial_state is None:

@@ -130,7 +130,7 @@ class SeededEnv(EnvBase):
         if seed is not None:
             self._next_seed = whole_seed(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._episode_seed = self._take_seed()
         self._start(self._episode_seed)
         self._elapsed = 0

@@ -24,7 +24,7 @@ CONTROL_FREQ = 20
 _LOADING = threading.Lock()
 
 
-def import_robosuite():
+def import_robosuite() -> Any:
     """Import robosuite without its start-up warnings, and also where no GL library is installed.
 
     Raises:
@@ -129,7 +129,8 @@ def _arms_between_actions(robot: Any) -> Callable[..., None]:
 
     It does not keep the robot: with it each reset's simulator would stay in memory until Python looks for cycles.
     """
-    follow, find = type(robot).control, weakref.ref(robot)
+    follow = type(robot).control
+    find: Callable[[], Any] = weakref.ref(robot)  # who calls it is there
 
     def control(action: np.ndarray, policy_step: bool = False) -> None:
         robot = find()

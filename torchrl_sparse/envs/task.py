@@ -28,10 +28,17 @@ class Task(Protocol):
         demonstrator: class whose instances act out one demonstration, see `torchrl_sparse.envs.experts.demonstrators`.
     """
 
-    name: str
-    alias: str
-    by_degrees: bool
-    early_cut: int | None
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def alias(self) -> str: ...
+
+    @property
+    def by_degrees(self) -> bool: ...
+
+    @property
+    def early_cut(self) -> int | None: ...
 
     @property
     def abs_action(self) -> bool | None: ...
@@ -52,7 +59,7 @@ class Task(Protocol):
     def acts_in_poses(self) -> bool: ...
 
     @property
-    def demonstrator(self) -> type: ...
+    def demonstrator(self) -> type[Any]: ...
 
     def make(self, **kwargs: Any) -> EnvBase:
         """Make the task's environment; its class documents ``kwargs`` and errors."""
@@ -64,7 +71,7 @@ class Task(Protocol):
             ValueError: if the task's episodes tell none.
         """
 
-    def load_expert(self) -> type:
+    def load_expert(self) -> type[Any]:
         """Import the class of the task's scripted expert.
 
         Raises:

@@ -40,7 +40,7 @@ class _Named:
             raise ValueError(f"task: expected one that tells its ways, got {self.name!r}, which does not")
         return _load(self.way_of)
 
-    def load_expert(self) -> type:
+    def load_expert(self) -> type[Any]:
         """See `Task.load_expert`."""
         if self.expert is None:
             having = ", ".join(name for name, task in TASKS.items() if getattr(task, "expert", None))
@@ -109,7 +109,7 @@ class RobosuiteTask(_Named):
         return ABSOLUTE_DIM * self.arms
 
     @property
-    def demonstrator(self) -> type:
+    def demonstrator(self) -> type[Any]:
         return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
 
     def pose_slices(self, state_keys: Sequence[str] | None = None) -> list[tuple[slice, slice]]:
@@ -183,7 +183,7 @@ class StateTask(_Named):
         return False
 
     @property
-    def demonstrator(self) -> type:
+    def demonstrator(self) -> type[Any]:
         """See `Task`."""
         return _load(f"{_EXPERTS}.demonstrators:StateDemonstrator")
 
@@ -260,7 +260,7 @@ _ROBOSUITE = (
         expert=_expert("tool_hang:ToolHangExpert"),
     ),
 )
-_OTHERS = (
+_OTHERS: tuple[Task, ...] = (
     StateTask(
         "PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert"), by_degrees=True
     ),

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import CatFrames, Compose, InitTracker, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.transforms import Transform
 
@@ -81,7 +81,7 @@ class EndEffectorVelocity(Transform):
         moved = twists(tensordict.get(self._key), next_tensordict.get(self._key), self._poses)
         return next_tensordict.set(keys.EEF_VEL, moved * self.control_freq)
 
-    def transform_observation_spec(self, observation_spec):
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape = (*observation_spec.shape, 6 * len(self._poses))
         observation_spec[keys.EEF_VEL] = Unbounded(shape, device=observation_spec.device)
         return observation_spec

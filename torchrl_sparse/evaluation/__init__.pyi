@@ -24,7 +24,6 @@ from .results import (
     PolicyShape as PolicyShape,
     Results as Results,
     build_results as build_results,
-    format_pairs as format_pairs,
     format_table as format_table,
     load_results as load_results,
     save_results as save_results,

@@ -153,7 +153,9 @@ def _bac(inputs: MethodInputs) -> tuple[Planner, Sampler]:
 
 def _saved(inputs: MethodInputs) -> tuple[Planner, Sampler]:
     """Load a planner; its sampler is the one that it was made for."""
-    planner, sampler = load_planner(_saved_path(inputs.planners, inputs.name)), inputs.sampler
+    path = _saved_path(inputs.planners, inputs.name)
+    assert path is not None  # or `find_method` had refused the name
+    planner, sampler = load_planner(path), inputs.sampler
     if (spec := planner.made_for) is not None:
         sampler = sampler.variant_named(spec.sampler, spec.num_inference_steps)
     return planner, sampler

@@ -88,8 +88,8 @@ def make_realtime_executor(
             )
         asked = RollForward(policy, model.to(policy.device))
     every = executed_every(text, policy, n_action_steps)
-    timing = {"latency": latency, "control_freq": control_freq}
-    return RealtimeExecutor(_averaged(text, asked), hold, every, **timing, **execution_options(text))
+    averaged, options = _averaged(text, asked), execution_options(text)
+    return RealtimeExecutor(averaged, hold, every, latency=latency, control_freq=control_freq, **options)
 
 
 def _averaged(text: str, policy: TensorDictModuleBase) -> TensorDictModuleBase:

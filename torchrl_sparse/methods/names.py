@@ -39,11 +39,6 @@ class MethodName:
     ensembled: bool = False
     ahead: bool = False
 
-    @property
-    def asked_as_usual(self) -> bool:
-        """True where episodes follow from the method's answers, not from how often or for how many it is asked."""
-        return self.every is None and self.samples == 1 and not self.ensembled and not self.ahead
-
     @classmethod
     def parse(cls, text: str) -> MethodName:
         """Raise ValueError unless ``text`` is written as above.

@@ -110,9 +110,11 @@ def numbered_pruner(method: str, number: float, settings: dict[str, Any]) -> Tok
     if settings and section is None:
         raise ValueError(f"settings: expected none for {method}, got {settings}")
     try:
-        return make_pruner(method, number=number, settings={section: settings} if section else None)
+        pruner = make_pruner(method, number=number, settings={section: settings} if section else None)
     except TypeError as error:
         raise ValueError(f"settings: expected arguments of {method}, got {error}") from error
+    assert pruner is not None  # no number tunes the dense policy
+    return pruner
 
 
 def fewest_tokens(points: Sequence[BudgetPoint], tolerance: float) -> float:

@@ -197,16 +197,22 @@ def make_pruner(
         number: takes the place of the one that is written, where another method is matched.
         settings: sections of further arguments, see `TokenMethod`.
 
+    Raises:
+        ValueError: for a number that the method does not take.
+
     Examples:
         >>> make_pruner("specprune@0.8", settings={"specprune": {"budget": 20.0}}).options.alpha
         0.8
     """
     written = TokenMethodName.parse(text)
+    method = TOKEN_METHODS[written.name]
     number = written.number if number is None else number
     arguments = settings_of(text, settings)
     if number is not None:
-        arguments[TOKEN_METHODS[written.name].number] = number
-    return TOKEN_METHODS[written.name].make(**arguments)
+        if method.number is None:
+            raise ValueError(f"number: expected none for {written.name}, got {number}")
+        arguments[method.number] = number
+    return method.make(**arguments)
 
 
 def make_controller(text: str, settings: Settings | None = None) -> TensorDictModuleBase | None:
@@ -227,4 +233,4 @@ def make_controller(text: str, settings: Settings | None = None) -> TensorDictMo
 def settings_of(text: str, settings: Settings | None) -> dict[str, Any]:
     """Return the section of ``settings`` that a method reads; empty where it reads none."""
     section = TOKEN_METHODS[TokenMethodName.parse(text).name].settings
-    return dict((settings or {}).get(section, {}))
+    return {} if section is None else dict((settings or {}).get(section, {}))

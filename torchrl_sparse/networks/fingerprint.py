@@ -1,12 +1,17 @@
-"""A name of networks' weights, for everything that is made for one policy."""
+"""A name of a policy, for everything that is made for one: schedules, pruners, episodes, calibrations."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-from torch import nn
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
-__all__ = ["networks_fingerprint"]
+__all__ = ["full_fingerprint", "is_same_policy", "networks_fingerprint", "policy_fingerprint"]
+
+_DIGITS, _DIGITS_OF_UNITS = 16, 8
 
 
 def networks_fingerprint(*networks: nn.Module) -> str:
@@ -20,4 +25,46 @@ def networks_fingerprint(*networks: nn.Module) -> str:
         digest.update(repr(sorted(network.config.items())).encode())
         for name, value in sorted(network.state_dict().items()):
             digest.update(name.encode() + value.detach().cpu().half().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    return digest.hexdigest()[:_DIGITS]
+
+
+def policy_fingerprint(
+    *networks: nn.Module, normalizer: Mapping[str, Tensor], trained: Mapping[str, Any]
+) -> str:
+    """Return the `networks_fingerprint`, a hyphen, and eight digits that name what the weights mean something under.
+
+    Args:
+        networks: see `networks_fingerprint`.
+        normalizer: tensors of the normaliser, f32 in files.
+        trained: what a sampler of these networks has in common with all others, see `Sampler.trained`.
+    """
+    units = [repr(sorted(trained.items())).encode()]
+    for name, value in sorted(normalizer.items()):
+        units.append(name.encode() + value.detach().cpu().float().numpy().tobytes())
+    return full_fingerprint(networks_fingerprint(*networks), b"".join(units))
+
+
+def full_fingerprint(weights: str, units: bytes) -> str:
+    """Return the name of weights, a hyphen, and eight digits that name what they mean something under.
+
+    >>> full_fingerprint("0123456789abcdef", b"[-1, 1]")
+    '0123456789abcdef-3981c725'
+    """
+    return f"{weights}-{hashlib.sha256(units).hexdigest()[:_DIGITS_OF_UNITS]}"
+
+
+def is_same_policy(noted: Any, asked: Any) -> bool:
+    """Tell whether what a file notes is the fingerprint ``asked``, or what earlier files note of that policy.
+
+    Those name the weights alone: policies that differ in their normaliser alone are one to them.
+
+    >>> is_same_policy("0123456789abcdef", "0123456789abcdef-01234567"), is_same_policy("a", "a-b")
+    (True, False)
+    """
+    if noted == asked:
+        return True
+    if not (isinstance(noted, str) and isinstance(asked, str)):
+        return False
+    weights, hyphen, units = asked.partition("-")
+    lengths = len(weights), len(units)
+    return noted == weights and bool(hyphen) and lengths == (_DIGITS, _DIGITS_OF_UNITS)

@@ -16,6 +16,7 @@ _NOTE = "wandb_run_id"
 def wandb_arguments(settings: Mapping[str, Any], folder: str | Path, name: str) -> dict[str, Any]:
     """Return arguments of ``wandb.init``; the run's id is noted in ``folder``, so that the next call continues the run.
 
+    Offline, W&B begins another folder of the same id, and its own count of steps at 0: lines are logged with their step.
     W&B's own variables count before: ``WANDB_RUN_ID``, which its agents set, and ``WANDB_DIR``.
 
     Args:

@@ -32,7 +32,7 @@ from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import check_folder, read_tensors, take, write_tensors
 
-FORMAT = "torchrl_sparse.diffusion_policy/1"
+FORMAT: Literal["torchrl_sparse.diffusion_policy/1"] = "torchrl_sparse.diffusion_policy/1"
 T = TypeVar("T")
 PlanName = Literal["plan.json", "plan"]  # of fixed names alone: a file cannot ask for one elsewhere
 RoundedEngine = Literal["native_bf16", "native_int8"]  # what is no choice of speed alone
@@ -65,8 +65,9 @@ class StoredPolicy:
         source: where an imported policy comes from and how to feed it; empty for policies trained here.
             ``"weights"`` ("ema_model" or "model"), ``"task"``, ``"epoch"``, ``"n_action_steps"`` to execute of a
             chunk, ``"abs_action"``, whether actions say where to go, ``"robosuite"``, the version whose observations
-            it was trained on, ``"state_keys"``, robomimic's names of the observations that make up the state, in
-            order, and ``"cameras"``, name of the image here -> robomimic's; None for what a checkpoint does not say.
+            it was trained on, ``"control_freq"``, its actions a second, ``"state_keys"``, robomimic's names of the
+            observations that make up the state, in order, and ``"cameras"``, name of the image here -> robomimic's; None or
+            nothing for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
         warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
         engine: that rounds weights and activations; None if nothing is rounded.
@@ -115,7 +116,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
         network, vision = _networks(path / "config.json", config)
         expected = _state(network, vision)
     tensors = read_tensors(path / "model.safetensors", expected)
-    seen = None if vision is None else read_tensors(path / "vision.safetensors", vision.state_dict())
+    seen = {} if vision is None else read_tensors(path / "vision.safetensors", vision.state_dict())
     network, vision = _networks(path / "config.json", config)
     _load(network, take(tensors, _NETWORK))
     if vision is not None:

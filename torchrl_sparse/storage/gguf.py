@@ -87,7 +87,7 @@ class GGUF:
         self._bytes = np.memmap(path, np.uint8, mode="r")
         self._at = 0
         if (magic := bytes(self._take(4))) != _MAGIC:
-            raise self._fault(f"expected a GGUF file, which begins with {_MAGIC}, got {magic}")
+            raise self._fault(f"expected a GGUF file, which begins with {_MAGIC!r}, got {magic!r}")
         if (version := self._number("I")) not in _VERSIONS:
             raise self._fault(f"expected GGUF of version 2 or 3, got {version}")
         tensors, entries = self._number("Q"), self._number("Q")
@@ -142,7 +142,7 @@ class GGUF:
         try:
             return data.decode()
         except UnicodeDecodeError as error:
-            raise self._fault(f"expected text in UTF-8 before byte {self._at}, got {data[:20]}") from error
+            raise self._fault(f"expected text in UTF-8 before byte {self._at}, got {data[:20]!r}") from error
 
     def _names(self, count: int) -> Iterator[str]:
         return (self._text() for _ in range(count))

@@ -9,14 +9,17 @@ named as such.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torchrl_sparse.networks.fingerprint import is_same_policy
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["check_plain", "describe_differences", "parse_json", "read_json", "to_plain", "write_json"]
@@ -30,7 +33,7 @@ _NAMED = 12  # differing keys that are named
 def read_json(path: str | os.PathLike, kind: type[T]) -> T:
     """Read a file as ``kind``: a dataclass, or any type with JSON values, such as ``dict[str, Any]``.
 
-    Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown.
+    Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown or stand twice.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -83,10 +86,14 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     except ValueError as error:
         raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
     try:
-        made = _adapter(kind).validate_json(b"[%b]" % data)[0]
+        made = _adapter(kind).validate_json(b"[%b]" % data)[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
-    if _names_numbers(kind):
+    try:
+        json.loads(b'{"": %b}' % data, object_pairs_hook=_once)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(read, to_plain(made), where)
     return made
 
@@ -105,10 +112,10 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     from pydantic import ValidationError
 
     try:
-        made = _adapter(kind).validate_python((value,))[0]
+        made = _adapter(kind).validate_python((value,))[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
         raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
-    if _names_numbers(kind):
+    if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(value, to_plain(made), where)
     return made
 
@@ -134,6 +141,8 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
 def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """Name the keys in which plain values differ, with both, those within mappings after dots; empty if they are equal.
 
+    A fingerprint of a policy equals what earlier files note of that policy, see `is_same_policy`.
+
     >>> describe_differences({"seed": 1, "task": "lift"}, {"seed": 2, "task": "lift"})
     'seed is 2 here and 1 there'
     >>> describe_differences({"train": {"lr": 1, "seed": 0}}, {"train": {"lr": 2, "seed": 0}})
@@ -144,7 +153,11 @@ def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> 
     def say(values: Mapping[str, Any], key: str) -> str:
         return _short(values[key]) if key in values else "missing"
 
-    keys = [key for key in {**found, **asked} if found.get(key, nothing) != asked.get(key, nothing)]
+    keys = [
+        key
+        for key in {**found, **asked}
+        if not is_same_policy(found.get(key, nothing), asked.get(key, nothing))
+    ]
     return ", ".join(f"{key} is {say(asked, key)} here and {say(found, key)} there" for key in keys[:_NAMED])
 
 
@@ -210,6 +223,24 @@ def _check_numbers(read: Any, made: Any, where: str) -> None:
         and type(read) is not type(made)
     ):
         raise ValueError(f"{where}: expected {made!r}, got {read!r}")
+
+
+def _once(entries: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of its entries; ValueError for an infinity, and for a name that stands twice: parsers keep the last."""
+    made = dict(entries)
+    if len(made) < len(entries):
+        ((twice, count),) = Counter(name for name, _ in entries).most_common(1)
+        raise ValueError(f"{twice}: expected one entry of this name, got {count}")
+    for name, value in entries:
+        if isinstance(value, (float, list)) and _is_infinite(value):
+            raise ValueError(f"{f'{name}: ' if name else ''}expected finite numbers, got one beyond floats")
+    return made
+
+
+def _is_infinite(value: Any) -> bool:
+    if isinstance(value, list):
+        return any(map(_is_infinite, value))
+    return isinstance(value, float) and math.isinf(value)
 
 
 def _check_size(size: int, where: str) -> None:

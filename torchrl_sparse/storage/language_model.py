@@ -113,7 +113,7 @@ def _entry(file: GGUF, name: str, kind: type[T]) -> T:
 
 
 def _sizes(file: GGUF) -> dict[str, Any]:
-    def number(name: str, kind: type[T] = int) -> T:
+    def number(name: str, kind: type[Any] = int) -> Any:
         return _entry(file, f"llama.{name}", kind)
 
     heads = number("attention.head_count")

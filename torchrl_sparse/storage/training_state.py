@@ -57,8 +57,8 @@ def read_checkpoint(
             f"move it away to begin anew"
         )
     for name, expected in header.items():
-        found, asked = (_without(free, values) for values in (state[name], expected))
-        if differing := describe_differences(found, asked):
+        stored, asked = (_without(free, values) for values in (state[name], expected))
+        if differing := describe_differences(stored, asked):
             raise ValueError(
                 f"{path}: made with another {name}: {differing}; choose another out or move it away"
             )

@@ -160,7 +160,7 @@ def _read_base(where: Path, stored: AdaptedBase | None, path: Path | None) -> La
     if (stored is None) != (path is None):
         needs = "none" if stored is None else f"the file with SHA-256 {stored.sha256}"
         raise ValueError(f"{where}: base: expected {needs}, got {path}")
-    if stored is None:
+    if stored is None or path is None:
         return None
     if not path.is_file():
         raise FileNotFoundError(f"base: expected a file {path}, got none")

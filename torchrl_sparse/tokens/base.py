@@ -55,6 +55,7 @@ class TokenPruner(LayerHooks):
     in_keys: list[NestedKey] = []
     out_keys: list[NestedKey] = []
     look_back: int = 1
+    spec: VisualSpec
 
     def bind(self, spec: VisualSpec) -> None:
         """Take note of the model that the pruner is assigned to: one that carries keys keeps it as ``self.spec``.

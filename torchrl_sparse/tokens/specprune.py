@@ -260,21 +260,21 @@ class SpecPrune(TokenPruner):
     def after_layer(self, index: int, state: LayerState) -> Tensor | None:
         if state.scores is None:
             return None
-        self._accumulate(index, state)
+        self._accumulate(index, state, state.scores)
         if index < _SPECULATION:
             return self._speculate(index, state)
         if index in self._dynamic_layers:
             return self._prune_further(state)
         return None
 
-    def _accumulate(self, index: int, state: LayerState) -> None:
+    def _accumulate(self, index: int, state: LayerState, scores: Tensor) -> None:
         """Eqs. 7 to 10, and the score to carry."""
         td, alive = state.td, state.visual_alive
-        weight = rank_weight(ranks(state.scores, alive), alive, self.options.steepness)
-        now = layer_score(weight, confidence(state.scores, alive))
+        weight = rank_weight(ranks(scores, alive), alive, self.options.steepness)
+        now = layer_score(weight, confidence(scores, alive))
         td.set(_RUNNING, now if index == 0 else updated_score(td.get(_RUNNING), now, self.options.beta))
         if index in self._carry_layers:
-            td.set(_TO_CARRY, td.get(_TO_CARRY) + state.scores / len(self._carry_layers))
+            td.set(_TO_CARRY, td.get(_TO_CARRY) + scores / len(self._carry_layers))
 
     def _speculate(self, index: int, state: LayerState) -> Tensor | None:
         """Eqs. 4 to 6: the sets of the first two layers, and static pruning."""

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim.lr_scheduler import LambdaLR
 
 from torchrl_sparse.storage.training_state import read_checkpoint, write_checkpoint
 
@@ -118,15 +118,19 @@ class Trainer(ABC):
         self.step, self.unlogged = state["step"], state.get(UNLOGGED, [])
         self._lr_scheduler = self.make_lr_scheduler(self._optimizer)
 
-    def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LRScheduler:
-        """Return the learning rate from `step` on: a linear warm-up, then a cosine to zero."""
-        from diffusers.optimization import (
-            get_cosine_schedule_with_warmup,  # seconds, which only a training needs
-        )
+    def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LambdaLR:
+        """Return the learning rate from `step` on: a linear warm-up, then a cosine to zero, and zero beyond `total`.
 
-        return get_cosine_schedule_with_warmup(
-            optimizer, self.warmup_steps, self.total, last_epoch=self.step - 1
-        )
+        diffusers' cosine of the same shape rises again there.
+        """
+        decay = max(1, self.total - self.warmup_steps)
+
+        def factor(step: int) -> float:
+            if step < self.warmup_steps:
+                return step / self.warmup_steps
+            return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - self.warmup_steps) / decay)))
+
+        return LambdaLR(optimizer, factor, last_epoch=self.step - 1)
 
     @property
     def lr(self) -> float:

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from recipes.studies.offline_errors.agreement import agreement_of, save_agreement, together_rows
 from recipes.studies.offline_errors.agreement_figure import plot_agreement
+from recipes.studies.offline_errors.errors import OfflineErrors, draw_answers, offline_errors
 from recipes.studies.offline_errors.figure import plot_offline
 from recipes.studies.offline_errors.results import (
     OfflineResults,
@@ -37,7 +38,6 @@ from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.results.schema import DENSE, load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
-from torchrl_sparse.evaluation.statistics.offline import OfflineErrors, draw_answers, offline_errors
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
@@ -93,8 +93,13 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
         if results.task != task:
             raise ValueError(f"results: {path}: expected a table of {task}, got one of {results.task}")
         found = outcomes(results).items()
-        played[path] = {name: outcome for name, outcome in found if MethodName.parse(name).asked_as_usual}
+        played[path] = {name: outcome for name, outcome in found if answers_alone(MethodName.parse(name))}
     return played
+
+
+def answers_alone(name: MethodName) -> bool:
+    """Tell whether episodes follow from the method's answers, not from how often or for how many it is asked."""
+    return name.every is None and name.samples == 1 and not name.ensembled and not name.ahead
 
 
 def no_calibration() -> Any:

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
+from recipes.studies.offline_errors.errors import OfflineErrors
 from recipes.studies.offline_errors.ranks import rank_correlation
-from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1
-from torchrl_sparse.evaluation.statistics.offline import OfflineErrors
+from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -78,7 +78,7 @@ def save_offline(results: OfflineResults, path: str | os.PathLike) -> Path:
     return write_json(path, results)
 
 
-def outcomes(results: AnyResults) -> dict[str, Outcome]:
+def outcomes(results: Results) -> dict[str, Outcome]:
     """Return what the methods of a table came to, but for dense itself; of a task done by degrees, in their scores."""
     dense = results.dense
     return {
@@ -88,7 +88,7 @@ def outcomes(results: AnyResults) -> dict[str, Outcome]:
     }
 
 
-def _reached(entry: MethodEntry1) -> float:
+def _reached(entry: MethodEntry) -> float:
     return entry.score.mean if entry.score else entry.success.rate
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.evaluation.results.build import Terms, compare_pair
-from torchrl_sparse.evaluation.results.parts import require
-from torchrl_sparse.evaluation.results.realtime import SCHEMA, Realtime, RealtimePoint, load_realtime
+from torchrl_sparse.evaluation.results.realtime import Realtime, RealtimePoint, load_realtime
 from torchrl_sparse.evaluation.results.report import comparison_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 from torchrl_sparse.evaluation.statistics.sequential import Design
@@ -29,14 +28,13 @@ def late_pair_rows(path: Path, pairs: Sequence[tuple[str, str]]) -> list[dict[st
 
     Raises:
         FileNotFoundError: if the file or a log is not there.
-        ValueError: if the file is of version 1, which keeps no horizon, or has no such late point.
+        ValueError: if the file has no such late point.
 
     >>> (row,) = late_pair_rows(Path("assets/lift/realtime.json"), [("ddim10 +1", "dense_noise +3")])
     >>> row["success"], row["difference, points"]
     ('100 : 89', '+11.0 [+6.3, +18.6]')
     """
     results = load_realtime(path)
-    require(results.realtime == SCHEMA, "realtime", f"version {SCHEMA}, to compare pairs", results.realtime)
     points = dict(_late(results))
     if unknown := [point for pair in pairs for point in pair if point not in points]:
         raise ValueError(f"pairs: expected two of {', '.join(points)}, got {', '.join(unknown)}")

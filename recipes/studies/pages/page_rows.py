@@ -8,16 +8,20 @@ from pathlib import Path
 from recipes.studies.carried_noise.results import carried_noise_rows, load_carried_noise
 from recipes.studies.offline_errors.agreement import load_agreement, together_rows
 from recipes.studies.offline_errors.results import agreement_rows, error_rows, load_offline
+from recipes.studies.pages.completed import completed_rows, told_completed
 from recipes.studies.pages.late_pairs import late_pair_rows
+from recipes.studies.pages.result_tables import acceleration_tables, realtime_tables, results_tables, subject
+from recipes.studies.pages.scores import score_rows, told_scores
+from recipes.studies.pages.ways import way_rows
 from recipes.studies.simulate_stopping.results import load_stopping, stopping_rows
-from torchrl_sparse.evaluation.results.completed import completed_rows, told_completed
+from torchrl_sparse.evaluation.figures.ways import told_ways
+from torchrl_sparse.evaluation.results.build import Terms, compare_pair
 from torchrl_sparse.evaluation.results.realtime import load_realtime
-from torchrl_sparse.evaluation.results.report import pair_rows
-from torchrl_sparse.evaluation.results.result_files import READERS, Table, make_table, read_tables
-from torchrl_sparse.evaluation.results.schema import AnyResults, load_results
-from torchrl_sparse.evaluation.results.scores import score_rows, told_scores
-from torchrl_sparse.evaluation.results.ways import told_ways, way_rows
+from torchrl_sparse.evaluation.results.report import comparison_rows
+from torchrl_sparse.evaluation.results.result_files import READERS, Table, make_table
+from torchrl_sparse.evaluation.results.schema import Results, load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
+from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["read_table"]
 
@@ -44,7 +48,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
         return _pairs(path, pairs)
     if which in _OF_EPISODES:
         return _told(path, which)
-    tables = read_tables(path, _READERS)
+    tables = next(read for kind, read in _READERS.items() if path.name.startswith(kind))(path)
     name = which or next(iter(tables))
     if name not in tables:
         raise ValueError(f"rows: expected one of {', '.join(tables)}, got {name!r}")
@@ -55,8 +59,18 @@ def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     if path.name.startswith("realtime"):
         return make_table(load_realtime(path).task, late_pair_rows(path, pairs))
     results = load_results(path)
-    episodes = _episodes(path, results, {name for pair in pairs for name in pair})
-    return make_table(results.subject, pair_rows(episodes, pairs, results.dense.paired_vs_dense.margin))
+    names = {name for pair in pairs for name in pair}
+    if unknown := sorted(names - results.methods.keys()):
+        raise ValueError(f"pairs: expected two of {', '.join(results.methods)}, got {', '.join(unknown)}")
+    played = _episodes(path, results, names)
+    terms = Terms(
+        Design(results.dense.success.n),
+        results.episode_horizon,
+        margin=results.dense.paired_vs_dense.margin,
+        time_margin=results.dense.time_vs_dense.margin,
+    )
+    compared = [compare_pair(ours, played[ours], other, played[other], terms) for ours, other in pairs]
+    return make_table(subject(results), comparison_rows(compared), len(_OF_PAIRS))
 
 
 def _told(path: Path, which: str) -> Table:
@@ -65,10 +79,10 @@ def _told(path: Path, which: str) -> Table:
     told = tell(_episodes(path, results, results.methods))
     if not told:
         raise ValueError(f"rows: expected episodes of {results.task} {expected}, got none")
-    return make_table(results.subject, rows(told, results))
+    return make_table(subject(results), rows(told, results))
 
 
-def _episodes(path: Path, results: AnyResults, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
+def _episodes(path: Path, results: Results, names: Iterable[str]) -> dict[str, list[EpisodeResult]]:
     """Read the episodes of methods that are of these results, of each as many as they say; a log may have more."""
     found = {}
     for name in names:
@@ -113,7 +127,12 @@ _OF_EPISODES: dict[str, tuple[Callable, Callable, str]] = {
         "with scores",
     ),
 }
-_READERS = READERS | {
+_OF_PAIRS = ("method", "against", "success", "difference, points", "verdict", "McNemar's p")
+_READERS = {
+    "results": results_tables,
+    "acceleration": acceleration_tables,
+    "realtime": realtime_tables,
+    **READERS,
     "offline_agreement": _agreement,
     "offline_errors": _offline,
     "carried_noise": _carried_noise,

@@ -11,7 +11,7 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
 - ``methods``: which rows, in this order; all without it. Rows of ``engine.json`` are its variants.
 - ``columns``: which columns, in this order. Those of ``results*.json`` are named as the benchmark prints them, and there are
   also ``success, %``, ``success or score`` (of a task done by degrees), ``action chunks per second`` and ``actions per
-  second``, of schema 2 ``mean time, steps``, ``early, %`` (solved within the task's early cut) and ``speed-up, 95 %``. An
+  second``, ``mean time, steps``, ``early, %`` (solved within the task's early cut) and ``speed-up, 95 %``. An
   ``engine.json`` also has ``f32 arithmetic alone, ms``, and what reads its weights, ``memory alone, ms``.
 - ``rows``: which table of a file with several: ``played`` of an ``acceleration.json``, a shape of an ``engine.json``,
   ``methods``, ``parts`` or ``products`` of a ``vla_latency.json``, ``success`` or ``time`` of an ``offline_agreement.json``, or

@@ -18,11 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 from tqdm import tqdm
 
-from torchrl_sparse.cli.options import Between, Count, Positive, Section
-from torchrl_sparse.cli.recipe import benchmark_command, recipe
-from torchrl_sparse.data.for_policy import policy_demos
-from torchrl_sparse.envs.tasks import find_task
-from torchrl_sparse.evaluation.accelerate.schedules import (
+from recipes.studies.search_schedule.evolution import Evolution
+from recipes.studies.search_schedule.schedules import (
     Judge,
     chain_schedule,
     compare,
@@ -30,10 +27,13 @@ from torchrl_sparse.evaluation.accelerate.schedules import (
     rivals,
     search_schedule,
 )
+from torchrl_sparse.cli.options import Between, Count, Positive, Section
+from torchrl_sparse.cli.recipe import benchmark_command, recipe
+from torchrl_sparse.data.for_policy import policy_demos
+from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
-from torchrl_sparse.training.diffusion.evolution import Evolution
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.pruner.loss import block_weights

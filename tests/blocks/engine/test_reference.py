@@ -3,7 +3,7 @@ import torch
 
 from tests.blocks.conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
-from torchrl_sparse.blocks.mask import mask_from_steps, reuse_source
+from torchrl_sparse.blocks.mask import mask_from_steps, num_buffers
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 NUM_BLOCKS = 3 * NUM_LAYERS
@@ -104,6 +104,17 @@ def test_type_reuse_follows_a_hand_computed_zigzag(ddpm):
     single = trace(ddpm, mask_from_steps(steps, NUM_STEPS)[None], "single")[0]
     assert single[:4, 0].tolist() == [0, 5, 200, 205]
     assert single[:4, 3].tolist() == [3, 103, 202, 302]
+
+
+def reuse_source(mask, reuse):
+    """Which evaluation made what a block adds, its own or an earlier one if it is pruned: (step, column), [B, K, 3L]."""
+    *batch, num_steps, num_blocks = mask.shape
+    # With evaluations numbered in order of execution, the newest computed one is a running maximum.
+    order = torch.arange(num_steps * num_blocks).view(num_steps, num_blocks)
+    written = order.expand(mask.shape).masked_fill(mask, -1)
+    written = written.reshape(*batch, -1, num_buffers(reuse, num_blocks))
+    newest = written.cummax(dim=-2).values.reshape(mask.shape)
+    return newest // num_blocks, newest % num_blocks
 
 
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])

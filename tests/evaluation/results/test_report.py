@@ -13,11 +13,10 @@ from torchrl_sparse.evaluation.results.parts import (
     Flops,
     Percentiles,
     Success,
-    TokensKept,
 )
-from torchrl_sparse.evaluation.results.report import format_pairs, format_table, results_rows
+from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, TokensKept
 from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
@@ -89,12 +88,12 @@ def test_planning_is_reported_where_it_was_timed():
 def test_any_two_methods_are_compared_seed_by_seed():
     won, lost = run([1, 1, 1, 0] * 5), run([1, 0, 0, 1] * 5)
     low, high = tango_interval(10, 5, 20)
-    table = format_pairs({"a": won.episodes, "b": lost.episodes[::-1]}, [["a", "b"]], margin=0.05)
-    assert f"15 : 10 | +25.0 [{100 * low:+.1f}, {100 * high:+.1f}]" in table
-    with pytest.raises(ValueError, match=r"pairs: expected two of a, b, got \['a', 'c'\]"):
-        format_pairs({"a": won.episodes, "b": lost.episodes}, [["a", "c"]])
-    with pytest.raises(ValueError, match="expected the seeds of 'b'"):
-        format_pairs({"a": won.episodes, "b": run([1], first_seed=9).episodes}, [["a", "b"]])
+    runs = {"dense": won, "a": won, "b": replace(lost, episodes=lost.episodes[::-1])}
+    terms = Terms(Design(20), 60, early_cut=30)
+    table = format_table(build_results(runs, terms=terms, pairs=[["a", "b"]], **ABOUT))
+    assert f"15 : 10 | +25.0 [{100 * low:+.1f}, {100 * high:+.1f}]" in " ".join(table.split())
+    with pytest.raises(ValueError, match=r"pairs: expected two of dense, a, b, got \['a', 'c'\]"):
+        build_results(runs, terms=terms, pairs=[["a", "c"]], **ABOUT)
 
 
 def test_dense_equals_itself_by_definition():

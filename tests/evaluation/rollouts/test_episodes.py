@@ -7,10 +7,10 @@ import pytest
 from torchrl_sparse.evaluation.rollouts.episodes import (
     EpisodeLog,
     EpisodeResult,
-    TokenTotals,
+    TokensKept,
     read_episodes,
     read_identity,
-    token_totals,
+    tokens_kept,
     totals,
 )
 from torchrl_sparse.storage.atomic import atomic_path
@@ -185,9 +185,11 @@ def test_tokens_are_averaged_over_queries_and_modes():
         episode(0, kept=(100.0, 40.0), fine=(False, True)),
         episode(1, kept=(60.0,), fine=(True,)),
     ]
-    assert token_totals(sighted) == TokenTotals(mean=pytest.approx(200 / 3), fine=50.0, coarse=100.0)
-    assert token_totals([episode(0, kept=(100.0, 40.0))]) == TokenTotals(70.0, None, None)
-    assert token_totals([episode(0)]) is None
+    assert tokens_kept(sighted) == TokensKept(
+        kept_mean=pytest.approx(200 / 3), kept_fine=50.0, kept_coarse=100.0
+    )
+    assert tokens_kept([episode(0, kept=(100.0, 40.0))]) == TokensKept(70.0, None, None)
+    assert tokens_kept([episode(0)]) is None
 
 
 def test_a_log_from_before_there_were_tokens_is_read(path):

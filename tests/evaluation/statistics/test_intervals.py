@@ -5,6 +5,7 @@ from scipy.stats import binomtest
 
 from torchrl_sparse.evaluation.statistics.intervals import (
     episodes_needed,
+    mcnemar_p,
     paired_difference,
     tango_interval,
     verdict,
@@ -152,3 +153,10 @@ def test_far_worse_is_inferior():
 def test_faults_name_what_came(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("won", "lost"), [(8, 1), (4, 0), (3, 3), (0, 0), (40, 21)])
+def test_the_p_of_few_differences_is_exact(won, lost):
+    """SciPy's signed-rank test halves it, or has none (findings/scipy_signed_rank_of_successes.sh)."""
+    expected = binomtest(won, won + lost).pvalue if won + lost else 1.0
+    assert mcnemar_p(won, lost) == mcnemar_p(lost, won) == pytest.approx(expected, rel=1e-12)

@@ -238,3 +238,48 @@ def test_little_noise_is_added_in_bfloat16_too():
     rounded = Sampler().add_noise(clean.bfloat16(), noise.bfloat16(), torch.arange(8))
     assert rounded.dtype == torch.bfloat16
     torch.testing.assert_close(rounded.float(), exact, rtol=2**-8, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "first", "amplitude"), [(2, 50, "0.69"), (34, 66, "0.49"), (60, 59, "0.58")]
+)
+def test_steps_that_begin_far_from_noise_are_said(steps, first, amplitude):
+    """They begin where diffusers begins (findings/diffusers_leading_spacing_starts_late.sh)."""
+    with pytest.warns(
+        UserWarning,
+        match=rf"^num_inference_steps={steps}: 'leading' begins at timestep {first} of 100, .* {amplitude} ",
+    ):
+        sampler = Sampler("ddim", steps)
+    assert sampler.timesteps[0] == first
+
+
+@pytest.mark.parametrize("options", [{}, {"num_inference_steps": 10}, {"num_inference_steps": 33},
+                                     {"num_inference_steps": 50}, {"num_inference_steps": 60, "spacing": "trailing"},
+                                     {"num_inference_steps": 2, "spacing": "logsnr"}, {"timesteps": [50, 0]}])  # fmt: skip
+def test_steps_that_begin_near_noise_or_were_chosen_are_not(options, recwarn):
+    Sampler("ddim", **options)
+    assert not recwarn
+
+
+def test_ddim_of_eta_one_is_ddpm_until_a_prediction_is_clipped():
+    """As diffusers has it (findings/diffusers_ddim_eta_one_is_not_ddpm.sh)."""
+    noise, draws = torch.randn(2, *SHAPE), torch.randn(10, *SHAPE)
+
+    def sample(kind, clip, **options):
+        sampler, found = Sampler(kind, 10, clip_sample_range=clip, **options), noise[0]
+        for k, draw in enumerate(draws):
+            found = sampler.step(torch.tanh(found + k), k, found, draw)
+        return found
+
+    torch.testing.assert_close(sample("ddim", 1e6, eta=1), sample("ddpm", 1e6), atol=1e-3, rtol=1e-4)
+    assert (sample("ddim", 1, eta=1) - sample("ddpm", 1)).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("kind", ["ddpm", "ddim", "dpmpp2m", "sde2m", "unipc"])
+def test_a_last_step_adds_no_noise_wherever_it_begins(kind):
+    """diffusers' large variance adds some above timestep 0 (findings/diffusers_large_variance_noises_the_answer.sh)."""
+    sampler = Sampler(kind, timesteps=[91, 51, 11], **({"eta": 1.0} if kind == "ddim" else {}))
+    sample, eps, clean = torch.randn(3, *SHAPE)
+    found = sampler.step(eps, 2, sample, torch.full(SHAPE, torch.nan), (clean, clean))
+    assert found.isfinite().all()
+    assert found.abs().max() <= 1

@@ -6,6 +6,7 @@ import pickle
 
 import pytest
 import torch
+from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
 
 from torchrl_sparse import DiffusionPolicy, keys
@@ -88,6 +89,22 @@ def test_learning_rate_warms_up_and_ends_at_zero(make_trainer):
     assert rates[:4] == pytest.approx([0, 1e-3 / 3, 2e-3 / 3, 1e-3])
     assert rates[3:] == sorted(rates[3:], reverse=True)
     assert rates[-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_learning_rate_stays_at_zero_beyond_the_last_step(make_trainer):
+    """diffusers' cosine rises again (findings/diffusers_cosine_rises_again.sh); until there it is the same, to the bit."""
+    trainer = make_trainer(max_steps=8, lr_warmup_steps=2)
+    weights = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weights], lr=1e-3)
+    reference = get_cosine_schedule_with_warmup(optimizer, 2, 8)
+    for _ in range(8):
+        assert trainer.lr == reference.get_last_lr()[0]
+        trainer.train_step()
+        optimizer.step()
+        reference.step()
+    for _ in range(4):
+        assert trainer.lr == 0
+        trainer.train_step()
 
 
 def test_averaged_weights_follow_diffusers(make_trainer):

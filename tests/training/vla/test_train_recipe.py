@@ -38,7 +38,7 @@ def test_a_terminated_training_goes_on_to_the_same_bits(demos, tmp_path):
     # from there once more: the first step of a warm-up moves nothing, and sizes are those of the policy
     again = tmp_path / "again"
     no_stages = ["grounding.locate_steps=0", "grounding.refer_steps=0"]
-    still = [f"demos={demos}", f"init={broken}/policy", "size=small", "max_steps=1", "batch_size=2"]
+    still = [f"demos={demos}", f"init={broken}/policy", "max_steps=1", "batch_size=2"]
     train_unbroken("train_vla", again, still + no_stages)
     weights = [load_file(out / "policy/model.safetensors") for out in (broken, again)]
     assert weights[0].keys() == weights[1].keys()

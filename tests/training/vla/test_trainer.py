@@ -190,6 +190,16 @@ def test_stages_without_positions_are_refused(make_trainer):
         ObjectPositions(torch.zeros(5, 3, 3), ["lift", "lower"])
 
 
+@pytest.mark.parametrize("steps", [1, 5])
+def test_objects_that_nothing_moves_cannot_be_located(steps):
+    """Their deviation is zero, by which positions were divided."""
+    still = ObjectPositions(torch.full((steps, 1, 3), 0.8), ["lift"])
+    with pytest.raises(ValueError, match=r"object_positions: expected some that vary .*locate_steps=0"):
+        still.standardised()
+    apart = ObjectPositions(torch.tensor([[[0.0, 0, 0], [0.2, 0, 0]]]).expand(steps, 2, 3), ["lift", "lower"])
+    assert apart.standardised().positions.isfinite().all()
+
+
 def test_a_checkpoint_of_another_training_is_refused(make_trainer, tmp_path):
     trainer = make_trainer()
     trainer.save(tmp_path / "checkpoint.pt")

@@ -42,7 +42,9 @@ class Engine(Protocol):
     """
 
     name: str
-    detail: str
+
+    @property
+    def detail(self) -> str: ...
 
     def denoise(
         self,

@@ -105,7 +105,9 @@ class EagerBaseline:
             sample = self._scheduler.step(eps, timestep, sample, **extra).prev_sample
         return sample
 
-    def _skipping_forward(self, sample, timestep, cond, computed: list[bool], latest: list) -> Tensor:
+    def _skipping_forward(
+        self, sample: Tensor, timestep: Tensor, cond: Tensor, computed: list[bool], latest: list
+    ) -> Tensor:
         network = self._network
         x, memory = network.embed(sample), network.memory(timestep, cond)
         for block in range(network.num_blocks):

@@ -118,13 +118,19 @@ def denoise(
 
 
 def _block_output(
-    network, block: int, x: Tensor, memory: Tensor, rows: Tensor | bool, latest: Tensor | None
+    network: TransformerForDiffusion,
+    block: int,
+    x: Tensor,
+    memory: Tensor,
+    rows: Tensor | bool,
+    latest: Tensor | None,
 ) -> Tensor:
     """Return what ``block`` adds: computed for ``rows`` (True: all, False: none), ``latest`` for the others."""
     if rows is True:
         return network.block(block, x, memory)
     if rows is False:
         return latest
+    assert latest is not None  # the first step computes every block of every row
     return latest.index_copy(0, rows, network.block(block, x[rows], memory[rows]))
 
 
@@ -136,10 +142,11 @@ class ComputedRows:
     """
 
     def __init__(self, mask: Tensor | None) -> None:
-        self._device = None if mask is None else mask.device
-        self._computed = None if mask is None else ~mask.cpu()
-        self._all = None if mask is None else self._computed.all(dim=0).tolist()
-        self._any = None if mask is None else self._computed.any(dim=0).tolist()
+        self._computed: Tensor | None = None
+        if mask is not None:
+            self._device, self._computed = mask.device, ~mask.cpu()
+            self._all = self._computed.all(dim=0).tolist()
+            self._any = self._computed.any(dim=0).tolist()
 
     def at(self, step: int, block: int) -> Tensor | bool:
         """Return True if every row computes, False if none does, else the i64 indices of those that do."""

@@ -185,15 +185,17 @@ class PrunerNetwork(nn.Module):
 
     # What is kept follows from the weights: training changes them, as do files and devices, and a copy makes its own.
 
+    _cells: Tensor | None
+    _native: NativePruner | None
+
     def _forget(self) -> None:
-        self._cells: Tensor | None = None
-        self._native: NativePruner | None = None
+        self._cells = self._native = None
 
     def train(self, mode: bool = True) -> PrunerNetwork:
         self._forget()
         return super().train(mode)
 
-    def _apply(self, fn, recurse: bool = True) -> PrunerNetwork:
+    def _apply(self, fn: Any, recurse: bool = True) -> PrunerNetwork:
         self._forget()
         return super()._apply(fn, recurse)
 

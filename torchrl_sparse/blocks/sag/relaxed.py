@@ -14,6 +14,7 @@ reusing does at its own place alone, not from what computing it would do for the
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -88,8 +89,8 @@ def denoise_relaxed(
     Raises:
         ValueError: as ``denoise`` does.
     """
-    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed, "detached": detached}
-    *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, **options)
+    options = _Options(reuse, explore, checkpointed, detached)
+    *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, options)
     return actions
 
 
@@ -115,8 +116,8 @@ def step_errors(
     Returns:
         f32 [B, K - 1, H, A], absolute differences after the steps 1 .. K-1.
     """
-    options = {"reuse": reuse, "explore": explore, "checkpointed": checkpointed, "detached": detached}
-    chain = _chain(network, sampler, noise, cond, gate, **options, cut=True)
+    options = _Options(reuse, explore, checkpointed, detached)
+    chain = _chain(network, sampler, noise, cond, gate, options, cut=True)
     errors = []
     for k, (before, cleans, after) in enumerate(chain):
         if k == 0:  # dense by definition
@@ -128,20 +129,27 @@ def step_errors(
     return torch.stack(errors, dim=1)
 
 
+class _Options(NamedTuple):
+    """Of :func:`denoise_relaxed`."""
+
+    reuse: Reuse
+    explore: float
+    checkpointed: bool
+    detached: bool
+
+
 def _chain(
     network: TransformerForDiffusion,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
     gate: Tensor,
+    options: _Options,
     *,
-    reuse: Reuse,
-    explore: float,
-    checkpointed: bool,
-    detached: bool,
     cut: bool = False,
 ) -> Iterator[tuple[Tensor, tuple[Tensor, ...], Tensor]]:
     """Yield the sample before each denoising step, the clean predictions that the step reads, and the sample after it."""
+    reuse, explore, checkpointed, detached = options
     pruned = gate.detach().bool()
     check_query(network, sampler, noise, cond, pruned, reuse)
     if not 0 < explore <= 1:
@@ -149,7 +157,9 @@ def _chain(
     explored = torch.rand(gate.shape[1:], device=gate.device) < explore
     computed = ComputedRows(pruned & ~explored)
     gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))
-    slots, buffers, cleans = num_buffers(reuse, network.num_blocks), (), ()
+    slots = num_buffers(reuse, network.num_blocks)
+    buffers: tuple[Tensor, ...] = ()
+    cleans: tuple[Tensor, ...] = ()
     sample = noise[:, 0]
     for k in range(sampler.num_inference_steps):
         if cut:
@@ -211,8 +221,10 @@ def _mix(fresh: Tensor | None, rows: Tensor | bool, gate: Tensor, reused: Tensor
     """Return ``(1 - M) d + M tau``; rows that did not compute have ``tau``, and tell their gate nothing."""
     if rows is False:
         return reused
+    if reused is None:  # in the first step, which computes every block of every row
+        return fresh
     whole = fresh if rows is True else reused.index_copy(0, rows, fresh)
-    return whole if reused is None else gate * reused + (1 - gate) * whole
+    return gate * reused + (1 - gate) * whole
 
 
 def _scale_gradient(value: Tensor, factor: Tensor) -> Tensor:

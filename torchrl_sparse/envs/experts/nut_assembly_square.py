@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,7 +46,7 @@ class NutAssemblySquareExpert(Expert):
         return [Waypoint(goal, downward(hand.yaw + _part(left)), OPEN, pace=0.7)]
 
     @property
-    def _nut(self):
+    def _nut(self) -> Any:
         return self.sim_env.nuts[self.sim_env.nut_id]
 
     @property

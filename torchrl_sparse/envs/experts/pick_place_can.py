@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ class PickPlaceCanExpert(Expert):
         hand = self.hand()
         can, rotation = self.body(self._object.root_body)
         grasp, aligned = self._grasp_pose(hand, can, rotation)
-        held = np.linalg.norm(hand.position - can) < 0.035 and hand.opening < _WIDTH + 0.004
+        held = bool(np.linalg.norm(hand.position - can) < 0.035 and hand.opening < _WIDTH + 0.004)
         if self._over_bin(can, margin=0.035) and can[2] < self._bin[2] + _RELEASE + 0.012:
             return [self._let_go(hand, held)]
         if held:
@@ -34,7 +35,7 @@ class PickPlaceCanExpert(Expert):
         return [Waypoint(self.above(hand, grasp), aligned, OPEN)]
 
     @property
-    def _object(self):
+    def _object(self) -> Any:
         return self.sim_env.objects[self.sim_env.object_id]
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,7 +99,7 @@ class PushTExpert:
                     best, best_rate = way, rate
         return best
 
-    def _candidates(self, position: np.ndarray, angle: float):
+    def _candidates(self, position: np.ndarray, angle: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Return the points where pushes may begin, and their unit directions."""
         turn = _rotation(angle)
         for start, end in zip(_CORNERS, np.roll(_CORNERS, -1, axis=0), strict=True):
@@ -115,7 +116,9 @@ class PushTExpert:
                     ):
                         yield begin, -turn @ outward
 
-    def _try(self, begin: np.ndarray, direction: np.ndarray, position: np.ndarray, angle: float):
+    def _try(
+        self, begin: np.ndarray, direction: np.ndarray, position: np.ndarray, angle: float
+    ) -> Iterator[tuple[float, float]]:
         """Push in the copy: yield each length and the outline's distance to the goal after it."""
         block, agent, space = self._copy.block, self._copy.agent, self._copy.space
         block.angle, block.position = angle, tuple(position)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -69,7 +70,7 @@ class ToolHangExpert(Expert):
         return [self._grasp(hand, frame.point(_FRAME_GRIP), frame.rotation @ _FRAME_GRASP)]
 
     @property
-    def _parts(self):
+    def _parts(self) -> tuple[Any, Any, Any]:
         return self.sim_env.frame, self.sim_env.tool, self.sim_env.stand
 
     def _grasp(self, hand: Hand, grip: np.ndarray, aligned: np.ndarray) -> Waypoint:

@@ -44,7 +44,6 @@ from torchrl_sparse.evaluation.results.acceleration import (
     Acceleration,
     Candidate,
     Played,
-    save_acceleration,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.parts import Percentiles
@@ -54,6 +53,7 @@ from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
+from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.targets import make_targets
 from torchrl_sparse.training.diffusion.timesteps import planned_error
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -148,7 +148,7 @@ def accelerate(
         played,
         request.budget_ms,
     )
-    save_acceleration(found, out / "acceleration.json")
+    write_json(out / "acceleration.json", found)
     return found, methods
 
 

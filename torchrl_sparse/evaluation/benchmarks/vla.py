@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, tokens_kept
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.methods.token_budget import TokenBudget
 from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, make_controller, make_pruner
@@ -158,7 +158,7 @@ def matched_number(
     written = TokenMethodName.parse(text)
     if written.like is None:
         return written.number
-    kept = token_totals(episodes[written.like]).mean
+    kept = tokens_kept(episodes[written.like]).kept_mean
     budgets = getattr(make_controller(text, settings), "budgets", (1.0,))
     fits = dense.network.config.visual_spec.per_camera / max(budgets)  # of an alpha, which multiplies them
     return matching_share(

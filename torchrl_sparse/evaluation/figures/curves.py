@@ -16,14 +16,12 @@ def plot_success_within(results: Results, path: str | os.PathLike) -> Path:
     """Draw the share of episodes solved within each number of steps (log axis), a curve per method.
 
     Args:
-        results: of a benchmark; methods whose episodes are not kept are left out.
+        results: of a benchmark.
         path: of the PNG.
     """
     from matplotlib.ticker import NullLocator, ScalarFormatter
 
-    curves = {
-        name: method.success_within for name, method in results.methods.items() if method.success_within
-    }
+    curves = {name: method.success_within for name, method in results.methods.items()}
     colors = method_colors(results.methods)
     figure, axes = make_figure(9, 5)
     for name, shares in curves.items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,41 +18,36 @@ from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime
 from torchrl_sparse.evaluation.results.acceleration import (
-    Acceleration,
     acceleration_note,
     acceleration_rows,
     load_acceleration,
 )
-from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime, realtime_note, realtime_rows
+from torchrl_sparse.evaluation.results.realtime import load_realtime, realtime_note, realtime_rows
 from torchrl_sparse.evaluation.results.report import results_note, results_rows
 from torchrl_sparse.evaluation.results.result_files import READERS, Row, read_tables
-from torchrl_sparse.evaluation.results.schema import AnyResults, Results, load_results
+from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.results.tables import LEFT, select_columns
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["find_runs", "write_report"]
 
 
-def _plots_of_results(results: AnyResults) -> dict[str, Callable[..., Path]]:
-    plots: dict[str, Callable[..., Path]] = {"success against latency": plot_pareto}
-    if isinstance(results, Results):
-        plots["success within the time allowed"] = plot_success_within
-    return plots
-
-
-def _plots_of_realtime(results: Realtime) -> dict[str, Callable[..., Path]]:
-    return {"success against latency": plot_realtime}
-
-
-def _plots_of_acceleration(results: Acceleration) -> dict[str, Callable[..., Path]]:
-    return {"error to demonstrations against latency": plot_acceleration}
-
-
 _DRAWN = {  # by the beginning of a file's name, what is drawn of it too: results.json, results_400.json
-    "acceleration": (load_acceleration, acceleration_rows, acceleration_note, _plots_of_acceleration),
-    "results": (load_results, results_rows, results_note, _plots_of_results),
-    "realtime": (load_realtime, realtime_rows, realtime_note, _plots_of_realtime),
+    "acceleration": (
+        load_acceleration,
+        acceleration_rows,
+        acceleration_note,
+        {"error to demonstrations against latency": plot_acceleration},
+    ),
+    "results": (
+        load_results,
+        results_rows,
+        results_note,
+        {"success against latency": plot_pareto, "success within the time allowed": plot_success_within},
+    ),
+    "realtime": (load_realtime, realtime_rows, realtime_note, {"success against latency": plot_realtime}),
 }
+_KINDS = (*_DRAWN, *READERS)
 _MEDIA = {".png": "image/png", ".mp4": "video/mp4"}
 # From the numbers, instead of a file that may be older than they are.
 _DRAWN_HERE = ("acceleration.png", "pareto.png", "realtime.png", "success_within.png")
@@ -94,12 +89,12 @@ class Run:
 
     @classmethod
     def _drawn(cls, file: Path, name: str) -> Run:
-        load, make_rows, make_note, find_plots = _DRAWN[_beginning(file)]
+        load, make_rows, make_note, plots = _DRAWN[_beginning(file)]
         results = load(file)
         with tempfile.TemporaryDirectory() as folder:
             figures = [
                 Medium.read(plot(results, Path(folder) / "figure.png"), caption)
-                for caption, plot in find_plots(results).items()
+                for caption, plot in plots.items()
             ]
         return cls(name, {"": make_rows(results)}, make_note(results), figures)
 
@@ -123,12 +118,10 @@ def find_runs(root: str | os.PathLike) -> list[Path]:
     Raises:
         FileNotFoundError: if there is none.
     """
-    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith((*READERS,)))
+    found = sorted(path for path in Path(root).rglob("*.json") if path.name.startswith(_KINDS))
     if not found:
-        others = (kind for kind in READERS if kind not in _DRAWN)
-        raise FileNotFoundError(
-            f"{root}: expected {' or '.join(f'{kind}.json' for kind in (*_DRAWN, *others))} in it or below it, got none"
-        )
+        expected = " or ".join(f"{kind}.json" for kind in _KINDS)
+        raise FileNotFoundError(f"{root}: expected {expected} in it or below it, got none")
     return found
 
 

@@ -11,7 +11,7 @@ from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.labels import place_labels
 from torchrl_sparse.evaluation.results.parts import Interval
-from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, MethodEntry1
+from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.text import threads_text
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _FRONT_COLOR = "#B5B5BA"
 _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
 
-def plot_pareto(results: AnyResults, path: str | os.PathLike) -> Path:
+def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
     """Draw success, or the score, with its interval, against the median latency of a query (log axis).
 
     The marker is the verdict.
@@ -57,7 +57,7 @@ def plot_pareto(results: AnyResults, path: str | os.PathLike) -> Path:
     return save_figure(figure, path)
 
 
-def _height(method: MethodEntry1) -> tuple[float, Interval]:
+def _height(method: MethodEntry) -> tuple[float, Interval]:
     """Return what is drawn of a method, and its interval."""
     if method.score:
         return method.score.mean, method.score.ci95
@@ -106,7 +106,7 @@ def _draw_front(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
         )
 
 
-def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntry1]) -> None:
+def _verdict_legend(figure: Figure, axes: Axes, methods: Mapping[str, MethodEntry]) -> None:
     from matplotlib.lines import Line2D
 
     present = {m.judged.verdict for name, m in methods.items() if name != DENSE}

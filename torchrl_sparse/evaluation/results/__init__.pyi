@@ -5,7 +5,6 @@ from .build import (
 )
 from .parts import PolicyShape as PolicyShape
 from .report import (
-    format_pairs as format_pairs,
     format_table as format_table,
 )
 from .schema import (

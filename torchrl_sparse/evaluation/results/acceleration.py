@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, get_args
 
 from torchrl_sparse.evaluation.latency.measure import Machine
@@ -30,7 +29,7 @@ from torchrl_sparse.evaluation.results.text import (
     verdict_text,
 )
 from torchrl_sparse.evaluation.statistics.intervals import Verdict
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "FAMILIES",
@@ -41,7 +40,6 @@ __all__ = [
     "acceleration_note",
     "acceleration_rows",
     "load_acceleration",
-    "save_acceleration",
     "verdict_line",
 ]
 
@@ -154,11 +152,6 @@ def load_acceleration(path: str | os.PathLike) -> Acceleration:
         ValueError: naming file and key, if it is of another kind or does not agree with itself.
     """
     return read_json(path, Acceleration)
-
-
-def save_acceleration(acceleration: Acceleration, path: str | os.PathLike) -> Path:
-    """Write an ``acceleration.json`` in one piece or not at all; return the path."""
-    return write_json(path, acceleration)
 
 
 def acceleration_rows(acceleration: Acceleration) -> list[dict[str, str]]:

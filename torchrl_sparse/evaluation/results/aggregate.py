@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
+from torchrl_sparse.evaluation.results.comparisons import surviving
 from torchrl_sparse.evaluation.results.parts import Difference, PValues, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.text import NONE_SOLVED, p_text, points_text, ratio_text, verdict_text
@@ -17,9 +18,8 @@ from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.evaluation.statistics.aggregate import TaskPairs, aggregate_tasks
 from torchrl_sparse.evaluation.statistics.durations import time_verdict
 from torchrl_sparse.evaluation.statistics.intervals import verdict
-from torchrl_sparse.evaluation.statistics.multiplicity import holm
 from torchrl_sparse.evaluation.statistics.sequential import Design
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "AggregateResults",
@@ -27,7 +27,6 @@ __all__ = [
     "aggregate_rows",
     "load_aggregate",
     "num_verdicts",
-    "save_aggregate",
 ]
 
 
@@ -56,17 +55,15 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     """Put the results of several tasks together; see `torchrl_sparse.evaluation.statistics.aggregate`.
 
     Args:
-        paths: of a ``results.json`` of version 2 of each task, with ``episodes/`` beside it.
+        paths: of a ``results.json`` of each task, with ``episodes/`` beside it.
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: naming the file, if one is of version 1 or of a task that is done by degrees, dense solved nothing in it, or
+        ValueError: naming the file, if one is of a task that is done by degrees, dense solved nothing in it, or
             its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
-        if not isinstance(results, Results):
-            raise ValueError(f"{path}: schema: expected 2 to aggregate, got {results.schema}")
         if results.by_degrees:
             raise ValueError(
                 f"{path}: expected a task that success and time decide, got {results.task}, by degrees"
@@ -84,15 +81,11 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     shared = [
         name
         for name in next(iter(found.values())).methods
-        if name != DENSE and all(_has_times(results, name) for results in found.values())
+        if name != DENSE and all(name in results.methods for results in found.values())
     ]
     if not shared:
-        raise ValueError(f"aggregate: expected a method whose times all of {tasks} have, got none")
+        raise ValueError(f"aggregate: expected a method that all of {tasks} have, got none")
     return AggregateResults(2, tuple(tasks), splits.pop(), {name: _entry(name, found) for name in shared})
-
-
-def _has_times(results: Results, name: str) -> bool:
-    return name in results.methods and results.methods[name].time_vs_dense is not None
 
 
 def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:
@@ -132,7 +125,8 @@ def _episodes(path: Path, name: str, first: int, n: int) -> list[EpisodeResult]:
 
 def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text; † where a verdict does not survive Holm's correction."""
-    lasting = holm(_p_values(results), num_verdicts(results))
+    p_values = {name: entry.p_values for name, entry in results.methods.items()}
+    lasting = surviving(p_values, num_verdicts(results))
     return [
         {
             "method": name,
@@ -152,12 +146,6 @@ def num_verdicts(results: AggregateResults) -> int:
     return 2 * len(results.methods)
 
 
-def _p_values(results: AggregateResults) -> dict[str, float]:
-    """Return the p-value of each verdict."""
-    success = {f"{name} success": entry.p_values.success for name, entry in results.methods.items()}
-    return success | {f"{name} time": entry.p_values.time for name, entry in results.methods.items()}
-
-
 def load_aggregate(path: str | os.PathLike) -> AggregateResults:
     """Read an ``aggregate.json``.
 
@@ -166,8 +154,3 @@ def load_aggregate(path: str | os.PathLike) -> AggregateResults:
         ValueError: naming file and key, if it is of another kind.
     """
     return read_json(path, AggregateResults)
-
-
-def save_aggregate(results: AggregateResults, path: str | os.PathLike) -> Path:
-    """Write an ``aggregate.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)

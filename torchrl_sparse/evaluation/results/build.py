@@ -20,10 +20,9 @@ from torchrl_sparse.evaluation.results.parts import (
     Score,
     Success,
     TimeDifference,
-    TokensKept,
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, SCHEMA, MethodEntry, Results, Stopping
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, token_totals, totals
+from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, tokens_kept, totals
 from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_by_design, pair_episodes
 from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
 from torchrl_sparse.evaluation.statistics.durations import (
@@ -145,7 +144,7 @@ def build_results(
 
 
 def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven: bool) -> MethodEntry:
-    cost, tokens = totals(run.episodes), token_totals(run.episodes)
+    cost, tokens = totals(run.episodes), tokens_kept(run.episodes)
     whole = uneven or tokens is not None  # a query does not say what an episode costs
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
@@ -162,7 +161,7 @@ def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven:
         action_error_vs_dense=ActionError(*map(float, run.action_error)),
         episode_length=cost.episode_length,
         planning_s=None if run.planning is None else Percentiles.of(run.planning),
-        tokens=None if tokens is None else TokensKept(tokens.mean, tokens.fine, tokens.coarse),
+        tokens=tokens,
         per_episode=_episode_cost(run, dense) if whole else None,
     )
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from torchrl_sparse.evaluation.results.schema import AnyResults, Results
+from collections.abc import Mapping
+
+from torchrl_sparse.evaluation.results.parts import PValues
+from torchrl_sparse.evaluation.results.schema import Results
 from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
-__all__ = ["num_comparisons", "survivors"]
+__all__ = ["num_comparisons", "survivors", "surviving"]
 
 
 def num_comparisons(results: Results) -> int:
@@ -13,15 +16,23 @@ def num_comparisons(results: Results) -> int:
     return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
 
 
-def survivors(results: AnyResults) -> set[str] | None:
-    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction; None of version 1."""
-    if not isinstance(results, Results):
-        return None
+def survivors(results: Results) -> set[str]:
+    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction."""
     if results.by_degrees:
         scores = {name: method.score.p_value for name, method in results.methods.items()}
         p_values = {f"{name} success": p for name, p in scores.items() if p is not None}
         return holm(p_values, num_comparisons(results))
-    tested = {name: method.p_values for name, method in results.methods.items() if method.p_values}
-    p_values = {f"{name} success": p.success for name, p in tested.items()}
-    p_values |= {f"{name} time": p.time for name, p in tested.items()}
-    return holm(p_values, num_comparisons(results))
+    p_values = {name: method.p_values for name, method in results.methods.items()}
+    return surviving(p_values, num_comparisons(results))
+
+
+def surviving(p_values: Mapping[str, PValues | None], comparisons: int) -> set[str]:
+    """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction.
+
+    Args:
+        p_values: name -> of both its verdicts; None of dense.
+        comparisons: verdicts in the family.
+    """
+    tested = {name: p for name, p in p_values.items() if p is not None}
+    both = {f"{name} success": p.success for name, p in tested.items()}
+    return holm(both | {f"{name} time": p.time for name, p in tested.items()}, comparisons)

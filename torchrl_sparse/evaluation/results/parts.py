@@ -24,7 +24,6 @@ __all__ = [
     "PolicyShape",
     "Success",
     "TimeDifference",
-    "TokensKept",
     "require",
 ]
 
@@ -275,15 +274,6 @@ class ActionError:
         for name in ("mean", "max"):
             value = getattr(self, name)
             require(0 <= value < math.inf, name, "a finite number >= 0", value)
-
-
-@dataclass(frozen=True)
-class TokensKept:
-    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, in fine and in coarse mode."""
-
-    kept_mean: float
-    kept_fine: float | None
-    kept_coarse: float | None
 
 
 def check_interval(interval: Interval) -> None:

@@ -1,7 +1,6 @@
 """Success against latency in a world that does not wait: ``realtime.json`` and its table.
 
-A latency acts by the number of steps that the world makes in it, so points are kept by that. Version 1 had neither times nor
-their verdicts, and is still read.
+A latency acts by the number of steps that the world makes in it, so points are kept by that.
 """
 
 from __future__ import annotations
@@ -9,15 +8,16 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
 from torchrl_sparse.control.realtime_executor import delay_steps
+from torchrl_sparse.envs.seeds import Split
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
-from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference, require
+from torchrl_sparse.evaluation.results.comparisons import surviving
+from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -29,8 +29,7 @@ from torchrl_sparse.evaluation.results.text import (
     verdict_text,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
-from torchrl_sparse.evaluation.statistics.multiplicity import holm
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "Realtime",
@@ -43,11 +42,9 @@ __all__ = [
     "num_late_comparisons",
     "realtime_note",
     "realtime_rows",
-    "save_realtime",
 ]
 
 SCHEMA = 2
-_COLUMNS = ("verdict", "mean time, steps", "time vs dense", "time verdict", "correlation")
 
 
 @dataclass(frozen=True)
@@ -60,8 +57,7 @@ class RealtimePoint:
         success: of its episodes.
         paired_vs_dense: against the dense policy at its own latency where ``own``, else at the same latency.
         episode_length: mean, environment steps.
-        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon. With what follows None
-            in version 1.
+        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
         time_vs_dense: its ratio to the dense policy's, compared like the success.
         p_values: of both verdicts; None of dense.
         correlation_with_dense: of its times with those that it is compared with; None also where either never differs.
@@ -72,8 +68,8 @@ class RealtimePoint:
     success: Success
     paired_vs_dense: Difference
     episode_length: float
-    restricted_mean_time: float | None = None
-    time_vs_dense: TimeDifference | None = None
+    restricted_mean_time: float
+    time_vs_dense: TimeDifference
     p_values: PValues | None = None
     correlation_with_dense: float | None = None
 
@@ -88,24 +84,17 @@ class RealtimeMethod:
 
 @dataclass(frozen=True)
 class Realtime:
-    """The content of a ``realtime.json``, whose version is ``realtime``; the last two are None in version 1."""
+    """The content of a ``realtime.json``, whose version is ``realtime``."""
 
-    realtime: Literal[1, 2]
+    realtime: Literal[2]
     task: str
     seed: int
     control_freq: float
     n_action_steps: int
     machine: Machine
     methods: dict[str, RealtimeMethod]
-    split: Literal["development", "test"] | None = None
-    episode_horizon: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.realtime == SCHEMA:
-            of_times = [point.time_vs_dense for method in self.methods.values() for point in method.points]
-            for name, value in {"split": self.split, "episode_horizon": self.episode_horizon}.items():
-                require(value is not None, name, "a value in version 2", value)
-            require(None not in of_times, "time_vs_dense", "a value in version 2", None)
+    split: Split
+    episode_horizon: int
 
 
 @dataclass(frozen=True)
@@ -124,7 +113,7 @@ def build_realtime(
     runs: Mapping[str, RealtimeRun],
     *,
     task: str,
-    split: Literal["development", "test"],
+    split: Split,
     seed: int,
     control_freq: float,
     n_action_steps: int,
@@ -172,11 +161,6 @@ def _point(
     )
 
 
-def save_realtime(results: Realtime, path: str | os.PathLike) -> Path:
-    """Write a ``realtime.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)
-
-
 def load_realtime(path: str | os.PathLike) -> Realtime:
     """Read a ``realtime.json``.
 
@@ -188,58 +172,45 @@ def load_realtime(path: str | os.PathLike) -> Realtime:
 
 
 def num_late_comparisons(results: Realtime) -> int:
-    """Return the verdicts of the table, on success and on time of every point but dense's; 0 of version 1."""
+    """Return the verdicts of the table, on success and on time of every point but dense's."""
     points = [point for name, method in results.methods.items() for point in method.points if name != DENSE]
-    return 2 * len(points) if results.realtime == SCHEMA else 0
+    return 2 * len(points)
 
 
 def realtime_rows(results: Realtime) -> list[dict[str, str]]:
     """Return one row of text per method and delay."""
     points = [(name, point) for name, method in results.methods.items() for point in method.points]
-    tested = {(name, point.delay_steps): point.p_values for name, point in points if point.p_values}
-    p_values = {(*key, what): getattr(p, what) for key, p in tested.items() for what in ("success", "time")}
-    lasting = holm(p_values, num_late_comparisons(results))
-    return [
-        _row(
-            name,
-            results,
-            point,
-            {what for what in ("success", "time") if (name, point.delay_steps, what) in lasting},
-        )
-        for name, point in points
-    ]
+    p_values = {f"{name} +{point.delay_steps}": point.p_values for name, point in points}
+    lasting = surviving(p_values, num_late_comparisons(results))
+    return [_row(name, results, point, lasting) for name, point in points]
 
 
 def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection[str]) -> dict[str, str]:
     own = f"{1e3 * results.methods[name].own_latency_s:.3g} ms, its own" if point.own else ""
+    tested, correlation = f"{name} +{point.delay_steps}", point.correlation_with_dense
+    success, time = point.paired_vs_dense, point.time_vs_dense
+    verdicts = [
+        verdict_text(success, f"{tested} success" in lasting),
+        verdict_text(time, f"{tested} time" in lasting),
+    ]
+    if not point.success.k and not success.diff:  # by either
+        verdicts = [NO_VERDICT, NO_VERDICT]
     row = {
         "method": name,
         "delay, steps": str(point.delay_steps),
         "latency": own or f"{1e3 * point.delay_steps / results.control_freq:.0f} ms",
         "success": count_text(point.success),
-        "vs dense, points": "" if name == DENSE else difference_text(point.paired_vs_dense),
+        "vs dense, points": difference_text(success),
+        "verdict": verdicts[0],
+        "mean time, steps": f"{point.restricted_mean_time:.1f}",
+        "time vs dense": ratio_text(time),
+        "time verdict": verdicts[1],
+        "correlation": "" if correlation is None else f"{correlation:.2f}",
     }
-    if results.realtime != SCHEMA:
-        return row | {"steps": f"{point.episode_length:.1f}"}
-    mean = f"{point.restricted_mean_time:.1f}"
-    told = ("baseline", mean, "", "", "") if name == DENSE else _told(point, mean, lasting)
-    return row | dict(zip(_COLUMNS, told, strict=True))
-
-
-def _told(point: RealtimePoint, mean: str, lasting: Collection[str]) -> tuple[str, ...]:
-    correlation, difference, time = (
-        point.correlation_with_dense,
-        point.paired_vs_dense,
-        point.time_vs_dense,
-    )
-    nothing = not point.success.k and not difference.diff  # by either
-    return (
-        NO_VERDICT if nothing else verdict_text(difference, "success" in lasting),
-        mean,
-        ratio_text(time),
-        NO_VERDICT if nothing else verdict_text(time, "time" in lasting),
-        "" if correlation is None else f"{correlation:.2f}",
-    )
+    if name != DENSE:
+        return row
+    compared = ("vs dense, points", "time vs dense", "time verdict", "correlation")
+    return row | dict.fromkeys(compared, "") | {"verdict": "baseline"}
 
 
 def format_realtime(results: Realtime) -> str:
@@ -254,15 +225,8 @@ def realtime_note(results: Realtime) -> str:
     return (
         f"{results.task}, {results.control_freq:g} Hz; {every}; the world goes on meanwhile. Success with Wilson's "
         "95 % interval, difference to dense with Tango's: at a method's own latency to dense at dense's own, else at the "
-        f"same latency. {_times_note(results)}Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, "
-        f"{machine.date[:10]}."
-    )
-
-
-def _times_note(results: Realtime) -> str:
-    if results.realtime != SCHEMA:
-        return ""
-    return (
-        f"Mean time to success, {results.episode_horizon} steps where there is none, is compared likewise. "
+        f"same latency. Mean time to success, {results.episode_horizon} steps where there is none, is compared likewise. "
         f"{num_late_comparisons(results)} comparisons; † marks a verdict that does not survive Holm's correction for them. "
+        f"Own latencies are medians on {machine.cpu}, {threads_text(machine.threads)}, "
+        f"{machine.date[:10]}."
     )

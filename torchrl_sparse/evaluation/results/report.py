@@ -10,15 +10,8 @@ from torchrl_sparse.evaluation.results.parts import (
     EpisodeCost,
     PairedEntry,
     TimeDifference,
-    TokensKept,
 )
-from torchrl_sparse.evaluation.results.schema import (
-    DENSE,
-    AnyResults,
-    MethodEntry,
-    MethodEntry1,
-    Results,
-)
+from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
     NO_VERDICT,
@@ -32,34 +25,28 @@ from torchrl_sparse.evaluation.results.text import (
     threads_text,
     verdict_text,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
-from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN
+from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
 from torchrl_sparse.evaluation.statistics.intervals import (
-    DEFAULT_MARGIN,
     episodes_needed,
-    paired_difference,
 )
 
 __all__ = [
     "comparison_rows",
-    "format_pairs",
     "format_table",
-    "pair_rows",
     "results_note",
     "results_rows",
 ]
 
 
-def format_table(results: AnyResults) -> str:
+def format_table(results: Results) -> str:
     """Return the table of a benchmark, as Markdown that also lines up in a terminal, and the lines that explain it."""
     table = f"{markdown_table(results_rows(results))}\n\n{results_note(results)}"
-    if not isinstance(results, Results) or not results.pairs:
+    if not results.pairs:
         return table
     return f"{table}\n\n{markdown_table(comparison_rows(results.pairs))}"
 
 
-def results_rows(results: AnyResults) -> list[dict[str, str]]:
+def results_rows(results: Results) -> list[dict[str, str]]:
     """Return the rows of the table, one per method: column -> text."""
     lasting = survivors(results)
     rows = [_table_row(name, method, lasting) for name, method in results.methods.items()]
@@ -71,9 +58,8 @@ def results_rows(results: AnyResults) -> list[dict[str, str]]:
 _VERDICTS = {"verdict", "time verdict"}
 
 
-def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dict[str, str]:
+def _table_row(name: str, method: MethodEntry, lasting: set[str]) -> dict[str, str]:
     error, baseline, score = method.action_error_vs_dense, name == DENSE, method.score
-    survives = lasting is None or f"{name} success" in lasting
     tokens = {"tokens (coarse / fine)": _tokens_text(method.tokens)} if method.tokens else {}
     executed = method.flops.executed
     return {
@@ -81,15 +67,15 @@ def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dic
         "success": count_text(method.success),
         **({"score": mean_text(score.mean, score.ci95)} if score else {}),
         "vs dense, points": "" if baseline else difference_text(method.judged),
-        "verdict": "baseline" if baseline else verdict_text(method.judged, survives),
+        "verdict": "baseline" if baseline else verdict_text(method.judged, f"{name} success" in lasting),
         "McNemar's p": p_text(method.judged.mcnemar_p),
-        **(_time_cells(name, method, lasting or ()) if isinstance(method, MethodEntry) and not score else {}),
+        **({} if score else _time_cells(name, method, lasting)),
         "pruned": f"{100 * method.prune_rate:.1f} %",
         **tokens,
         "GFLOPs/query": f"{method.flops.per_query / 1e9:.2f}",
         "FLOPs ratio": f"{method.flops.ratio_to_dense:.3f}",
         **({} if executed is None else {"executed, GFLOPs": f"{executed / 1e9:.2f}"}),
-        **(_episode_cells(getattr(method, "per_episode", None))),
+        **(_episode_cells(method.per_episode)),
         "p50, ms": milliseconds_text(method.latency_s.p50),
         "p95, ms": milliseconds_text(method.latency_s.p95),
         "speed-up": f"{method.speedup_vs_dense:.2f}×",
@@ -99,10 +85,9 @@ def _table_row(name: str, method: MethodEntry1, lasting: set[str] | None) -> dic
 
 
 def _time_cells(name: str, method: MethodEntry, lasting: Collection[str]) -> dict[str, str]:
-    """Return the columns that version 2 adds, empty where a method's episodes are not kept."""
-    texts = dict.fromkeys(("time vs dense", "time verdict", "correlation"), "")
-    if method.time_vs_dense is None or name == DENSE:
-        return texts
+    """Return the columns of times, empty for dense."""
+    if name == DENSE:
+        return dict.fromkeys(("time vs dense", "time verdict", "correlation"), "")
     correlation = method.correlation_with_dense
     return {
         "time vs dense": ratio_text(method.time_vs_dense),
@@ -126,48 +111,6 @@ def _episode_cells(cost: EpisodeCost | None) -> dict[str, str]:
 def _tokens_text(tokens: TokensKept) -> str:
     modes = [f"{count:.0f}" if count is not None else "-" for count in (tokens.kept_coarse, tokens.kept_fine)]
     return f"{tokens.kept_mean:.1f} ({' / '.join(modes)})"
-
-
-def format_pairs(
-    episodes: Mapping[str, Sequence[EpisodeResult]],
-    pairs: Sequence[Sequence[str]],
-    margin: float = DEFAULT_MARGIN,
-) -> str:
-    """Return a table of differences in success between methods of which none need be dense, paired by seed.
-
-    Args:
-        episodes: method -> its episodes.
-        pairs: of names, the first against the second; at least one pair.
-        margin: non-inferiority margin of the verdict on the first.
-
-    Raises:
-        ValueError: if a pair is not two of the methods, or they ran on different seeds.
-
-    >>> once = [EpisodeResult(0, True, 8, 1, 1.0, 0.0)]
-    >>> print(format_pairs({"a": once, "b": once}, [("a", "b")]))
-    | method   | against   |   success |   difference, points | verdict   |   McNemar's p |
-    |:---------|:----------|----------:|---------------------:|:----------|--------------:|
-    | a        | b         |     1 : 1 |  +0.0 [-79.3, +79.3] | undecided |          1.00 |
-    """
-    return markdown_table(pair_rows(episodes, pairs, margin))
-
-
-def pair_rows(
-    episodes: Mapping[str, Sequence[EpisodeResult]], pairs: Sequence[Sequence[str]], margin: float
-) -> list[dict[str, str]]:
-    """Return the rows of `format_pairs`: column -> text."""
-    return [_pair_row(episodes, pair, margin) for pair in pairs]
-
-
-def _pair_row(
-    episodes: Mapping[str, Sequence[EpisodeResult]], pair: Sequence[str], margin: float
-) -> dict[str, str]:
-    if len(pair) != 2 or not set(pair) <= set(episodes):
-        raise ValueError(f"pairs: expected two of {', '.join(episodes)}, got {list(pair)}")
-    pairs = pair_episodes(pair[0], episodes[pair[0]], pair[1], episodes[pair[1]])
-    ours, theirs = pairs.solved
-    difference = Difference.of(paired_difference(ours, theirs, margin))
-    return _success_cells(pair, (sum(ours), sum(theirs)), difference)
 
 
 def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:
@@ -203,7 +146,7 @@ _MCNEMAR = (
 _STOPPED = ", and as of a fixed number of episodes."
 
 
-def results_note(results: AnyResults) -> str:
+def results_note(results: Results) -> str:
     """Return the lines that explain the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
     n, margin = _num_pairs(results), dense.paired_vs_dense.margin
@@ -221,15 +164,16 @@ def results_note(results: AnyResults) -> str:
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
         "below 0, whatever the margin.",
-        *(() if scored else [_MCNEMAR + (_STOPPED if getattr(results, "until_decided", None) else ".")]),
-        *(_time_lines(results) if isinstance(results, Results) and not scored else []),
-        *(_comparison_lines(results) if isinstance(results, Results) else []),
+        *(() if scored else [_MCNEMAR + (_STOPPED if results.until_decided else ".")]),
+        *([] if scored else [_time_line(results)]),
+        f"{num_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
+        "correction for them.",
         f"Dense: {policy.params:,} parameters, {steps}. FLOPs are "
         f"2·MAC of a query, {flops}. Latency of a query, all methods interleaved in one process, on "
         f"{machine.cpu}, {machine.device}, {threads_text(machine.threads)}, torch {machine.torch}, "
         f"{machine.date[:10]}.",
     ]
-    if any(getattr(method, "per_episode", None) for method in results.methods.values()):
+    if any(method.per_episode for method in results.methods.values()):
         lines.append(
             "FLOPs ratio is that of a query; beside it that of *an episode*, whose length methods change, and of *a second* of "
             "motion. Queries are those of an episode, *time, an episode* the seconds that all of them take, over dense's."
@@ -246,16 +190,14 @@ def results_note(results: AnyResults) -> str:
     return "\n".join(lines)
 
 
-def _num_pairs(results: AnyResults) -> int:
+def _num_pairs(results: Results) -> int:
     """Return the episodes of the method that has the most; dense may have more."""
     counts = [method.success.n for name, method in results.methods.items() if name != DENSE]
     return max(counts, default=results.dense.success.n)
 
 
-def _episodes_text(results: AnyResults) -> str:
+def _episodes_text(results: Results) -> str:
     n = _num_pairs(results)
-    if not isinstance(results, Results):
-        return f"{n} paired episodes a method (seed {results.seed})"
     seeds = f"{results.split} seeds from {results.first_seed}"
     if (stopping := results.until_decided) is None:
         return f"{n} paired episodes a method ({seeds})"
@@ -265,25 +207,16 @@ def _episodes_text(results: AnyResults) -> str:
     )
 
 
-def _time_lines(results: Results) -> Iterator[str]:
-    margin = results.dense.time_vs_dense.margin if results.dense.time_vs_dense else DEFAULT_TIME_MARGIN
-    yield (
+def _time_line(results: Results) -> str:
+    margin = results.dense.time_vs_dense.margin
+    return (
         f"Time vs dense is the ratio of mean steps to success, {results.episode_horizon} where there is none, with a paired "
         f"95 % interval and a verdict against a margin of {100 * margin:g} %; correlation is that of these steps with dense's "
         "over the seeds, about 0 where a method does not share dense's noise step by step."
     )
 
 
-def _comparison_lines(results: Results) -> Iterator[str]:
-    yield (
-        f"{num_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
-        "correction for them."
-    )
-    if lacking := [name for name, method in results.methods.items() if method.time_vs_dense is None]:
-        yield f"Episodes of {', '.join(lacking)} were not kept: they count as comparisons without a p-value."
-
-
-def _planning(methods: Mapping[str, MethodEntry1]) -> Iterator[str]:
+def _planning(methods: Mapping[str, MethodEntry]) -> Iterator[str]:
     """Yield what each planner that looks at the observation takes, and its share of a query."""
     for name, method in methods.items():
         if method.planning_s:

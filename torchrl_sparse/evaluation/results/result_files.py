@@ -1,15 +1,12 @@
-"""Rows of text from a file of results, whatever its kind: what a report and a page show of it."""
+"""Rows of text from a file of results that nothing is drawn of: what a report shows of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from torchrl_sparse.evaluation.results.acceleration import acceleration_rows, load_acceleration
 from torchrl_sparse.evaluation.results.aggregate import aggregate_rows, load_aggregate, num_verdicts
-from torchrl_sparse.evaluation.results.choices import budget_rows, headline_rows
-from torchrl_sparse.evaluation.results.comparisons import num_comparisons
 from torchrl_sparse.evaluation.results.engine_report import (
     COLUMNS,
     engine_rows,
@@ -17,10 +14,6 @@ from torchrl_sparse.evaluation.results.engine_report import (
     load_engine_results,
 )
 from torchrl_sparse.evaluation.results.query_report import load_query_profile, query_rows
-from torchrl_sparse.evaluation.results.realtime import load_realtime, num_late_comparisons, realtime_rows
-from torchrl_sparse.evaluation.results.report import comparison_rows, results_rows
-from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results, load_results
-from torchrl_sparse.evaluation.results.text import count_text, mean_text, percent_text
 from torchrl_sparse.evaluation.results.vla_report import (
     load_vla_results,
     vla_method_rows,
@@ -54,70 +47,9 @@ class Table:
         return row[self.columns[0]]
 
 
-def read_tables(
-    path: Path, readers: Mapping[str, Callable[[Path], dict[str, Table]]] | None = None
-) -> dict[str, Table]:
-    """Read all tables of a file of results that its episodes are not needed for, by name.
-
-    Args:
-        path: of a file whose name begins with a key of ``readers``.
-        readers: beginning of a name -> reader; `READERS` without it.
-    """
-    found = READERS if readers is None else readers
-    return next(read for kind, read in found.items() if path.name.startswith(kind))(path)
-
-
-def _results(path: Path) -> dict[str, Table]:
-    results = load_results(path)
-    rows = results_rows(results)
-    whole = [{**row, **_more(results, row["method"])} for row in rows]
-    marked = num_comparisons(results) if isinstance(results, Results) else 0
-    methods = replace(make_table(results.subject, whole, len(rows[0])), comparisons=marked)
-    pairs = results.pairs if isinstance(results, Results) else None
-    compared = {"pairs": make_table(results.subject, comparison_rows(pairs))} if pairs else {}
-    if not isinstance(results, Results) or results.dense.restricted_mean_time is None:
-        return {"methods": methods} | compared
-    headline, budgets = headline_rows(results), budget_rows(results)
-    chosen = {
-        "headline": make_table(results.subject, headline),
-        "budgets": make_table(results.subject, budgets),
-    }
-    return {"methods": methods} | compared | chosen
-
-
-def _more(results: AnyResults, name: str) -> Row:
-    """Return the columns that only a page asks for."""
-    method = results.methods[name]
-    chunks, score = 1 / method.latency_s.p50, method.score
-    more = {
-        "success, %": percent_text(method.success),
-        "success or score": mean_text(score.mean, score.ci95) if score else count_text(method.success),
-        "action chunks per second": f"{chunks:.1f}",
-        "actions per second": f"{results.policy.n_action_steps * chunks:.0f}",
-    }
-    if isinstance(method, MethodEntry):
-        more |= _more_of_times(results, method)
-        if not score:
-            return more
-    # Beside rows of version 2 that success and time decide, one of version 1 or one that its score decides has no times.
-    return more | dict.fromkeys(("time vs dense", "time verdict"), "")
-
-
-def _more_of_times(results: Results, method: MethodEntry) -> Row:
-    """Return those of version 2, empty where a method's episodes are not kept."""
-    mean, shares, limits = method.restricted_mean_time, method.success_within, method.speedup_ci95
-    early = None if shares is None or results.early_cut is None else shares[str(results.early_cut)]
-    return {
-        "mean time, steps": "" if mean is None else f"{mean:.1f}",
-        "early, %": "" if early is None else f"{100 * early:.1f}",
-        "speed-up, 95 %": "" if limits is None else f"[{limits[0]:.2f}, {limits[1]:.2f}]",
-    }
-
-
-def _realtime(path: Path) -> dict[str, Table]:
-    results = load_realtime(path)
-    table = make_table(results.task, realtime_rows(results))
-    return {"methods": replace(table, comparisons=num_late_comparisons(results))}
+def read_tables(path: Path) -> dict[str, Table]:
+    """Read all tables of a file whose name begins with a key of `READERS`, by name."""
+    return next(read for kind, read in READERS.items() if path.name.startswith(kind))(path)
 
 
 def _engine(path: Path) -> dict[str, Table]:
@@ -147,24 +79,13 @@ def _aggregate(path: Path) -> dict[str, Table]:
     return {"methods": replace(table, comparisons=num_verdicts(results))}
 
 
-def _acceleration(path: Path) -> dict[str, Table]:
-    found = load_acceleration(path)
-    rows = acceleration_rows(found)
-    played = [row for row in rows if row["method"].removesuffix(" (chosen)") in found.played]
-    tables = {"candidates": make_table(found.task, rows)}
-    return tables | ({"played": make_table(found.task, played)} if played else {})
-
-
 def make_table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
     """Make a table that shows its first columns, all unless it is said how many."""
     return Table(task, tuple(rows[0])[:shown], rows)
 
 
 READERS = {
-    "results": _results,
-    "acceleration": _acceleration,
     "aggregate": _aggregate,
-    "realtime": _realtime,
     "engine": _engine,
     "query": _query,
     "vla_latency": _vla,

@@ -1,8 +1,7 @@
 """``results.json``: the only source of every table and figure.
 
-The dataclasses are the schema. Version 2 is written; version 1, without times to success, can still be read, as `Results1`, and
-`load_results` refuses everything else. Seconds are those of a query; FLOPs are 2 * MAC of a query, of the denoiser alone or
-of a whole vision-language-action model.
+The dataclasses are the schema, and `load_results` refuses everything else. Seconds are those of a query; FLOPs are 2 * MAC of a
+query, of the denoiser alone or of a whole vision-language-action model.
 """
 
 from __future__ import annotations
@@ -27,20 +26,17 @@ from torchrl_sparse.evaluation.results.parts import (
     Score,
     Success,
     TimeDifference,
-    TokensKept,
     check_interval,
     require,
 )
+from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
     "DENSE",
     "SCHEMA",
-    "AnyResults",
     "MethodEntry",
-    "MethodEntry1",
     "Results",
-    "Results1",
     "Stopping",
     "load_results",
     "save_results",
@@ -50,12 +46,10 @@ SCHEMA = 2
 DENSE = "dense"
 """The method that all others are compared with."""
 
-_FIRST_SEED_1 = 100_000  # of every benchmark of version 1
 
-
-@dataclass(frozen=True)
-class MethodEntry1:
-    """Everything that version 1 says about one method.
+@dataclass(frozen=True, kw_only=True)
+class MethodEntry:
+    """Everything about one method.
 
     Attributes:
         success: of its episodes.
@@ -68,6 +62,15 @@ class MethodEntry1:
         episode_length: mean, environment steps.
         planning_s: part of a query in which the planner decides; where it looks at the observation.
         tokens: that it keeps; of policies with visual tokens.
+        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
+        time_vs_dense: its ratio to the dense policy's.
+        success_within: share of episodes solved within so many steps; see `allowed_steps`.
+        correlation_with_dense: Pearson's, of times over the seeds; None where times never differ.
+        p_values: of the two verdicts; None of dense.
+        speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement; None in older files.
+        score: of a task that is done by degrees; its verdict is the one that counts there.
+        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, or where methods are asked
+            unequally often.
     """
 
     success: Success
@@ -80,8 +83,14 @@ class MethodEntry1:
     episode_length: float
     planning_s: Percentiles | None = None
     tokens: TokensKept | None = None
-
-    score = None  # version 1 tells none
+    restricted_mean_time: float
+    time_vs_dense: TimeDifference
+    success_within: dict[str, float]
+    correlation_with_dense: float | None = None
+    p_values: PValues | None = None
+    speedup_ci95: Interval | None = None
+    score: Score | None = None
+    per_episode: EpisodeCost | None = None
 
     @property
     def judged(self) -> Difference:
@@ -90,49 +99,12 @@ class MethodEntry1:
 
     def __post_init__(self) -> None:
         require(0 <= self.prune_rate <= 1, "prune_rate", "0 to 1", self.prune_rate)
-
-
-@dataclass(frozen=True)
-class MethodEntry(MethodEntry1):
-    """Everything about one method.
-
-    What follows from episodes is None in a file that was made from one of version 1, where the method's are not kept; what
-    follows from the rounds of the latency measurement, in every such file.
-
-    Attributes:
-        restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
-        time_vs_dense: its ratio to the dense policy's.
-        success_within: share of episodes solved within so many steps; see `allowed_steps`.
-        correlation_with_dense: Pearson's, of times over the seeds; None also where times never differ.
-        p_values: of the two verdicts.
-        speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement.
-        score: of a task that is done by degrees; its verdict is the one that counts there.
-        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, or where methods are asked
-            unequally often.
-    """
-
-    restricted_mean_time: float | None = None
-    time_vs_dense: TimeDifference | None = None
-    success_within: dict[str, float] | None = None
-    correlation_with_dense: float | None = None
-    p_values: PValues | None = None
-    speedup_ci95: Interval | None = None
-    score: Score | None = None
-    per_episode: EpisodeCost | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        known = {getattr(self, name) is not None for name in _OF_EPISODES}
-        require(len(known) == 1, "restricted_mean_time", f"all of {', '.join(_OF_EPISODES)} or none", "some")
-        for steps, share in (self.success_within or {}).items():
+        for steps, share in self.success_within.items():
             require(
                 steps.isdecimal() and 0 <= share <= 1, "success_within", "steps and shares", {steps: share}
             )
         if self.speedup_ci95 is not None:
             check_interval(self.speedup_ci95)
-
-
-_OF_EPISODES = ("restricted_mean_time", "time_vs_dense", "success_within")
 
 
 @dataclass(frozen=True)
@@ -143,65 +115,8 @@ class Stopping:
     looks: int
 
 
-class _Methods:
-    """The fields and methods of both versions."""
-
-    task: str
-    policy: PolicyShape
-    methods: dict[str, MethodEntry]
-
-    def _check_methods(self, *, same_episodes: bool = True) -> None:
-        require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
-        n = self.dense.success.n
-        expected = f"{n}, as every method" if same_episodes else f"at most {n}, as dense"
-        for name, method in self.methods.items():
-            got = method.success.n
-            fits = got == n if same_episodes else got <= n
-            require(fits, f"methods.{name}.success.n", expected, got)
-
-    @property
-    def subject(self) -> str:
-        """What tables and figures of several results tell apart: the task, and whether the policy has cameras for it."""
-        return f"{self.task}, cameras" if self.policy.cameras else self.task
-
-    @property
-    def by_degrees(self) -> bool:
-        """Whether the task is done by degrees, so that verdicts are those of scores."""
-        return self.dense.score is not None
-
-    @property
-    def dense_did_nothing(self) -> bool:
-        """Whether dense solved no episode, or scored nothing in any, so that no verdict means anything."""
-        return not (self.dense.score.mean if self.dense.score else self.dense.success.k)
-
-    @property
-    def dense(self) -> MethodEntry:
-        """The dense policy's entry."""
-        return self.methods[DENSE]
-
-
 @dataclass(frozen=True)
-class Results1(_Methods):
-    """The content of a ``results.json`` of version 1."""
-
-    schema: Literal[1]
-    task: str
-    seed: int
-    machine: Machine
-    policy: PolicyShape
-    methods: dict[str, MethodEntry1]
-
-    def __post_init__(self) -> None:
-        self._check_methods()
-
-    @property
-    def first_seed(self) -> int:
-        """Seed of the first episode."""
-        return _FIRST_SEED_1 + self.seed
-
-
-@dataclass(frozen=True)
-class Results(_Methods):
+class Results:
     """The content of a ``results.json``: where it was measured, on what, and all methods, the dense policy among them.
 
     Attributes:
@@ -233,10 +148,32 @@ class Results(_Methods):
     settings: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        self._check_methods(same_episodes=self.until_decided is None)
+        same_episodes = self.until_decided is None
+        require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
+        n = self.dense.success.n
+        expected = f"{n}, as every method" if same_episodes else f"at most {n}, as dense"
+        for name, method in self.methods.items():
+            got = method.success.n
+            fits = got == n if same_episodes else got <= n
+            require(fits, f"methods.{name}.success.n", expected, got)
         for pair in self.pairs or ():
             known = {pair.method, pair.against} <= self.methods.keys()
             require(known, "pairs", f"two of {', '.join(self.methods)}", [pair.method, pair.against])
+
+    @property
+    def by_degrees(self) -> bool:
+        """Whether the task is done by degrees, so that verdicts are those of scores."""
+        return self.dense.score is not None
+
+    @property
+    def dense_did_nothing(self) -> bool:
+        """Whether dense solved no episode, or scored nothing in any, so that no verdict means anything."""
+        return not (self.dense.score.mean if self.dense.score else self.dense.success.k)
+
+    @property
+    def dense(self) -> MethodEntry:
+        """The dense policy's entry."""
+        return self.methods[DENSE]
 
     @property
     def first_seed(self) -> int:
@@ -244,20 +181,18 @@ class Results(_Methods):
         return evaluation_seeds(self.split, self.seed, 1)[0]
 
 
-AnyResults = Results | Results1
-
-
-def load_results(path: str | os.PathLike) -> AnyResults:
-    """Read a ``results.json`` as what its ``schema`` says.
+def load_results(path: str | os.PathLike) -> Results:
+    """Read a ``results.json``.
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of neither version or does not agree with itself.
+        ValueError: naming file and key, if it is of another version or does not agree with itself.
     """
     found = read_json(path, dict[str, Any]).get("schema")
-    if type(found) is not int or found not in (1, SCHEMA):  # true is 1
-        raise ValueError(f"{path}: schema: expected 1 or {SCHEMA}, got {found!r}")
-    return read_json(path, Results if found == SCHEMA else Results1)
+    if type(found) is not int or found != SCHEMA:  # true is 1
+        older = "; schema 1 had no times to success: run its benchmark again" if found == 1 else ""
+        raise ValueError(f"{path}: schema: expected {SCHEMA}, got {found!r}{older}")
+    return read_json(path, Results)
 
 
 def save_results(results: Results, path: str | os.PathLike) -> Path:

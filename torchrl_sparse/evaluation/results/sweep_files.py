@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
+
+from torchrl_sparse.storage.yaml import read_yaml
 
 __all__ = ["find_program", "hydra_word", "parameter_sets", "read_sweep", "sweep_engine", "trial_command"]
 
@@ -39,15 +43,12 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
         ValueError: if wandb would refuse it, an entry would not be honoured, or its trials would see test seeds; the message
             names file and entry.
     """
-    try:
-        config = yaml.safe_load(Path(path).read_bytes())
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of bytes that are no text, and of depth
-        reason = " ".join(str(error).split()) or "one that is too deep"
-        raise ValueError(f"{path}: expected a wandb sweep, got {reason}") from error
+    config = read_yaml(path)
     if not isinstance(config, dict):
         raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
     config = {"command": [*DEFAULT_COMMAND]} | config
     _check_entries(path, config)
+    _check_parameters(path, config["parameters"])
     _check_command(path, config)
     check = sweep_engine().config.cfg.schema_violations_from_proposed_config
     try:
@@ -75,6 +76,43 @@ def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
             raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
     if config["method"] not in _METHODS:
         raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
+
+
+def _check_parameters(path: str | os.PathLike, parameters: Mapping[str, Any]) -> None:
+    """Refuse, by name, values that a trial would read as others, and options that two parameters set."""
+    options: list[str] = []
+    for name, entry in parameters.items():
+        found: set[str] = set()
+        for option, value in parameter_values(name, entry):
+            found |= {f"{option}.{inner}" for inner in value} if isinstance(value, dict) else {option}
+            if not _arrives(value):
+                expected = "a value that Hydra reads as it stands, without ${...} and other marks in names"
+                raise ValueError(f"{path}: {option}: expected {expected}, got {value!r}")
+        options += [option.lstrip("+") for option in found]
+    if twice := sorted({option for option in options if options.count(option) > 1}):
+        raise ValueError(f"{path}: parameters: expected each option once, got {', '.join(twice)} twice")
+
+
+def parameter_values(name: str, entry: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the options that a parameter sets, with each value that the file names; a distribution names none.
+
+    >>> list(parameter_values("sampler", {"parameters": {"kind": {"values": ["ddim", "ddpm"]}}}))
+    [('sampler.kind', 'ddim'), ('sampler.kind', 'ddpm')]
+    """
+    entry = entry if isinstance(entry, dict) else {}
+    for inner, nested in entry.get("parameters", {}).items():
+        yield from parameter_values(f"{name}.{inner}", nested)
+    values = entry.get("values", [])
+    yield from ((name, value) for value in (values if isinstance(values, list) else [values]))
+    if "value" in entry:
+        yield name, entry["value"]
+
+
+def _arrives(value: Any) -> bool:
+    """Tell whether a trial reads a value as it stands, or, of a text in brackets, what it says."""
+    word = hydra_word(value)
+    in_brackets = isinstance(value, str) and word == value and value[:1] in ("[", "{")
+    return "${" not in word and (in_brackets or _read_by_hydra(word) == value)
 
 
 def _check_command(path: str | os.PathLike, config: dict[str, Any]) -> None:
@@ -158,14 +196,29 @@ def trial_command(config: Mapping[str, Any], parameters: Mapping[str, Any]) -> l
 
 
 def hydra_word(value: Any) -> str:
-    """Write a parameter as Hydra reads it on a command line. Text is left as it is: it may be a list, or a reference.
+    """Write a parameter as Hydra reads it on a command line.
 
-    >>> hydra_word(None), hydra_word(True), hydra_word("[dense,bac]")
-    ('null', 'true', '[dense,bac]')
+    A text is read as the text that it is, but for one that is a list or a mapping in brackets, as W&B's users write these.
+
+    >>> hydra_word(None), hydra_word(True), hydra_word("true"), hydra_word("[dense,bac]")
+    ('null', 'true', "'true'", '[dense,bac]')
     >>> hydra_word({"kind": "ddim", "timesteps": [87, 20]})
     "{kind: 'ddim', timesteps: [87, 20]}"
     """
-    return value if isinstance(value, str) else _written(value)
+    if not isinstance(value, str):
+        return _written(value)
+    read = _read_by_hydra(value)
+    kept = isinstance(read, (list, dict)) if value[:1] in ("[", "{") else read == value
+    return value if kept else _quoted(value)
+
+
+def _read_by_hydra(text: str) -> Any:
+    """Return what Hydra makes of a text after ``name=``; None if it reads nothing."""
+    try:
+        (override,) = OverridesParser.create().parse_overrides([f"name={text}"])
+        return override.value()
+    except HydraException:
+        return None
 
 
 def _written(value: Any) -> str:
@@ -177,7 +230,11 @@ def _written(value: Any) -> str:
         return f"{{{', '.join(f'{name}: {_written(entry)}' for name, entry in value.items())}}}"
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_written, value))}]"
-    return "'" + value.replace("'", r"\'") + "'" if isinstance(value, str) else str(value)
+    return _quoted(value) if isinstance(value, str) else str(value)
+
+
+def _quoted(text: str) -> str:
+    return QuotedString(text, Quote.single).with_quotes()
 
 
 def find_program(name: str) -> Path:

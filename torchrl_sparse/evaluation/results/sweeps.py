@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_sparse.evaluation.results.schema import DENSE, AnyResults, load_results
+from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.sweep_files import sweep_engine, trial_command
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.runtime.failure import RunFailed
@@ -28,10 +28,6 @@ __all__ = [
     "run_trial",
     "write_trials",
 ]
-
-
-_DEBUGGING = ("HYDRA_FULL_ERROR",)
-"""Variables of the sweep's own process that are none of its trials'."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +122,7 @@ class LocalSweep:
         self.trials[self.trials.index(trial)] = replace(trial, finished=True)
         self._save()
 
-    def results(self) -> list[tuple[Trial, AnyResults]]:
+    def results(self) -> list[tuple[Trial, Results]]:
         """Return the finished trials and what they found, in the order in which they were chosen."""
         return [(trial, load_results(self.results_file(trial))) for trial in self.trials if trial.finished]
 
@@ -154,8 +150,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
         RunFailed: if its command fails.
         FileNotFoundError: if it left no results.
     """
-    inherited = {name: value for name, value in os.environ.items() if name not in _DEBUGGING}
-    environment = inherited | {
+    environment = os.environ | {
         "WANDB_MODE": "offline",
         "WANDB_RUN_ID": trial.id,
         "WANDB_RUN_GROUP": sweep.out.name,
@@ -167,7 +162,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
     sweep.finish(trial)
 
 
-def write_trials(trials: Sequence[tuple[Trial, AnyResults]], path: str | os.PathLike) -> None:
+def write_trials(trials: Sequence[tuple[Trial, Results]], path: str | os.PathLike) -> None:
     """Write one line of CSV per trial: its parameters, the numbers of what it tested, and the id of its run."""
     rows = [{**trial.parameters, **_tested(results), "run": trial.id} for trial, results in trials]
     with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
@@ -176,13 +171,13 @@ def write_trials(trials: Sequence[tuple[Trial, AnyResults]], path: str | os.Path
         writer.writerows(rows)
 
 
-def _tested(results: AnyResults) -> dict[str, float]:
+def _tested(results: Results) -> dict[str, float]:
     prefix = "tested/"
     metrics = trial_metrics(results).items()
     return {name.removeprefix(prefix): value for name, value in metrics if name.startswith(prefix)}
 
 
-def merge_trials(trials: Sequence[tuple[Trial, AnyResults]]) -> AnyResults:
+def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
     """Merge a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
 
     Latencies come from the trials' own processes, each with its own dense for ``speedup_vs_dense``; the dense entry

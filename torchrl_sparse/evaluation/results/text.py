@@ -12,7 +12,6 @@ __all__ = [
     "mean_text",
     "milliseconds_text",
     "p_text",
-    "percent_text",
     "points_text",
     "ratio_text",
     "threads_text",
@@ -36,15 +35,6 @@ def count_text(success: Success) -> str:
     '3/4 [30, 95] %'
     """
     return f"{success.k}/{success.n} {percent_range(success.ci95)} %"
-
-
-def percent_text(success: Success) -> str:
-    """Return a success rate with its interval, in percent.
-
-    >>> percent_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
-    '75.0 [30, 95]'
-    """
-    return f"{100 * success.rate:.1f} {percent_range(success.ci95)}"
 
 
 def difference_text(difference: Difference) -> str:

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sparse.evaluation.results.report import results_rows
-from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry1
+from torchrl_sparse.evaluation.results.schema import MethodEntry, Results
 from torchrl_sparse.runtime.wandb_run import wandb_arguments
 
 __all__ = ["log_benchmark", "tested_method", "trial_metrics"]
 
 
-def tested_method(results: AnyResults) -> str:
+def tested_method(results: Results) -> str:
     """Return the name of the method that a sweep's trial is about: the last one."""
     return list(results.methods)[-1]
 
 
-def trial_metrics(results: AnyResults) -> dict[str, float]:
+def trial_metrics(results: Results) -> dict[str, float]:
     """Return ``"<method>/<number>"`` for every method, and ``"tested/<number>"`` for the last one, whatever its name."""
     named = {**results.methods, "tested": results.methods[tested_method(results)]}
     return {
@@ -26,7 +26,7 @@ def trial_metrics(results: AnyResults) -> dict[str, float]:
     }
 
 
-def _numbers(method: MethodEntry1) -> dict[str, float]:
+def _numbers(method: MethodEntry) -> dict[str, float]:
     return {
         "success": method.success.rate,
         "diff_to_dense": method.paired_vs_dense.diff,
@@ -39,7 +39,7 @@ def _numbers(method: MethodEntry1) -> dict[str, float]:
     }
 
 
-def log_benchmark(results: AnyResults, folder: Path, config: Mapping[str, Any]) -> None:
+def log_benchmark(results: Results, folder: Path, config: Mapping[str, Any]) -> None:
     """Log a finished benchmark as one run, the same as before if it is logged again; see `wandb_arguments`.
 
     Args:

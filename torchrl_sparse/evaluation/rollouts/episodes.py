@@ -17,11 +17,11 @@ from torchrl_sparse.storage.json import MAX_BYTES, describe_differences, parse_j
 __all__ = [
     "EpisodeLog",
     "EpisodeResult",
-    "TokenTotals",
+    "TokensKept",
     "Totals",
     "read_episodes",
     "read_identity",
-    "token_totals",
+    "tokens_kept",
     "totals",
 ]
 
@@ -80,15 +80,15 @@ class Totals:
 
 
 @dataclass(frozen=True)
-class TokenTotals:
-    """Visual tokens in a decoder layer, mean over queries: of all, of those in fine mode, and of the others.
+class TokensKept:
+    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, of those in fine mode, and of the others.
 
-    ``fine`` and ``coarse`` are None where there was no such query, as without a controller.
+    The last two are None where there was no such query, as without a controller.
     """
 
-    mean: float
-    fine: float | None
-    coarse: float | None
+    kept_mean: float
+    kept_fine: float | None
+    kept_coarse: float | None
 
 
 def totals(episodes: Sequence[EpisodeResult]) -> Totals:
@@ -111,11 +111,11 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
     )
 
 
-def token_totals(episodes: Sequence[EpisodeResult]) -> TokenTotals | None:
+def tokens_kept(episodes: Sequence[EpisodeResult]) -> TokensKept | None:
     """Average the visual tokens of episodes, every query counting the same; None for a policy without them.
 
-    >>> token_totals([EpisodeResult(0, True, 8, 2, 10.0, 0.5, kept=(90.0, 30.0), fine=(True, False))])
-    TokenTotals(mean=60.0, fine=90.0, coarse=30.0)
+    >>> tokens_kept([EpisodeResult(0, True, 8, 2, 10.0, 0.5, kept=(90.0, 30.0), fine=(True, False))])
+    TokensKept(kept_mean=60.0, kept_fine=90.0, kept_coarse=30.0)
     """
     kept = [count for episode in episodes for count in episode.kept]
     if not kept:
@@ -124,7 +124,7 @@ def token_totals(episodes: Sequence[EpisodeResult]) -> TokenTotals | None:
         pair for episode in episodes if episode.fine for pair in zip(episode.fine, episode.kept, strict=True)
     ]
     fine, coarse = ([count for mode, count in modes if mode is wanted] for wanted in (True, False))
-    return TokenTotals(_mean(kept), _mean(fine) if fine else None, _mean(coarse) if coarse else None)
+    return TokensKept(_mean(kept), _mean(fine) if fine else None, _mean(coarse) if coarse else None)
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, settings_of
+from torchrl_sparse.networks.fingerprint import full_fingerprint
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
@@ -31,7 +33,10 @@ def method_identity(text: str, number: float | None, policy: VLAPolicy, settings
         policy: whose weights answered.
         settings: sections that its pruner was made with.
     """
-    identity = {"method": text, "number": number, "policy": tensors_fingerprint(policy.state_dict())}
+    # sizes that no tensor shows, as the share of an image that is cropped and the number of heads
+    sizes = json.dumps(policy.network.config.to_dict(), sort_keys=True).encode()
+    fingerprint = full_fingerprint(tensors_fingerprint(policy.state_dict()), sizes)
+    identity = {"method": text, "number": number, "policy": fingerprint}
     method = TOKEN_METHODS[TokenMethodName.parse(text).name]
     if method.settings is not None:
         identity["options"] = settings_of(text, settings)

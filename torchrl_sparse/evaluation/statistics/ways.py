@@ -1,12 +1,12 @@
-"""Ways of doing a task that episodes take: a policy that knows one of several equally good ones has collapsed."""
+"""What episodes tell beside success: which of several ways of a task they took, and how many of its parts they did."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import log2
 
-__all__ = ["way_entropy"]
+__all__ = ["count_levels", "way_entropy"]
 
 
 def way_entropy(ways: Iterable[int]) -> float:
@@ -28,3 +28,13 @@ def way_entropy(ways: Iterable[int]) -> float:
     if not (total := counts.total()):
         raise ValueError("ways: expected at least one episode that showed its way, got none")
     return sum(count / total * log2(total / count) for count in counts.values())
+
+
+def count_levels(told: Sequence[int], most: int = 0) -> dict[str, int]:
+    """Return of how many episodes at least one part was done, two, … up to ``most`` or the most of any episode.
+
+    >>> count_levels([2, 2, 1, 0])
+    {'p1': 3, 'p2': 2}
+    """
+    levels = range(1, max(1, most, *told) + 1)
+    return {f"p{level}": sum(count >= level for count in told) for level in levels}

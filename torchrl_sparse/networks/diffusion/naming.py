@@ -68,8 +68,8 @@ class SamplerName:
         kind, steps, spacing, timesteps, eta = match.groups()
         return cls(
             kind,
-            steps and int(steps),
-            timesteps and tuple(map(int, timesteps.split("_")[1:])),
+            int(steps) if steps else None,
+            tuple(map(int, timesteps.split("_")[1:])) if timesteps else None,
             spacing or "leading",
             float(eta.removeprefix("_eta")) if eta else 0.0,
         )

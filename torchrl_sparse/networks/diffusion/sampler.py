@@ -63,9 +63,9 @@ class Sampler:
             ``timesteps``, or without those for all training steps.
         num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
         timesteps: K falling diffusion timesteps, where no spacing shall decide.
-        eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance.
+        eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance, and is DDPM where nothing is clipped.
         spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
-            :mod:`~torchrl_sparse.networks.diffusion.spacing`.
+            :mod:`~torchrl_sparse.networks.diffusion.spacing`; a warning says where one begins far from noise.
         clip_sample_range: largest absolute value of a predicted clean action, as in diffusers; 1 for normalised actions.
 
     Attributes:
@@ -101,6 +101,7 @@ class Sampler:
     previous_timesteps: tuple[int, ...]
     alphas_cumprod: Tensor
     coefficients: StepCoefficients
+    _chosen: tuple[int, ...] | None
 
     def __init__(
         self,
@@ -176,7 +177,7 @@ class Sampler:
         written, asked = parts.num_inference_steps, num_inference_steps
         if None not in (written, asked) and written != asked:
             raise ValueError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
-        options = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
+        options: dict[str, Any] = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
     def variant(self, kind: str = "ddpm", num_inference_steps: int | None = None, **options: Any) -> Sampler:

@@ -22,6 +22,7 @@ left to do: the spacing therefore counts from above.
 from __future__ import annotations
 
 import reprlib
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from numbers import Integral
@@ -33,6 +34,8 @@ __all__ = ["SPACINGS", "check_timesteps", "falls_evenly", "spaced_timesteps", "t
 
 SPACINGS = ("leading", "trailing", "linspace", "logsnr")
 _SMALLEST_LOG_RATIO = -2.1
+_FAR_FROM_NOISE = 0.3
+"""Amplitude of the signal at a first timestep that is shown noise alone; 0.12 where ``"logsnr"`` begins."""
 
 
 def spaced_timesteps(
@@ -49,17 +52,22 @@ def spaced_timesteps(
     Raises:
         ValueError: on an unknown spacing, or where K is so large that they would repeat or leave 0 .. T-1.
 
+    Warns:
+        UserWarning: where they begin far from pure noise. ``"leading"`` does, in diffusers too, with few steps and with most
+            numbers above T / 3 that do not divide T: 51 of 100 begin at timestep 50.
+
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
         >>> abar = Sampler().alphas_cumprod
-        >>> [spaced_timesteps(spacing, 4, abar) for spacing in SPACINGS[:3]]
-        [[75, 50, 25, 0], [99, 74, 49, 24], [99, 66, 33, 0]]
+        >>> [spaced_timesteps(spacing, 5, abar) for spacing in SPACINGS[:3]]
+        [[80, 60, 40, 20, 0], [99, 79, 59, 39, 19], [99, 74, 50, 25, 0]]
         >>> spaced_timesteps("logsnr", 2, abar), spaced_timesteps("logsnr", 3, abar)
         ([91, 41], [91, 58, 24])
     """
     if spacing not in SPACINGS:
         raise ValueError(f"spacing: expected one of {', '.join(SPACINGS)}, got {spacing!r}")
     num_train, points = len(alphas_cumprod), num_steps + without_last
+    rising: np.ndarray
     if spacing == "leading":
         rising = np.arange(points) * (num_train // points)
     elif spacing == "linspace":
@@ -72,6 +80,12 @@ def spaced_timesteps(
     if not timesteps_fall(found, num_train):
         raise ValueError(
             f"num_inference_steps: expected fewer, {spacing!r} has no {num_steps} falling timesteps of {num_train} here"
+        )
+    if num_train > 1 and (amplitude := alphas_cumprod[found[0]].item() ** 0.5) > _FAR_FROM_NOISE:
+        warnings.warn(
+            f"num_inference_steps={num_steps}: {spacing!r} begins at timestep {found[0]} of {num_train}, where the network "
+            f'expects {amplitude:.2f} of the actions\' amplitude and is shown noise; "logsnr" begins where it expects 0.12',
+            stacklevel=3,
         )
     return found
 

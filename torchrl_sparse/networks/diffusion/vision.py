@@ -10,6 +10,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -135,7 +136,7 @@ class VisionEncoder(nn.Module):
         width: int = 64,
     ) -> None:
         super().__init__()
-        self.config = {
+        self.config: dict[str, Any] = {
             "cameras": list(cameras),
             "image_size": list(image_size),
             "crop_size": list(crop_size),
@@ -143,7 +144,9 @@ class VisionEncoder(nn.Module):
         }
         _check(**self.config)
         self.cameras, self.image_size = tuple(cameras), tuple(image_size)
-        self.encoders = nn.ModuleDict({name: CameraEncoder(tuple(crop_size), width) for name in cameras})
+        self.encoders = nn.ModuleDict(
+            {name: CameraEncoder((crop_size[0], crop_size[1]), width) for name in cameras}
+        )
         self.feature_dim = _FEATURES * len(self.cameras)
 
     def forward(self, images: Mapping[str, Tensor]) -> Tensor:

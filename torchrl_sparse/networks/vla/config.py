@@ -20,7 +20,7 @@ __all__ = ["TransformerSize", "VLAConfig"]
 
 # Bounds, far beyond any use, on what a file can ask for before its weights are seen.
 _MAX_SIZE, _MAX_LAYERS, _MAX_PIXELS, _MAX_CHUNK = 1 << 20, 256, 4096, 4096
-_ADDED = {"kv_heads": None, "rope_base": 10000.0, "norm_eps": 1e-6}
+_ADDED: dict[str, Any] = {"kv_heads": None, "rope_base": 10000.0, "norm_eps": 1e-6}
 """Fields that the first files did not have, and what those meant: where it is meant still, files are as they were."""
 
 

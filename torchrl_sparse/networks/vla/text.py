@@ -48,6 +48,9 @@ class InstructionTokenizer(Protocol):
     def encode(self, instructions: Sequence[str]) -> Prompts:
         """Return the prompts of a batch of instructions."""
 
+    def to_config(self) -> dict[str, Any]:
+        """Return JSON values that `tokenizer_from_config` reads."""
+
 
 class WordTokenizer:
     """A small tokenizer: one id for each known word, the bytes of any other; spaces between words are not encoded.
@@ -138,8 +141,10 @@ class LlamaTokenizer:
             start, stop = len(_BEFORE), len(_BEFORE) + len(text)
             # a token belongs to the instruction if its last character does: it may begin with the space before
             inside = [start < end <= stop for _, end in encoding.offsets]
-            closed = self.closing is None or encoding.ids[-1] == self.closing
-            rows.append(encoding.ids if closed else [*encoding.ids, self.closing])
+            if self.closing is None or encoding.ids[-1] == self.closing:
+                rows.append(encoding.ids)
+            else:
+                rows.append([*encoding.ids, self.closing])
             spans.append((inside.index(True) if any(inside) else 0, sum(inside)))
         return _pad(rows, spans)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -64,7 +64,7 @@ class ActionDenoiser(TensorDictModuleBase):
         self._counted: tuple[Tensor | None, float] = (None, 0.0)
 
     @property
-    def in_keys(self):
+    def in_keys(self) -> list[NestedKey]:
         own = [keys.COND, keys.SEED, keys.PRUNE_MASK]
         return [*own, *self._begin_keys(), *self._guide_keys()]
 
@@ -75,7 +75,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return [keys.KNOWN, keys.PULL] if self.guided else []
 
     @property
-    def out_keys(self):
+    def out_keys(self) -> list[NestedKey]:
         return [keys.CHUNK, keys.FLOPS]
 
     @property
@@ -138,14 +138,15 @@ class ActionDenoiser(TensorDictModuleBase):
     ) -> tuple[Tensor, Tensor]:
         """Return normalised actions [B, H, A] and FLOPs [B] of queries, each with as many steps as it takes."""
         whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
-        numbers = [whole] if num_steps is None else sorted(set(num_steps.flatten().tolist()))
-        if numbers in ([], [whole]):
+        steps = None if num_steps is None else num_steps.flatten()
+        numbers = [whole] if steps is None else sorted(set(steps.tolist()))
+        if steps is None or start is None or numbers in ([], [whole]):
             return self.run(noise, cond, mask, self.reuse, None, guide), mask_flops(sizes, mask)
         if not 1 <= numbers[0] <= numbers[-1] <= whole:
             raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
         actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
         for number in numbers:
-            rows = num_steps.flatten() == number
+            rows = steps == number
             part = self._last_steps(number, noise[rows], mask[rows], start[rows].to(noise))
             drawn = None if guide is None else guide.rows(rows)
             actions[rows] = self.run(part[0], cond[rows], part[1], self.reuse, number, drawn)

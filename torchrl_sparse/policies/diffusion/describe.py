@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchrl_sparse.storage.convention import source_convention
+
 
 def describe(policy: Any) -> str:
     """Return lines on the observation, with the state's layout and ranges, on the chunk, and on how it was trained.
 
-    A range is what the normaliser maps to [-1, 1], that of the demonstrations.
+    A range is what the normaliser maps to [-1, 1], that of the demonstrations. Robosuite 1.5 orders the parts of the objects'
+    state otherwise than 1.4 did, and turned the sign of some, see `torchrl_sparse.envs.conventions`. This library's
+    environments and demonstrations follow the policy. A state from elsewhere has to be as this says.
 
     Args:
         policy: a `DiffusionPolicy`, whose method this is.
@@ -24,6 +28,10 @@ def describe(policy: Any) -> str:
         f"  state, {len(low_high)} numbers: {', '.join(names) if names else 'the layout of its task'}",
         *(f"    [{i}] {low:.3g} to {high:.3g}" for i, (low, high) in enumerate(low_high)),
     ]
+    if "object" in names if names else policy.vision is None:
+        lines.append(
+            f"  objects, if its task has them, as robosuite {source_convention(source)} observes them"
+        )
     if policy.vision is not None:
         height, width = policy.vision.image_size
         lines += [f"  {camera}, uint8 [{height}, {width}, 3]" for camera in policy.vision.cameras]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
-from torchrl_sparse.networks.fingerprint import networks_fingerprint
+from torchrl_sparse.networks.fingerprint import policy_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
@@ -36,6 +36,7 @@ from torchrl_sparse.policies.diffusion.shortcut import answer_directly
 from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
+from torchrl_sparse.storage.convention import source_convention
 from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
@@ -94,45 +95,39 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
         super().__init__(stages)
-        self.plan, self.source = plan, {}  # the plan is bound to this network and sampler
+        self.plan = plan  # it is bound to this network and sampler
+        self.source: dict[str, Any] = {}
         self.engine = engine  # which decides how the cameras are encoded, too
         self.eval()
-
-    @property
-    def network(self) -> TransformerForDiffusion:
-        return self.module["denoise"].network
-
-    @property
-    def normalizer(self) -> Normalizer:
-        return self.module["denoise"].normalizer
-
-    @property
-    def vision(self) -> VisionEncoder | None:
-        """Encoder of the cameras."""
-        return self.module["encode"].condition.vision
 
     @property
     def plan(self) -> Planner:
         return self.module["plan"]
 
+    @plan.setter
+    def plan(self, plan: Planner | None) -> None:
+        self._install(plan, self.sampler, self.start)
+
     @property
     def start(self) -> ColdStart:
         return self.module["start"]
+
+    @start.setter
+    def start(self, start: ColdStart | None) -> None:
+        self._install(self.plan, self.sampler, start)
 
     @property
     def sampler(self) -> Sampler:
         return self.module["denoise"].sampler
 
+    @sampler.setter
+    def sampler(self, sampler: Sampler) -> None:
+        self._install(self.plan, sampler, self.start)
+
     def __setattr__(self, name: str, value: Any) -> None:
-        # nn.Module registers any module that is assigned, so properties with setters never see it.
-        if name == "plan":
-            self._install(value, self.sampler, self.start)
-        elif name == "sampler":
-            self._install(self.plan, value, self.start)
-        elif name == "start":
-            self._install(self.plan, self.sampler, value)
-        elif name == "noise":
-            self.module["denoise"].noise = check_noise(value)
+        # nn.Module registers any module that is assigned, so that of itself a property's setter would never see it.
+        if name in ("plan", "start", "sampler", "noise"):
+            object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
 
@@ -143,8 +138,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         check_trained(sampler, self.sampler)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
-        self.module["denoise"].sampler = sampler
         denoise = self.module["denoise"]
+        denoise.sampler = sampler
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
         denoise.follow(plan)
         self.module["plan"], self.module["start"] = plan, start
@@ -160,8 +155,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
                 other training steps.
         """
-        shared = {"vision": self.vision, "engine": self.engine, "sampler": self.sampler}
-        policy = DiffusionPolicy(self.network, self.normalizer, **shared)
+        same: dict[str, Any] = {"vision": self.vision, "sampler": self.sampler, "engine": self.engine}
+        policy = DiffusionPolicy(self.network, self.normalizer, **same)
         policy.source = self.source
         policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
@@ -184,10 +179,18 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
 
+    @noise.setter
+    def noise(self, name: str) -> None:
+        self.module["denoise"].noise = check_noise(name)
+
     @property
     def fingerprint(self) -> str:
-        """A name of these weights, at the fp16 precision in which they are saved; planners are made for one policy."""
-        return networks_fingerprint(self.network, *filter(None, [self.vision]))
+        """A name of its weights, at the fp16 precision in which they are saved, and of its normaliser and training steps.
+
+        Planners and episodes belong to one policy. Earlier files name the weights alone, the part before the hyphen.
+        """
+        units = {"normalizer": self.normalizer.state_dict(), "trained": self.sampler.trained}
+        return policy_fingerprint(self.network, *filter(None, [self.vision]), **units)
 
     @property
     def engine(self) -> EngineName:
@@ -228,8 +231,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        device = self.device
-        start = synchronised_clock(device)
+        start = synchronised_clock(device := self.device)
         # Made now: after the engine's call nothing is in the caches of what makes tensors.
         latency = torch.zeros(*tensordict.batch_size, 1, device=device)
         try:
@@ -248,16 +250,16 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
             ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
                 None nor a `WarmStart`; nothing is written.
         """
+        parts = self.network, self.normalizer, self.sampler, self.vision, self.source
         warm = stored_start(self.start)
-        rounds = self.engine if self.engine in get_args(RoundedEngine) else None
-        kept = self.vision, self.source, save_beside(self.plan, Path(path)), warm, rounds
-        write_pretrained(
-            Path(path), StoredPolicy(self.network, self.normalizer, self.sampler, *kept), half=half
-        )
+        rounds = cast(RoundedEngine, self.engine) if self.engine in get_args(RoundedEngine) else None
+        stored = StoredPolicy(*parts, save_beside(self.plan, Path(path)), warm, rounds)
+        write_pretrained(Path(path), stored, half=half)
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
         """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
+        facts["robosuite"] = source_convention(self.source)  # whose meaning the objects' state has
         export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
@@ -290,10 +292,9 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
 
     @classmethod
     def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
-        if engine == "auto" and stored.engine is not None:
-            engine = stored.engine
-        options = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
-        policy = cls(stored.network, stored.normalizer, **options)
+        engine = stored.engine or engine if engine == "auto" else engine
+        parts: dict[str, Any] = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
+        policy = cls(stored.network, stored.normalizer, **parts)
         policy.source = stored.source
         policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
         return policy

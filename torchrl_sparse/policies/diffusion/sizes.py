@@ -4,24 +4,38 @@ from __future__ import annotations
 
 import torch
 from tensordict import NestedKey
+from torch import nn
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import Entry, carried_keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
+from torchrl_sparse.networks.normalize import Normalizer
 
 __all__ = ["PolicySizes"]
 
 
 class PolicySizes:
-    """Properties of a `DiffusionPolicy` that follow from its network and its sampler."""
+    """Properties of a `DiffusionPolicy` that follow from its parts."""
 
-    network: TransformerForDiffusion
+    module: nn.ModuleDict
     sampler: Sampler
-    vision: VisionEncoder | None
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]
+
+    @property
+    def network(self) -> TransformerForDiffusion:
+        return self.module["denoise"].network
+
+    @property
+    def normalizer(self) -> Normalizer:
+        return self.module["denoise"].normalizer
+
+    @property
+    def vision(self) -> VisionEncoder | None:
+        """Encoder of the cameras."""
+        return self.module["encode"].condition.vision
 
     @property
     def device(self) -> torch.device:

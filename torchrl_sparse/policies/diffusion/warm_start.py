@@ -25,7 +25,7 @@ That needs a network that was trained with a timestep for each action. This one 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -60,8 +60,8 @@ class ColdStart(TensorDictModuleBase):
     f32 [*B, H, 1], normalised actions that every step is drawn to, and how far.
     """
 
-    in_keys = []
-    out_keys = []
+    in_keys: list[NestedKey] = []
+    out_keys: list[NestedKey] = []
 
     def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
         """Prepare to serve a policy of these parts; it calls this when it is given the start or another sampler.

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import carried_keys
 from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import Decoded
@@ -26,7 +27,7 @@ from torchrl_sparse.policies.vla.sizes import VLASizes
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.published.openvla_oft import Unsaid, is_openvla_oft, read_openvla_oft
 from torchrl_sparse.storage.published.openvla_statistics import Normalization
-from torchrl_sparse.storage.vla import StoredVLA, VLASource, read_vla, write_vla
+from torchrl_sparse.storage.vla import AdaptedBase, StoredVLA, VLASource, read_vla, write_vla
 from torchrl_sparse.tokens.base import TokenPruner
 
 __all__ = ["VLAPolicy"]
@@ -92,7 +93,8 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             raise ValueError(
                 f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
             )
-        self.pruner, self.source, self.base = None, VLASource(), None
+        self.pruner, self.source = None, VLASource()
+        self.base: AdaptedBase | None = None
         self.eval()
 
     # -- the pruner ----------------------------------------------------------------------------------------------------
@@ -101,6 +103,13 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     def pruner(self) -> TokenPruner | None:
         """The method that drops visual tokens; None is dense."""
         return self._pruner
+
+    @pruner.setter
+    def pruner(self, pruner: TokenPruner | None) -> None:
+        if pruner is not None:
+            pruner.bind(self.network.config.visual_spec)
+        self._pruner = pruner
+        self._update_keys()
 
     def with_pruner(self, pruner: TokenPruner | None) -> VLAPolicy:
         """Return a policy of the same network under another pruner.
@@ -113,14 +122,11 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         return policy
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # nn.Module registers any module that is assigned, so a property with a setter never sees a pruner that is one.
+        # nn.Module registers any module that is assigned, so that of itself the setter would never see a pruner that is one.
         if name == "pruner":
-            if value is not None:
-                value.bind(self.network.config.visual_spec)
-            name = "_pruner"
-        super().__setattr__(name, value)
-        if name == "_pruner":
-            self._update_keys()
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     def _update_keys(self) -> None:
         """Declare the pruner's keys and ours beside TorchRL's."""
@@ -139,7 +145,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     # -- running it ----------------------------------------------------------------------------------------------------
 
     def forward(
-        self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None, **kwargs
+        self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None, **kwargs: Any
     ) -> TensorDictBase:
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
@@ -161,7 +167,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             raise ValueError(
                 f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
             )
-        return tensordict.select(*self.in_keys, strict=False).reshape(rows)
+        return keys.dense(tensordict.select(*self.in_keys, strict=False), carried_keys(self)).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
@@ -262,8 +268,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
 
         The policy reads upright images of the published size and crops them itself. What the published evaluation did to
         LIBERO's images before that belongs to the environment, see `torchrl_sparse.envs.instructed.instructed_env`: a turn by
-        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers of the
-        gripper.
+        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers.
 
         Weights stay in the shards, of which the system reads what is used and keeps what there is room for, unless another
         ``dtype`` is asked for or the policy goes to another device. So the files have to stay as they are.

@@ -16,6 +16,8 @@ class VLASizes:
 
     network: VLANetwork
     pruner: TokenPruner | None
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
 
     n_obs_steps = 1
     num_inference_steps = 1

@@ -69,9 +69,11 @@ def _read(archive: TorchArchive, ignore: frozenset[str]) -> StoredPolicy:
         "epoch": _epoch(payload),
         "n_action_steps": _executed_steps(config),
         "abs_action": abs_action,
-        "robosuite": _robosuite_version(config, payload),
+        "robosuite": _noted(config, payload, "env_version", str),
     }
     source["state_keys"] = state_keys
+    if (rate := _noted(config, payload, "env_kwargs.control_freq", float)) is not None:
+        source["control_freq"] = rate
     sampler = read_sampler(config, ignore)
     network, normalizer, vision = _READERS[kind](archive, config, tensors, source)
     _nothing_left(tensors)
@@ -114,10 +116,8 @@ def _read_images(
                 f"normalizer: {key}: expected scale 2, offset -1, got {scale.item()}, {offset.item()}"
             )
     states = [read_affine(archive, entries, key, size) for key, size in layout.states.items()]
-    normalizer = Normalizer(
-        *(torch.cat(part) for part in zip(*states, strict=True)),
-        *read_affine(archive, entries, "action", network.input_dim),
-    )
+    scale, offset = (torch.cat(part) for part in zip(*states, strict=True))
+    normalizer = Normalizer(scale, offset, *read_affine(archive, entries, "action", network.input_dim))
     _nothing_left(entries)
     source |= {"state_keys": list(layout.states), "cameras": layout.cameras}
     return network, normalizer, vision
@@ -136,13 +136,13 @@ def _executed_steps(config: PublishedConfig) -> int:
     return steps
 
 
-def _robosuite_version(config: PublishedConfig, payload: Mapping) -> str | None:
-    """Return the version that robomimic's ``env_meta`` notes; None where a checkpoint has none."""
+def _noted(config: PublishedConfig, payload: Mapping, name: str, kind: type) -> Any:
+    """Return what robomimic's ``env_meta`` notes under a name; None where a checkpoint has none."""
     if "env_meta" in payload:
         noted = PublishedConfig({"env_meta": payload["env_meta"]})  # tensors stand beside it
-        return noted.get("env_meta.env_version", str, None)
-    places = (f"{place}env_meta.env_version" for place in ("", "task.", "task.env_runner."))
-    return next(filter(None, (config.get(place, str, None) for place in places)), None)
+        return noted.get(f"env_meta.{name}", kind, None)
+    places = (f"{place}env_meta.{name}" for place in ("", "task.", "task.env_runner."))
+    return next((found for place in places if (found := config.get(place, kind, None)) is not None), None)
 
 
 def _epoch(payload: Mapping) -> int | None:

@@ -196,13 +196,15 @@ def check_task_entries(
 def _agreed(said: Mapping[str, Any]) -> Any:
     """Return what all places that say something say."""
     said = {place: value for place, value in said.items() if value is not None}
-    first = next(iter(said), None)
+    if not said:
+        return None
+    first = next(iter(said))
     for place, value in said.items():
         if value != said[first]:
             raise ValueError(
                 f"cfg: {place}: expected {_written(said[first])}, as {first}, got {_written(value)}"
             )
-    return said.get(first)
+    return said[first]
 
 
 def check_sizes(config: PublishedConfig, section: str, sizes: Any, *, cameras: bool) -> None:

@@ -34,7 +34,9 @@ def read_network(
     cameras = section == "policy"
     # What the published image policy takes where nothing is said, and what the denoiser alone does.
     heads, causal, dropout = (4, True, (0.0, 0.3)) if cameras else (12, False, (0.1, 0.1))
-    masks = {name: stored.pop(name) for name in ("mask", "memory_mask") if name in stored}
+    masks: dict[str, StoredTensor] = {
+        name: stored.pop(name) for name in ("mask", "memory_mask") if name in stored
+    }
     arguments = {
         **_sizes(stored),
         "n_head": config.get(f"{section}.n_head", int, heads),

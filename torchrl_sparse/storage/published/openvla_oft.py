@@ -46,7 +46,10 @@ __all__ = ["Unsaid", "is_openvla_oft", "read_openvla_oft"]
 _DINO, _SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 _LLM, _HEAD, _PROPRIO = "language_model.model.", "action_head.", "proprio_projector."
 _EMBEDDING = "decoder.llama.embed_tokens.weight"
-_FIXED = {"image_resize_strategy": "resize-naive", "arch_specifier": "no-align+fused-gelu-mlp"}
+_FIXED: dict[str, Any] = {
+    "image_resize_strategy": "resize-naive",
+    "arch_specifier": "no-align+fused-gelu-mlp",
+}
 _FIXED |= {"use_fused_vision_backbone": True, "timm_override_act_layers": [None, None]}
 _FIXED_TEXT = {"rms_norm_eps": 1e-6, "rope_theta": 10000.0, "rope_scaling": None, "hidden_act": "silu"}
 _DIFFUSION = "expected a head for L1 regression, got a diffusion head, which is not supported"

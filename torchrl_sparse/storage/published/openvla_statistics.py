@@ -47,8 +47,9 @@ def read_normalizer(
     if not all(proprio.get("mask", [])):
         raise ValueError(f"{path}: proprio.mask: expected all true, got {proprio['mask']}")
     try:
-        ranges = [torch.tensor(part[bound]) for part in (proprio, action) for bound in bounds]
-        normalizer = QuantileNormalizer(*ranges, torch.tensor(gripper))
+        state_low, state_high = (torch.tensor(proprio[bound]) for bound in bounds)
+        low, high = (torch.tensor(action[bound]) for bound in bounds)
+        normalizer = QuantileNormalizer(state_low, state_high, low, high, torch.tensor(gripper))
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: expected {' and '.join(bounds)} of action and proprio: {error}") from error
     found = len(normalizer.state_low), len(normalizer.action_low)

@@ -68,7 +68,7 @@ class ImageLayout:
             raise ValueError(
                 f"cfg: shape_meta: expected states and RGB images of one size, got {list(order)}"
             )
-        return cls(order, cameras, states, size[1:])
+        return cls(order, cameras, states, (size[1], size[2]))
 
     @property
     def features(self) -> int:
@@ -106,7 +106,7 @@ def read_vision(
         raise ValueError(
             "cfg: policy.eval_fixed_crop: expected true, got false: crops would be random in use"
         )
-    crop = layout.image_size
+    crop: tuple[int, ...] = layout.image_size
     if cropped:
         crop = _sizes(config, "policy.crop_shape") if said else _DEFAULT_CROP
     tensors: dict[str, Tensor] = {}

@@ -18,6 +18,7 @@ from tensordict import NonTensorStack, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.networks.normalize import MIN_RANGE
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 __all__ = ["Grounding", "GroundingConfig", "ObjectPositions"]
@@ -75,9 +76,19 @@ class ObjectPositions:
             )
 
     def standardised(self) -> ObjectPositions:
-        """Return positions about zero, and of unit size along the axis on which they vary most."""
+        """Return positions about zero, and of unit size along the axis on which they vary most.
+
+        Raises:
+            ValueError: if they vary on none, as one object's that nothing moves: there is nothing to locate.
+        """
         positions = self.positions.double()  # or the last bit would depend on the number of threads
         centred = positions - positions.mean((0, 1))
+        size = centred.std((0, 1), correction=0).max()
+        if not size > MIN_RANGE:
+            raise ValueError(
+                f"object_positions: expected some that vary by more than {MIN_RANGE} m, got a deviation of {size:.1e} m; "
+                "locate_steps=0 and refer_steps=0 train without them"
+            )
         return ObjectPositions((centred / centred.std((0, 1)).max()).float(), self.instructions)
 
 

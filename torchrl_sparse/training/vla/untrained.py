@@ -18,11 +18,12 @@ from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import WordTokenizer
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.rotations import ABSOLUTE_DIM
+from torchrl_sparse.storage.json import describe_differences
 from torchrl_sparse.storage.language_model import LanguageModel, load_base, read_language_model
 from torchrl_sparse.storage.vla import AdaptedBase
 from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
-__all__ = ["untrained_policy"]
+__all__ = ["check_sizes", "untrained_policy"]
 
 _SIZES = {"tiny": VLAConfig.tiny, "small": VLAConfig.small, "published": VLAConfig}
 
@@ -61,6 +62,32 @@ def untrained_policy(
         return _adapting(config, normalizer, read_language_model(base), rank)
     words = sorted({word for text in demos.instructions for word in text.lower().split()})
     return VLAPolicy(VLANetwork(config), normalizer, WordTokenizer(words))
+
+
+def check_sizes(
+    policy: VLAPolicy,
+    path: str | Path,
+    *,
+    size: str | None,
+    rank: int | None,
+    changes: Mapping[str, Any],
+) -> None:
+    """Raise ValueError for sizes that are asked for and that a policy to train on has not.
+
+    Args:
+        policy: that is trained on.
+        path: its folder.
+        size, rank, changes: as of `untrained_policy`; None for the policy's own.
+    """
+    if size is not None:
+        raise ValueError(f"size: expected null, since sizes are those of the policy in {path}, got {size}")
+    own = None if policy.base is None else policy.base.rank
+    if rank not in (None, own):
+        raise ValueError(f"rank: expected {own}, as of the policy in {path}, got {rank}")
+    sizes = policy.network.config.to_dict()
+    asked = OmegaConf.to_container(OmegaConf.merge(sizes, changes), resolve=True)
+    if differing := describe_differences(sizes, asked):
+        raise ValueError(f"network: expected sizes of the policy in {path}, got others: {differing}")
 
 
 def _adapting(

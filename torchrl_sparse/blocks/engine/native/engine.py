@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.base import Overhead, check_query
 from torchrl_sparse.blocks.engine.costs import folded_block_macs, folded_overhead_macs
 from torchrl_sparse.blocks.engine.native.arena import PANEL
-from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instruction_level, library
+from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instruction_level, loaded
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
@@ -106,9 +106,13 @@ class NativeEngine:
 
     def __reduce__(self) -> tuple:
         """Let copies and pickles pack the weights of their own network."""
-        options = {"weights": self._weights, "threads": self._threads}
-        options["instruction_set"] = INSTRUCTION_SETS[self._level]
-        return partial(NativeEngine, **options), (self._network, self._sampler)
+        again = partial(
+            NativeEngine,
+            weights=self._weights,
+            threads=self._threads,
+            instruction_set=INSTRUCTION_SETS[self._level],
+        )
+        return again, (self._network, self._sampler)
 
     @property
     def detail(self) -> str:
@@ -145,7 +149,7 @@ class NativeEngine:
         query = mask.data_ptr(), slots, noise.data_ptr(), cond.data_ptr(), *guides, actions.data_ptr()
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            library().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
+            loaded().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
     def condition(self, state: Tensor, scales: ctypes.Array) -> Tensor | None:
@@ -161,7 +165,7 @@ class NativeEngine:
         state = state.contiguous()
         cond, (rows, steps, dim) = torch.empty_like(state), state.shape
         where = state.data_ptr(), cond.data_ptr()
-        finite = library().sparse_normalise(scales, rows * steps, dim, *where)
+        finite = loaded().sparse_normalise(scales, rows * steps, dim, *where)
         return cond if finite else None
 
     def ready(self, noise: Tensor, cond: Tensor) -> PackedNetwork:
@@ -203,7 +207,7 @@ class NativeEngine:
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
             query = rows, mask.data_ptr(), slots, noise.data_ptr(), scales, *tensors
-            library().sparse_answer(*where, *query, scratch.data_ptr())
+            loaded().sparse_answer(*where, *query, scratch.data_ptr())
 
     def _num_threads(self, rows: int) -> int:
         """Return how many threads a batch of ``rows`` uses; more than there are panels in the narrowest product would wait."""
@@ -221,7 +225,7 @@ class NativeEngine:
         scratch = self._new_scratch(packed, threads).zero_()
 
         def walk(kind: int) -> None:
-            library().sparse_blocks(self._level, threads, byref(packed.model), kind, scratch.data_ptr())
+            loaded().sparse_blocks(self._level, threads, byref(packed.model), kind, scratch.data_ptr())
 
         return time_blocks(walk, self._network.n_layer, repeats, scratch.device)
 
@@ -255,7 +259,7 @@ class NativeEngine:
         if packed is None or packed.weights is not weights:
             packed = PackedNetwork(self._network, self._sampler, weights)
             # With a slot for each block: enough for every reuse rule.
-            packed.scratch = library().sparse_scratch(byref(packed.model), self._dense.shape[1])
+            packed.scratch = loaded().sparse_scratch(byref(packed.model), self._dense.shape[1])
             self._packed = packed
         return packed
 

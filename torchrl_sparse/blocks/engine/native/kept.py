@@ -15,11 +15,12 @@ import ctypes
 from collections.abc import Callable, Iterable, Sequence
 from ctypes import c_uint64, c_void_p
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_sparse.blocks.engine.native.library import library
+from torchrl_sparse.blocks.engine.native.library import loaded
 from torchrl_sparse.blocks.engine.weights import Members
 
 __all__ = ["Kept", "addresses", "layout_is_known"]
@@ -59,8 +60,9 @@ def addresses(places: Iterable[int]) -> ctypes.Array:
 @lru_cache(maxsize=1)
 def _compare() -> Callable[..., int]:
     # A prototype that keeps the interpreter's lock: nothing in Python may change meanwhile.
-    function = library().sparse_kept
-    return ctypes.PYFUNCTYPE(function.restype, *function.argtypes)((function.__name__, library()))
+    found: Any = loaded()
+    function = found.sparse_kept
+    return ctypes.PYFUNCTYPE(function.restype, *function.argtypes)((function.__name__, found))
 
 
 # -- trying it -----------------------------------------------------------------------------------------------------------

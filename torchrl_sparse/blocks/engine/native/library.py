@@ -16,7 +16,7 @@ from pathlib import Path
 
 from torchrl_sparse.blocks.engine.native.packing import Model
 
-__all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "native_available"]
+__all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "loaded", "native_available"]
 
 _OF_MACHINE = {"aarch64": ("neon",), "arm64": ("neon",)}
 INSTRUCTION_SETS = (
@@ -45,6 +45,15 @@ def library() -> ctypes.CDLL | str:
     found = _load(Path(__file__).parent)
     if isinstance(found, str):
         warnings.warn(f"torchrl_sparse runs without its native engine: {found}", stacklevel=2)
+    return found
+
+
+@lru_cache(maxsize=1)
+def loaded() -> ctypes.CDLL:
+    """Return the compiled library, which has to be there; RuntimeError, saying why, where it is not."""
+    found = library()
+    if isinstance(found, str):
+        raise RuntimeError(f"native engine: {found}")
     return found
 
 
@@ -89,7 +98,7 @@ def instruction_level(instruction_set: str | None = None) -> int:
     Raises:
         ValueError: if this CPU does not have it.
     """
-    available = INSTRUCTION_SETS[: library().sparse_levels()]
+    available = INSTRUCTION_SETS[: loaded().sparse_levels()]
     if instruction_set is None:
         return len(available) - 1
     if instruction_set not in available:

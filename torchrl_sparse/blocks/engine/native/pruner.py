@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
-from torchrl_sparse.blocks.engine.native.library import instruction_level, library
+from torchrl_sparse.blocks.engine.native.library import instruction_level, loaded
 
 __all__ = ["MAX_HIDDEN", "NativePruner", "PrunerWeights"]
 
@@ -134,4 +134,4 @@ class NativePruner:
             )
         features = features.contiguous()
         where = self._level, torch.get_num_threads()
-        library().sparse_prune(*where, byref(self.packed), len(features), features.data_ptr(), logits, masks)
+        loaded().sparse_prune(*where, byref(self.packed), len(features), features.data_ptr(), logits, masks)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.native.kept import Kept, addresses, layout_is_known
-from torchrl_sparse.blocks.engine.native.library import library
+from torchrl_sparse.blocks.engine.native.library import loaded
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -49,7 +49,7 @@ class NativeWatch(WeightWatch):
 
     def read(self, places: ctypes.Array) -> bytes:
         values = (c_float * len(places))()
-        library().sparse_gather(len(places), places, values)
+        loaded().sparse_gather(len(places), places, values)
         return bytes(values)
 
 

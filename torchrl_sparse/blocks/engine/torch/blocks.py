@@ -8,8 +8,6 @@ allocates nothing, except that on a CPU each product with large f32 weights retu
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -17,7 +15,7 @@ from torchrl_sparse.blocks.engine.folding import FoldedLayer
 from torchrl_sparse.blocks.engine.torch.linear import make_linear
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-__all__ = ["Block", "BlockScratch", "CrossAttention", "FeedForward", "SelfAttention"]
+__all__ = ["BlockScratch", "CrossAttention", "FeedForward", "SelfAttention"]
 
 
 class BlockScratch:
@@ -64,9 +62,6 @@ class BlockScratch:
         torch.linalg.vector_norm(x, 2, -1, True, out=self._length)
         self._length.hypot_(self._smallest)
         return torch.div(x, self._length, out=self._direction)
-
-
-Block = Callable[..., Tensor]
 
 
 class SelfAttention:

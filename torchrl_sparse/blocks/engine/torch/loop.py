@@ -83,9 +83,11 @@ class Workspace:
 
     def _set_segments(self, capture: Callable[[Segment], Segment] | None) -> None:
         blocks = range(len(self._tables.blocks))
-        self._compute = [partial(self._compute_all, block) for block in blocks]
-        self._choose = [partial(self._compute_chosen, block) for block in blocks]
-        self._finish, self._fold, self._play = self._finish_step, self._memory.fold, self._run
+        self._compute: list[Segment] = [partial(self._compute_all, block) for block in blocks]
+        self._choose: list[Segment] = [partial(self._compute_chosen, block) for block in blocks]
+        self._finish: Segment = self._finish_step
+        self._fold: Segment = self._memory.fold
+        self._play: Callable[[Loop], object] = self._run
         self._gathers = capture is None
         if capture is None:
             return
@@ -105,6 +107,7 @@ class Workspace:
         """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
         self._sample.copy_(noise[:, 0].flatten(0, 1))
         if guide is not None:
+            assert self._guide is not None  # a guided query is given a guided workspace
             for part, given in zip(self._guide, guide, strict=True):
                 part.copy_(given.flatten(0, 1))
         for earlier in self._earlier:

@@ -4,9 +4,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from recipes.studies.offline_errors.errors import draw_answers, offline_errors
 from tests.fixtures.diffusion import SIZES, make_network
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
-from torchrl_sparse.evaluation.statistics.offline import draw_answers, offline_errors
 
 __all__ = ["make_network"]
 

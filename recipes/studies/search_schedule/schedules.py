@@ -1,6 +1,6 @@
 """Searched schedules: the chain of a policy that demonstrations like best among those that cost as much, and what it is worth.
 
-What is searched is in `torchrl_sparse.training.diffusion.evolution`; here are its fitness, the file that it goes on from,
+What is searched is in `recipes.studies.search_schedule.evolution`; here are its fitness, the file that it goes on from,
 and the comparison, on demonstrations that it did not see, with what the same budget buys otherwise.
 """
 
@@ -16,13 +16,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from recipes.studies.offline_errors.errors import draw_answers, energy_scores
+from recipes.studies.search_schedule.evolution import ChainSpace, Evolution, PrunedChain, evolve
 from torchrl_sparse.blocks.mask import Reuse
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
-from torchrl_sparse.evaluation.statistics.offline import draw_answers, energy_scores
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
-from torchrl_sparse.training.diffusion.evolution import ChainSpace, Evolution, PrunedChain, evolve
 from torchrl_sparse.training.diffusion.timesteps import search_timesteps
 
 __all__ = [

@@ -6,17 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
 from torchrl_sparse.evaluation.results.text import percent_range
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
 from torchrl_sparse.evaluation.statistics.ways import way_entropy
 
-__all__ = ["told_ways", "way_rows"]
-
-
-def told_ways(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
-    """Return the ways of each method's episodes; a method whose task tells none is left out."""
-    ways = {name: [e.way for e in played if e.way is not None] for name, played in episodes.items()}
-    return {name: told for name, told in ways.items() if told}
+__all__ = ["way_rows"]
 
 
 def way_rows(ways: Mapping[str, Sequence[int]]) -> list[dict[str, str]]:

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from recipes.studies.pages.result_tables import subject
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.pareto import plain_log_ticks
 from torchrl_sparse.evaluation.results.parts import Interval
-from torchrl_sparse.evaluation.results.schema import AnyResults, MethodEntry, Results
+from torchrl_sparse.evaluation.results.schema import MethodEntry, Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,7 +92,7 @@ _SPENDERS = (
 )
 
 
-def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
+def plot_fronts(results: Sequence[Results], path: str | os.PathLike) -> Path:
     """Draw, for each task, what methods lose to dense against how many times as fast as dense a query is.
 
     Above is success in points, or the score; below the ratio of times to success. Bars are 95 % intervals, the dashed
@@ -100,28 +101,22 @@ def plot_fronts(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
     Args:
         results: of any number of tasks; of several of one task the first that has a method counts.
         path: of the PNG.
-
-    Raises:
-        ValueError: if there are results without times to success.
     """
     return _plot(results, path, _SPEED)
 
 
-def plot_spending(results: Sequence[AnyResults], path: str | os.PathLike) -> Path:
+def plot_spending(results: Sequence[Results], path: str | os.PathLike) -> Path:
     """Draw the same against what a second of the robot's time costs, for methods that ask more often or for several samples.
 
     Points are marked with the environment steps from one query to the next, eight where a name says nothing.
 
     Args:
         results, path: as of `plot_fronts`; of methods that say what an episode costs.
-
-    Raises:
-        ValueError: if there are results without times to success.
     """
     return _plot(results, path, _SPENT)
 
 
-def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -> Path:
+def _plot(results: Sequence[Results], path: str | os.PathLike, axis: _Axis) -> Path:
     tasks = _by_task(results)
     width = max(1.5 + 2.9 * len(tasks), 7.3)  # of the legend too
     figure, grid = make_figure(width, 7.2, rows=2, columns=len(tasks), sharex=True)
@@ -151,13 +146,12 @@ def _plot(results: Sequence[AnyResults], path: str | os.PathLike, axis: _Axis) -
     return save_figure(figure, path)
 
 
-def _by_task(results: Sequence[AnyResults]) -> dict[str, list[Results]]:
+def _by_task(results: Sequence[Results]) -> dict[str, list[Results]]:
     """Return what is drawn under each title."""
     tasks: dict[str, list[Results]] = {}
     for one in results:
-        if not isinstance(one, Results) or one.dense.time_vs_dense is None:
-            raise ValueError(f"fronts: expected results with times to success, got {one.task} without them")
-        tasks.setdefault(f"{one.subject}, score" if one.by_degrees else one.subject, []).append(one)
+        title = subject(one)
+        tasks.setdefault(f"{title}, score" if one.by_degrees else title, []).append(one)
     return tasks
 
 
@@ -188,9 +182,8 @@ def _lost(method: MethodEntry) -> Estimate:
     return 100 * judged.diff, (100 * judged.ci95[0], 100 * judged.ci95[1])
 
 
-def _time(method: MethodEntry) -> Estimate | None:
-    time = method.time_vs_dense
-    return None if time is None else (time.ratio, time.ci95)
+def _time(method: MethodEntry) -> Estimate:
+    return method.time_vs_dense.ratio, method.time_vs_dense.ci95
 
 
 def _draw(
@@ -198,16 +191,14 @@ def _draw(
     family: _Family,
     methods: Mapping[str, MethodEntry],
     axis: _Axis,
-    point: Callable[[MethodEntry], Estimate | None],
+    point: Callable[[MethodEntry], Estimate],
 ) -> Line2D | None:
     """Draw the methods of a family, and return what stands for them in the legend, None where there is none."""
-    known = {
-        name: (axis.of(methods[name]), point(methods[name])) for name in family.members(methods, axis.number)
-    }
-    names = [name for name, where in known.items() if None not in where]
+    where = {name: axis.of(methods[name]) for name in family.members(methods, axis.number)}
+    names = [name for name, x in where.items() if x is not None]
     if not names:
         return None
-    at, values = zip(*(known[name] for name in names), strict=True)
+    at, values = [where[name] for name in names], [point(methods[name]) for name in names]
     for x, (_, interval) in zip(at, values, strict=True):
         axes.vlines(x, *interval, color=family.color, linewidth=1.6, alpha=0.5)
     heights = [value for value, _ in values]

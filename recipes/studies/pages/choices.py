@@ -95,8 +95,7 @@ _REMARK = f"at {GOAL:g} times dense's speed"
 
 def _time_ratios(results: Results) -> dict[str, float]:
     """Return the ratios of the methods whose times are known."""
-    ratios = {name: method.time_vs_dense for name, method in results.methods.items()}
-    return {name: of_one.ratio for name, of_one in ratios.items() if of_one is not None}
+    return {name: method.time_vs_dense.ratio for name, method in results.methods.items()}
 
 
 def _after_correction(results: Results, name: str) -> str:
@@ -111,16 +110,15 @@ def _after_correction(results: Results, name: str) -> str:
 def _lacks(method: MethodEntry) -> Iterator[str]:
     """Yield what a method, whose times are known, is not shown to be non-inferior in."""
     for verdict, what in ((method.paired_vs_dense, "success"), (method.time_vs_dense, "time")):
-        if verdict is not None and verdict.verdict != "non-inferior":
+        if verdict.verdict != "non-inferior":
             yield f"{verdict.verdict} in {what}"
 
 
 def _cells(method: MethodEntry) -> dict[str, str]:
-    time, ratio = method.restricted_mean_time, method.time_vs_dense
     return {
         "success": count_text(method.success),
-        "mean time, steps": "" if time is None else f"{time:.1f}",
-        "time vs dense": "" if ratio is None else ratio_text(ratio),
+        "mean time, steps": f"{method.restricted_mean_time:.1f}",
+        "time vs dense": ratio_text(method.time_vs_dense),
         "p50, ms": milliseconds_text(method.latency_s.p50),
         "speed-up": f"{method.speedup_vs_dense:.2f}×",
     }

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from recipes.studies.search_schedule.evolution import ChainSpace, Evolution, PrunedChain, evolve
 from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
-from torchrl_sparse.training.diffusion.evolution import ChainSpace, Evolution, PrunedChain, evolve
 
 WEIGHTS = [5.0, 0.1, 10.0, 4.0, 0.2, 9.0]
 

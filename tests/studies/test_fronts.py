@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from recipes.studies.fronts import figure as fronts
 from tests.evaluation.figures.test_plots import has_color
-from tests.evaluation.synthetic import VERSION_1
-from torchrl_sparse.evaluation.figures import fronts
 from torchrl_sparse.evaluation.results.schema import load_results
 
 LIFT, CAN, SQUARE = (
@@ -87,14 +86,7 @@ def test_spending_is_by_what_a_second_costs_and_marked_with_the_interval(tmp_pat
     assert has_color(np.asarray(Image.open(path).convert("RGB")), "#0072B2")
 
 
-def test_one_task_is_enough_and_results_without_times_are_refused(tmp_path, drawn):
+def test_one_task_is_enough(tmp_path, drawn):
     lift = load_results(LIFT)
     fronts.plot_fronts([lift, lift], tmp_path / "lift.png")
     assert drawn[0].shape == (2, 1)
-    old = load_results(VERSION_1)
-    for plot in (fronts.plot_fronts, fronts.plot_spending):
-        with pytest.raises(
-            ValueError, match="fronts: expected results with times to success, got lift_named without"
-        ):
-            plot([lift, old], tmp_path / "fronts.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["lift.png"]

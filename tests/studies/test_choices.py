@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from tests.evaluation.synthetic import make_results
-from torchrl_sparse.evaluation.results.choices import (
+from recipes.studies.pages.choices import (
     best_within,
     budget_rows,
     headline,
     headline_rows,
 )
+from tests.evaluation.synthetic import make_results
 from torchrl_sparse.evaluation.results.parts import PValues
 
 

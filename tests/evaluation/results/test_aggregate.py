@@ -1,25 +1,22 @@
-"""Version 1 and its episodes make version 2; several tasks make an aggregate."""
+"""Several tasks make an aggregate."""
 
-import json
 from dataclasses import replace
 
 import pytest
 
 from recipes.studies.pages.pages import write_tables
-from tests.evaluation.synthetic import VERSION_1, make_results, make_runs
+from tests.evaluation.synthetic import make_results, make_runs
 from torchrl_sparse.evaluation.results.aggregate import (
     AggregateResults,
     aggregate_results,
     aggregate_rows,
     load_aggregate,
-    save_aggregate,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
-from torchrl_sparse.evaluation.results.upgrade import upgrade_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
-from torchrl_sparse.storage.json import to_plain
+from torchrl_sparse.storage.json import write_json
 
 NAMES = ("dense", "ddim10", "bac")
 
@@ -29,61 +26,6 @@ def write_logs(folder, runs: dict[str, MethodRun]):
         log = EpisodeLog(folder / "episodes" / f"{name}.jsonl")
         for episode in run.episodes:
             log.append(replace(episode, seed=100_000 + episode.seed))
-
-
-@pytest.fixture
-def old(tmp_path):
-    """A file of version 1 with the episodes that it was made from, and what version 2 says of them."""
-    results = make_results(100, names=NAMES)
-    write_logs(tmp_path, make_runs(100, names=NAMES))
-    content = to_plain(results)
-    content["schema"] = 1
-    for key in ("split", "episode_horizon", "early_cut"):
-        del content[key]
-    first = {*load_results(VERSION_1).dense.__dataclass_fields__}
-    for method in content["methods"].values():
-        for key in [*method]:
-            if key not in first:
-                del method[key]
-    path = tmp_path / "results.json"
-    path.write_text(json.dumps(content))
-    return path, results
-
-
-def test_an_upgraded_file_says_what_a_new_one_would(old):
-    path, expected = old
-    upgraded, lacking = upgrade_results(path)
-    assert lacking == {}
-    without = {name: replace(m, speedup_ci95=None) for name, m in expected.methods.items()}
-    assert upgraded == replace(expected, methods=without)
-    save_results(upgraded, path)
-    assert load_results(path) == upgraded
-    with pytest.raises(ValueError, match=r"results.json: schema: expected 1 to upgrade, got 2"):
-        upgrade_results(path)
-
-
-def test_methods_without_their_episodes_are_named_and_keep_what_they_had(old):
-    path, expected = old
-    (path.parent / "episodes" / "bac.jsonl").unlink()
-    log = path.parent / "episodes" / "ddim10.jsonl"
-    log.write_text("\n".join(log.read_text().splitlines()[:-1]) + "\n")
-    upgraded, lacking = upgrade_results(path)
-    assert lacking["bac"].startswith("got no")
-    assert "solved of 100" in lacking["ddim10"]
-    assert lacking["ddim10"].endswith("of 99")
-    for name in ("bac", "ddim10"):
-        entry = upgraded.methods[name]
-        assert entry.success == expected.methods[name].success
-        assert entry.latency_s == expected.methods[name].latency_s
-        assert entry.time_vs_dense is entry.success_within is entry.p_values is None
-    assert upgraded.dense.time_vs_dense.ratio == 1
-
-
-def test_without_dense_nothing_is_upgraded(old):
-    path, _ = old
-    (path.parent / "episodes" / "dense.jsonl").unlink()
-    with pytest.raises(ValueError, match="expected the episodes of 'dense', got no"):
-        upgrade_results(path)
 
 
 @pytest.fixture
@@ -108,7 +50,7 @@ def test_tasks_are_put_together_for_the_methods_that_all_have(tasks, tmp_path):
     ratios = [m.time_vs_dense.ratio for m in each]
     assert entry.time_vs_dense.ratio == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
     assert entry.episodes == 160
-    save_aggregate(results, tmp_path / "aggregate.json")
+    write_json(tmp_path / "aggregate.json", results)
     assert load_aggregate(tmp_path / "aggregate.json") == results
     page = write_tables("<!-- table: aggregate.json -->\n<!-- end -->", tmp_path)
     assert aggregate_rows(results)[0]["time vs dense"] in page
@@ -161,7 +103,5 @@ def test_what_says_nothing_over_tasks_is_named(tasks):
 def test_what_cannot_be_put_together_is_named(tasks):
     with pytest.raises(ValueError, match="aggregate: expected different tasks of one split"):
         aggregate_results([tasks[0], tasks[0].parent / ".." / "Lift" / "results.json"])
-    with pytest.raises(ValueError, match=r"version_1.json: schema: expected 2 to aggregate, got 1"):
-        aggregate_results([VERSION_1])
     with pytest.raises(FileNotFoundError, match=r"expected a file nothing.json"):
         aggregate_results(["nothing.json"])

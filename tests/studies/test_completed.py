@@ -1,6 +1,6 @@
 """The parts of a task that episodes did: the published levels."""
 
-from torchrl_sparse.evaluation.results.completed import completed_rows, told_completed
+from recipes.studies.pages.completed import completed_rows, told_completed
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
 PARTS = {"dense": [2, 2, 1, 2], "ddim10": [0, 1, 0, 0]}

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from torchrl_sparse.evaluation.results.text import percent_range
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
+from torchrl_sparse.evaluation.statistics.ways import count_levels
 
-__all__ = ["completed_rows", "count_levels", "told_completed"]
+__all__ = ["completed_rows", "told_completed"]
 
 
 def told_completed(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
@@ -33,16 +34,6 @@ def completed_rows(completed: Mapping[str, Sequence[int]]) -> list[dict[str, str
         {"method": name, **{level: _share(k, len(told)) for level, k in count_levels(told, most).items()}}
         for name, told in completed.items()
     ]
-
-
-def count_levels(told: Sequence[int], most: int = 0) -> dict[str, int]:
-    """Return of how many episodes at least one part was done, two, … up to ``most`` or the most of any episode.
-
-    >>> count_levels([2, 2, 1, 0])
-    {'p1': 3, 'p2': 2}
-    """
-    levels = range(1, max(1, most, *told) + 1)
-    return {f"p{level}": sum(count >= level for count in told) for level in levels}
 
 
 def _share(k: int, n: int) -> str:

@@ -2,12 +2,12 @@
 
 import pytest
 
+from recipes.studies.pages.completed import completed_rows
 from recipes.studies.pages.page_rows import read_table
+from recipes.studies.pages.ways import way_rows
 from tests.evaluation.synthetic import make_results
 from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
-from torchrl_sparse.evaluation.results.completed import completed_rows
 from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.results.ways import way_rows
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 
 

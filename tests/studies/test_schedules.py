@@ -6,13 +6,13 @@ from itertools import combinations, product
 import pytest
 import torch
 
+from recipes.studies.offline_errors.errors import draw_answers, offline_errors
+from recipes.studies.search_schedule import schedules
+from recipes.studies.search_schedule.evolution import Evolution, PrunedChain
+from recipes.studies.search_schedule.schedules import Judge, compare, judged_rows, rivals
 from tests.fixtures.diffusion import demos, make_network  # noqa: F401
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler
-from torchrl_sparse.evaluation.accelerate import schedules
-from torchrl_sparse.evaluation.accelerate.schedules import Judge, compare, judged_rows, rivals
-from torchrl_sparse.evaluation.statistics.offline import draw_answers, offline_errors
 from torchrl_sparse.methods import make_method
-from torchrl_sparse.training.diffusion.evolution import Evolution, PrunedChain
 from torchrl_sparse.training.diffusion.targets import make_targets
 
 BUDGET, WEIGHTS = 1.7, torch.tensor([3.0, 1.0, 6.0])
