@@ -183,10 +183,7 @@ def _read(row: Row) -> Any:
 def _word(recipe: str, row: Row | str) -> str:
     if isinstance(row, str):
         return row
-    options = _options(recipe)
-    known = (
-        row.option in {*_leaves(options), *options} and options.get(row.option) != {}
-    )  # Hydra adds to those
+    known = row.option in {*_leaves(_options(recipe)), *_options(recipe)}
     return f"{'' if known else '+'}{row.option}={row.value}"
 
 

@@ -52,6 +52,6 @@ class TestOptions(OptionTests):
         [
             Row("policy", "published", lambda run: told(LOADED, "path")(run)),
             Row("heads", "[4,2,4]", told(LOADED, "heads")),
-            Row("published", "{chunk_size: 5}", told(LOADED, "chunk_size"), 5),
+            Row("published.chunk_size", "5", told(LOADED, "chunk_size")),
         ],
     )

@@ -99,7 +99,7 @@ class TestOptions(OptionTests):
         [
             Row("base", "model.gguf", told(LOADED, "base")),
             Row("heads", "[4,2,4]", told(LOADED, "heads")),
-            Row("published", "{chunk_size: 5}", told(LOADED, "chunk_size"), 5),
+            Row("published.chunk_size", "5", told(LOADED, "chunk_size")),
             Row("task", "libero_goal", told(LOADED, "unnorm_key")),
             *AS_SHIPPED, "policy=openvla", "alphas=[1]", "shares=[]",
         ],
