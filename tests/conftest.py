@@ -3,6 +3,7 @@
 import gc
 import multiprocessing
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -16,12 +17,38 @@ def ctrl_c_interrupts():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+FULL = (
+    *("pinned", "torture", "studies", "envs", "training", "data", "options"),
+    *(f"evaluation/{name}" for name in ("accelerate", "benchmarks", "figures", "rollouts")),
+    *("test_assets.py", "test_checkpoint_recipes.py", "test_examples.py", "test_package.py", "test_pages.py"),
+    *("test_recipes.py", "cli/test_recipe.py", "control/test_matrix.py", "policies/diffusion/test_export.py"),
+    *(
+        "policies/vla/test_trained.py",
+        "storage/test_exhaustion.py",
+        "storage/published",
+        "tokens/test_closed_loop.py",
+    ),
+    *("evaluation/results/test_sweep_recipe.py", "evaluation/results/test_engine_report.py"),
+    *(
+        "evaluation/statistics/test_sequential.py",
+        "valid_inputs/test_sweeps.py",
+        "valid_inputs/test_demonstrations.py",
+    ),
+)
+"""Below `tests`, what the quick tier leaves out: nearly all time of the suite."""
+QUICK = ("options/test_benchmark.py", "options/test_train_policy.py")  # two recipes
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """What runs on Ray waits for the tier that installs it."""
+    """Mark what the quick tier leaves out, and what runs on Ray, which it does not install."""
+    tests = Path(__file__).parent
+    left_out, kept = ([tests / name for name in names] for names in (FULL, QUICK))
     for item in items:
         parameters = item.callspec.params.values() if hasattr(item, "callspec") else ()
-        if "ray_cluster" in item.fixturenames or "ray" in map(str, parameters):
+        on_ray = "ray_cluster" in getattr(item, "fixturenames", ()) or "ray" in map(str, parameters)
+        places = {item.path, *item.path.parents}
+        if on_ray or (places.intersection(left_out) and not places.intersection(kept)):
             item.add_marker(pytest.mark.full)
 
 

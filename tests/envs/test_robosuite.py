@@ -225,7 +225,7 @@ def test_bad_input_is_named(lift):
 
 def test_a_size_of_images_without_a_camera_is_refused():
     with pytest.raises(
-        ValueError, match=r"image_size: expected a camera or wrist_camera with it, .* got 84 alone"
+        ValueError, match=r"image_size: expected a camera or wrist_camera with it, got 84 alone"
     ):
         make_env("LiftNamed", image_size=84)
 

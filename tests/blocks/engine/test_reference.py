@@ -117,6 +117,38 @@ def reuse_source(mask, reuse):
     return newest // num_blocks, newest % num_blocks
 
 
+def test_block_reuse_reads_the_most_recent_update_of_the_block():
+    mask = mask_from_steps([[0, 3], [0], [0, 1, 2, 3, 4]], num_steps=5)
+    step, column = reuse_source(mask, "block")
+    assert step.T.tolist() == [[0, 0, 0, 3, 3], [0, 0, 0, 0, 0], [0, 1, 2, 3, 4]]
+    assert torch.equal(column, torch.arange(3).expand(5, 3))
+
+
+def test_type_reuse_zigzags_through_layers():
+    # Two layers; SA is computed by layer 0 in steps 0 and 2 and by layer 1 in steps 0 and 1.
+    everywhere = [0, 1, 2, 3]
+    mask = mask_from_steps([[0, 2], everywhere, everywhere, [0, 1], everywhere, everywhere], num_steps=4)
+    step, column = reuse_source(mask, "type")
+    source = (100 * step + column).tolist()
+    # Step 1: layer 0 reads what layer 1 wrote in step 0. Step 2: layer 1 reads what layer 0 just wrote.
+    # Step 3: both read it still.
+    assert [row[0] for row in source] == [0, 3, 200, 200]
+    assert [row[3] for row in source] == [3, 103, 200, 200]
+
+
+@pytest.mark.parametrize("reuse", ["block", "type", "single"])
+def test_reuse_source_is_per_row_and_points_to_computed_blocks_only(reuse):
+    masks = random_mask(4, rate=0.8)
+    step, column = reuse_source(masks, reuse)
+    for row, mask in enumerate(masks):
+        alone = reuse_source(mask, reuse)
+        assert torch.equal(step[row], alone[0])
+        assert torch.equal(column[row], alone[1])
+        assert not mask[step[row], column[row]].any()
+        if reuse != "single":
+            assert (column[row] % 3 == torch.arange(6) % 3).all()
+
+
 @pytest.mark.parametrize("reuse", ["block", "type", "single"])
 def test_every_block_adds_what_reuse_source_says(ddpm, reuse):
     masks = random_mask(4, rate=0.7)
