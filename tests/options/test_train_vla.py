@@ -95,7 +95,7 @@ class TestOptions(OptionTests):
             "max_steps=1",
             "checkpoint_every=9",
         ],
-        [Row("init", "vla", made("size"), []), "max_steps=1", "checkpoint_every=9"],
+        [Row("init", "vla", made("size"), []), "size=null", "max_steps=1", "checkpoint_every=9"],
         [
             Row("task", "lift_crowded", lambda run: source(run).task, "LiftCrowded"),
             "grounding.locate_steps=0",
