@@ -21,7 +21,13 @@ FULL = (
     *("pinned", "torture", "studies", "envs", "training", "data", "options"),
     *(f"evaluation/{name}" for name in ("accelerate", "benchmarks", "figures", "rollouts")),
     *("test_assets.py", "test_checkpoint_recipes.py", "test_examples.py", "test_package.py", "test_pages.py"),
-    *("test_recipes.py", "cli/test_recipe.py", "control/test_matrix.py", "policies/diffusion/test_export.py"),
+    *(
+        "test_import.py",
+        "test_recipes.py",
+        "cli/test_recipe.py",
+        "control/test_matrix.py",
+        "policies/diffusion/test_export.py",
+    ),
     *(
         "policies/vla/test_trained.py",
         "storage/test_exhaustion.py",
