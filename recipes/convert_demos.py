@@ -4,9 +4,9 @@
     python recipes/convert_demos.py demos=pusht_human.npz out=data/pusht_human.h5     # as Diffusion Policy publishes Push-T's
     python recipes/convert_demos.py demos=data/lift.h5 out=data/lift_images.h5 cameras=[agentview,robot0_eye_in_hand]
 
-Deltas become absolute actions, observations are made anew from the recorded states, images are copied. Of Diffusion Policy's
-``*_abs.hdf5``, which hold poses and still name a controller of deltas, say ``poses=true``. Kill it at any moment and run it
-again to go on: what is converted lies in OUT.parts, and before it is rendered in OUT.converted.
+Deltas become absolute actions, observations are recomputed from the recorded states, images are copied. Diffusion Policy's
+``*_abs.hdf5`` hold poses although they name a controller of deltas: give ``poses=true`` with them. Kill it at any moment and
+run it again to go on: what is converted lies in OUT.parts, and before it is rendered in OUT.converted.
 """
 
 from __future__ import annotations

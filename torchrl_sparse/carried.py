@@ -15,9 +15,11 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+
+from torchrl_sparse import keys
 
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
@@ -29,6 +31,7 @@ __all__ = [
     "carried_entries",
     "carried_keys",
     "check_carried",
+    "dense",
     "make_primer",
     "refuse",
 ]
@@ -84,6 +87,30 @@ def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going
     for key in wanted:
         if tensordict.get(key, None) is None:
             refuse(key, _lacks(tensordict, key) & going_on)
+
+
+def dense(tensordict: TensorDictBase, module: TensorDictModuleBase) -> TensorDictBase:
+    """Return ``tensordict``, or if it is a lazy stack a TensorDict with the same entries, of one tensor each.
+
+    An asynchronous collector stacks rows lazily where their keys differ. What a lazy stack hands out is a copy, so that writing
+    into it is lost, and its repeated rows are one and the same. Rows without a key that ``module`` carries, at their first
+    step, get zeros.
+
+    Raises:
+        KeyError: if only some of the rows have any other key.
+    """
+    if not isinstance(tensordict, LazyStackedTensorDict):
+        return tensordict
+    rows, whole = tensordict.tensordicts, tensordict.contiguous()
+    for key in carried_keys(module):
+        if whole.get(key, None) is None and any(row.get(key, None) is not None for row in rows):
+            whole.set(key, keys.recall(tensordict, key, (), 0))
+    for row in rows:
+        if lacking := set(row.keys(True, True)) - set(whole.keys(True, True)):
+            raise KeyError(
+                f"expected {min(lacking, key=str)!r} in all of {len(rows)} rows or in none, got it in some"
+            )
+    return whole
 
 
 def refuse(key: NestedKey, lost: Tensor) -> None:

@@ -69,8 +69,6 @@ constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================
 """
 
-from collections.abc import Iterable
-
 import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
@@ -177,29 +175,3 @@ def recall(
         rows = [recall(row, key, shape, fill, dtype) for row in tensordict.tensordicts]
         return torch.stack(rows, tensordict.stack_dim)
     return torch.full((*tensordict.batch_size, *shape), fill, dtype=dtype, device=tensordict.device)
-
-
-def dense(tensordict: TensorDictBase, carried: Iterable[NestedKey]) -> TensorDictBase:
-    """Return ``tensordict``, or if it is a lazy stack a TensorDict with the same entries, of one tensor each.
-
-    An asynchronous collector stacks rows lazily where their keys differ. What a lazy stack hands out is a copy, so that writing
-    into it is lost, and its repeated rows are one and the same.
-
-    Args:
-        carried: keys that a module leaves for its own next call; rows without them, at their first step, get zeros.
-
-    Raises:
-        KeyError: if only some of the rows have any other key.
-    """
-    if not isinstance(tensordict, LazyStackedTensorDict):
-        return tensordict
-    rows, whole = tensordict.tensordicts, tensordict.contiguous()
-    for key in carried:
-        if whole.get(key, None) is None and any(row.get(key, None) is not None for row in rows):
-            whole.set(key, recall(tensordict, key, (), 0))
-    for row in rows:
-        if lacking := set(row.keys(True, True)) - set(whole.keys(True, True)):
-            raise KeyError(
-                f"expected {min(lacking, key=str)!r} in all of {len(rows)} rows or in none, got it in some"
-            )
-    return whole

@@ -98,7 +98,7 @@ def _kill(*args, **options):
 
 
 def test_what_this_library_collected_is_rendered_as_it_is(convert, collected):
-    """Observations that are made anew are a physics step younger: 2 ms of a moving hand are other numbers."""
+    """Recomputed observations are those of the recorded state, one physics step (2 ms) later than a running simulator's."""
     said, out = convert(collected, *SEEN)
     assert said == f"{out}: images of birdview"
     for name, values in arrays(collected).items():

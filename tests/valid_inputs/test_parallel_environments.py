@@ -5,12 +5,14 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict, lazy_stack
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import step_mdp
 
 from tests.counting import EXECUTORS, SEEDS, counting_policy, make_count_env
 from torchrl_sparse import ActionAwareController, ChunkExecutor, keys
+from torchrl_sparse.carried import dense
 
 ALIVE = []  # collectors, which close their environment as they are forgotten, even if told not to
 DROPPED = (
@@ -96,8 +98,9 @@ def test_a_loop_that_keeps_the_specs_keys_alone_keeps_the_state():
 def test_rows_that_disagree_about_what_they_have_are_refused():
     """tensordict: a lazy stack shows the keys of all rows alone; one that a policy reads must not vanish."""
     first = TensorDict({"state": torch.zeros(2), "budget": torch.ones(1)})
+    module = TensorDictModule(torch.neg, in_keys=["memory"], out_keys=["memory"])
     second = TensorDict({"state": torch.ones(2), "memory": torch.ones(1)})
     with pytest.raises(KeyError, match="'budget' in all of 2 rows or in none"):
-        keys.dense(lazy_stack([first, second]), ["memory"])
-    whole = keys.dense(lazy_stack([first.exclude("budget"), second]), ["memory"])
+        dense(lazy_stack([first, second]), module)
+    whole = dense(lazy_stack([first.exclude("budget"), second]), module)
     assert whole["memory"].tolist() == [[0.0], [1.0]]

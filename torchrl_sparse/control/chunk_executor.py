@@ -19,6 +19,7 @@ from torchrl_sparse.carried import (
     carried_entries,
     carried_keys,
     check_carried,
+    dense,
     make_primer,
     refuse,
 )
@@ -253,7 +254,7 @@ class ChunkExecutor(TensorDictModuleBase):
             request.set(keys.LAST_CHUNK, keys.recall(tensordict, keys.CHUNK, (1, 1), 0.0))
         if keys.DELAY in wanted:
             request.set(keys.DELAY, self._expected_delay(tensordict))
-        return keys.dense(request, carried_keys(self.policy))
+        return dense(request, self.policy)
 
     def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
         """Return i64 [*B, 1]: steps that a query asked now will take; none in a world that waits."""

@@ -89,8 +89,8 @@ class BlockPushScene:
         ImportError: without pybullet, with the command that installs it.
     """
 
-    _anchor: np.ndarray  # where the tip is drawn to, f64 [2], m
-    _hold: int  # the constraint that draws it
+    _anchor: np.ndarray  # target position of the tip, f64 [2], m
+    _hold: int  # the constraint that pulls the tip there
 
     def __init__(self) -> None:
         self._bullet = import_extra("pybullet", "blockpush")

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.carried import carried_keys
+from torchrl_sparse.carried import dense
 from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import Decoded
@@ -167,7 +167,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             raise ValueError(
                 f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
             )
-        return keys.dense(tensordict.select(*self.in_keys, strict=False), carried_keys(self)).reshape(rows)
+        return dense(tensordict.select(*self.in_keys, strict=False), self).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
