@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_sparse.cli.options import OPTIONS, check_options
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
+from torchrl_sparse.runtime.names import closest
 
 __all__ = ["benchmark_command", "check_command", "recipe", "refuse_unread"]
 
@@ -152,8 +152,8 @@ def _one_line(error: Exception) -> str:
     unknown = getattr(error.__cause__, "full_key", None)
     if isinstance(error, HydraException) and unknown:
         words = error.__cause__.parent_node
-        close = get_close_matches(unknown.rpartition(".")[2], map(str, words or ()), n=1)
-        return f"{unknown}: expected an option of this recipe{f', such as {close[0]}' if close else ''}, got another"
+        close = closest(unknown.rpartition(".")[2], map(str, words or ()))
+        return f"{unknown}: expected an option of this recipe{f', such as {close}' if close else ''}, got another"
     missing = getattr(error, "full_key", None)
     if isinstance(error, OmegaConfBaseException) and missing:
         return f"{missing}: expected a value, got {str(error).splitlines()[0]}"

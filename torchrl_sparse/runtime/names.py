@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["did_you_mean"]
+__all__ = ["closest", "did_you_mean"]
+
+
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that is most like ``name``; None if none is close."""
+    close = get_close_matches(name, [*known], n=1)
+    return close[0] if close else None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -14,5 +20,5 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     >>> did_you_mean("benchmrak", ["benchmark", "report"]), did_you_mean("magic", ["benchmark", "report"])
     (', did you mean benchmark?', '')
     """
-    close = get_close_matches(name, [*known], n=1)
-    return f", did you mean {close[0]}?" if close else ""
+    close = closest(name, known)
+    return "" if close is None else f", did you mean {close}?"

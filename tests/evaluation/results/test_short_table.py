@@ -27,6 +27,13 @@ def test_the_advice_is_what_is_shown(results, said):
     assert advice(results).startswith(said)
 
 
+def test_the_fastest_of_many_has_to_survive_their_correction():
+    one = {"dense": run([1] * 80), "fast": run([1] * 80, latency=0.1)}
+    many = one | {f"other{i}": run([1] * 80, latency=0.2) for i in range(8)}
+    assert advice(build(one)).startswith("Use fast")
+    assert advice(build(many)).startswith("Use dense: no faster method is shown")
+
+
 def test_a_dense_policy_that_solves_nothing_is_said():
     none = build({"dense": run([0] * 80), "fast": run([0] * 80, latency=0.1)})
     assert advice(none).startswith("Dense solved none")
