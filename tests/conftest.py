@@ -18,29 +18,15 @@ def ctrl_c_interrupts():
 
 
 FULL = (
-    *("pinned", "torture", "studies", "envs", "training", "data", "options"),
-    *(f"evaluation/{name}" for name in ("accelerate", "benchmarks", "figures", "rollouts")),
-    *("test_assets.py", "test_checkpoint_recipes.py", "test_examples.py", "test_package.py", "test_pages.py"),
-    *(
-        "test_import.py",
-        "test_recipes.py",
-        "cli/test_recipe.py",
-        "control/test_matrix.py",
-        "policies/diffusion/test_export.py",
-    ),
-    *(
-        "policies/vla/test_trained.py",
-        "storage/test_exhaustion.py",
-        "storage/published",
-        "tokens/test_closed_loop.py",
-    ),
-    *("evaluation/results/test_sweep_recipe.py", "evaluation/results/test_engine_report.py"),
-    *(
-        "evaluation/statistics/test_sequential.py",
-        "valid_inputs/test_sweeps.py",
-        "valid_inputs/test_demonstrations.py",
-    ),
-)
+    "pinned", "torture", "studies", "envs", "training", "data", "options",
+    "evaluation/accelerate", "evaluation/benchmarks", "evaluation/figures", "evaluation/rollouts",
+    "evaluation/results/test_sweep_recipe.py", "evaluation/results/test_engine_report.py",
+    "evaluation/statistics/test_sequential.py", "cli/test_recipe.py", "control/test_matrix.py",
+    "policies/diffusion/test_export.py", "policies/vla/test_trained.py", "storage/published",
+    "storage/test_exhaustion.py", "tokens/test_closed_loop.py", "valid_inputs/test_demonstrations.py",
+    "valid_inputs/test_sweeps.py", "test_assets.py", "test_checkpoint_recipes.py", "test_examples.py",
+    "test_import.py", "test_package.py", "test_pages.py", "test_recipes.py", "test_site.py",
+)  # fmt: skip
 """Below `tests`, what the quick tier leaves out: nearly all time of the suite."""
 QUICK = ("options/test_benchmark.py", "options/test_train_policy.py")  # two recipes
 

@@ -15,7 +15,6 @@ PAGE = """<html><body class="md-typeset"><table><thead><tr><th>method</th><th>su
 <script>addEventListener("load", () => document.querySelectorAll("th")[{}].click())</script></body></html>"""
 
 pytestmark = [
-    pytest.mark.full,
     pytest.mark.skipif(BROWSER is None, reason="needs Chromium"),
     pytest.mark.skipif(not (SITE / "vendor").exists(), reason="needs `make docs`"),
 ]
