@@ -32,6 +32,7 @@ from torchrl_sparse.evaluation.statistics.intervals import (
 
 __all__ = [
     "comparison_rows",
+    "episodes_text",
     "format_table",
     "results_note",
     "results_rows",
@@ -159,7 +160,7 @@ def results_note(results: Results) -> str:
     if dense.tokens:
         steps, flops = f"chunks of {policy.horizon} actions", "whole network"
     lines = [
-        f"{results.task}, {_episodes_text(results)}: the same initial states "
+        f"{results.task}, {episodes_text(results)}: the same initial states "
         f"and seeds of noise for every method. Success with Wilson's 95 % interval, {compared}.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
         f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
@@ -196,7 +197,8 @@ def _num_pairs(results: Results) -> int:
     return max(counts, default=results.dense.success.n)
 
 
-def _episodes_text(results: Results) -> str:
+def episodes_text(results: Results) -> str:
+    """Say how many episodes a method has played, and on which seeds."""
     n = _num_pairs(results)
     seeds = f"{results.split} seeds from {results.first_seed}"
     if (stopping := results.until_decided) is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.evaluation.results.comparisons import survivors
-from torchrl_sparse.evaluation.results.report import comparison_rows, format_table
+from torchrl_sparse.evaluation.results.report import comparison_rows, episodes_text, format_table
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -42,10 +42,11 @@ def short_table(results: Results) -> str:
     rows = [_row(name, method, lasting, results) for name, method in results.methods.items()]
     machine, judged = results.machine, results.dense.judged
     notes = (
+        f"{results.task}, {episodes_text(results)}; latency of a policy call on {machine.cpu}, "
+        f"{threads_text(machine.threads)}. All columns: table=full.",
         "Intervals are of 95 %, verdicts against margins of "
         f"{100 * judged.margin:g} points and {100 * results.dense.time_vs_dense.margin:g} % of the time to success; "
         "† does not survive Holm's correction.",
-        f"Latency is that of a policy call on {machine.cpu}, {threads_text(machine.threads)}. All columns: table=full.",
     )
     pairs = [markdown_table(comparison_rows(results.pairs)), ""] if results.pairs else []
     return "\n".join([markdown_table(rows), "", *notes, "", *pairs, advice(results)])
