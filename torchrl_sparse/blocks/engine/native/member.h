@@ -8,7 +8,7 @@ struct Member {
     void (*wait)(void* team, int size) = nullptr;
 
     // Returns when all of them have called it.
-    void meet() const {
+    void barrier() const {
         if (size > 1) wait(team, size);
     }
 };

@@ -36,7 +36,7 @@ struct Batch {
         float* const own = scratch + who.rank * piece;
         for (int32_t row; (row = next.fetch_add(1)) < alone;) query(Member{}, row, own, own);
         for (int32_t row = alone; row < rows; row++) {
-            who.meet();
+            who.barrier();
             query(who, row, own, scratch);
         }
     }

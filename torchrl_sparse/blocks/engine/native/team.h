@@ -26,7 +26,7 @@ namespace {
 constexpr int MOST_THREADS = 64;
 constexpr std::chrono::microseconds SPIN{50};  // longer than any block of a published network takes
 
-inline void breathe() {
+inline void cpu_relax() {
 #if defined(__x86_64__)
     __builtin_ia32_pause();
 #elif defined(__aarch64__)
@@ -64,7 +64,7 @@ class alignas(64) Counter {
     bool changes(uint32_t seen) const {
         for (int i = 0; i < 64; i++) {
             if (value() != seen) return true;
-            breathe();
+            cpu_relax();
         }
         return false;
     }
@@ -112,7 +112,7 @@ class Team {
         for (int rank = 1; rank < size; rank++) orders_[rank].advance();
         const Member who{0, size, this, wait};
         job(who, data);
-        if (size > 1) meet(size);
+        if (size > 1) barrier(size);
     }
 
     void work(int rank) {
@@ -120,22 +120,22 @@ class Team {
             orders_[rank].wait(seen);
             const int size = size_;
             job_(Member{rank, size, this, wait}, data_);
-            meet(size);
+            barrier(size);
         }
     }
 
     // Returns when `size` threads have called it.
-    void meet(int size) {
-        const uint32_t seen = met_.value();
+    void barrier(int size) {
+        const uint32_t seen = generation_.value();
         if (arrived_.fetch_add(1) == size - 1) {
             arrived_.store(0);
-            met_.advance();
+            generation_.advance();
         } else {
-            met_.wait(seen);
+            generation_.wait(seen);
         }
     }
 
-    static void wait(void* team, int size) { static_cast<Team*>(team)->meet(size); }
+    static void wait(void* team, int size) { static_cast<Team*>(team)->barrier(size); }
 
     // Starts workers until there are `threads` threads with the caller's; returns how many there are, if the system has no more.
     int grow(int threads) {
@@ -157,7 +157,7 @@ class Team {
     void* data_ = nullptr;
     int size_ = 1;
     alignas(64) std::atomic<int> arrived_{0};
-    Counter met_, orders_[MOST_THREADS];
+    Counter generation_, orders_[MOST_THREADS];
 };
 
 }  // namespace
