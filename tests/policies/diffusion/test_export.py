@@ -1,11 +1,9 @@
 """Exported policies: a C program gives the chunks of Python, to the last bit, and nothing in a file can hurt it."""
 
-import ctypes
 import os
 import re
 import shutil
 import subprocess
-import zlib
 from pathlib import Path
 
 import pytest
@@ -199,35 +197,11 @@ def test_a_trained_policy_in_two_steps(example, tmp_path):
     check_equal(example, policy, tmp_path / "lift.tsp")
 
 
-def test_what_is_wrong_with_a_file_is_one_line(example, tmp_path):
-    path = tmp_path / "policy.tsp"
-    make_policy().export(path)
-    whole = path.read_bytes()
-
-    def refused(content):
-        path.write_bytes(content)
-        done = run([example, path], input="", capture_output=True, text=True)
-        assert done.returncode == 2
-        assert done.stdout == ""
-        (line,) = done.stderr.splitlines()
-        assert line.startswith(f"{path}: ")
-        return line.removeprefix(f"{path}: ")
-
-    assert refused(b"") == refused(b"x" * 200) == "expected an exported policy (.tsp)"
-    newer = whole[:8] + (2).to_bytes(4, "little") + whole[12:]
-    assert refused(newer) == "version: expected 1, got 2; export the policy again"
-    assert refused(whole[:-64]) == f"size: expected {len(whole)} bytes, got {len(whole) - 64}"
-    assert re.fullmatch(
-        r"checksum: expected \w{8}, got \w{8}; the file is damaged", refused(whole[:-1] + b"\x01")
-    )
-    header = tsp._Header.from_buffer_copy(whole)
-    header.heads = 5
-    changed = bytearray(bytes(header) + whole[ctypes.sizeof(header) :])
-    changed[12:16] = zlib.crc32(changed[16:]).to_bytes(4, "little")
-    assert refused(changed) == "heads: expected a divisor of width 32, got 5"
-    path.unlink()
+def test_what_is_wrong_with_a_file_is_one_line_of_the_example(example, tmp_path):
+    path = tmp_path / "absent.tsp"
     done = run([example, path], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (2, f"{path}: expected a file that can be read\n")
+    expected = f"{path}: expected a file that can be read (No such file or directory)\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
 
 
 def test_no_damaged_file_does_harm(example, folder, tmp_path):

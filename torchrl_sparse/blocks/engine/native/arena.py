@@ -1,4 +1,4 @@
-"""Matrices and constants in the memory layout of ``denoise.h``.
+"""Matrices and constants in the memory layout of ``layout.h``.
 
 A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into panels of 32 columns,
 [part][panel][row][32].
@@ -7,33 +7,23 @@ A matrix [columns, rows] of PyTorch is cut into parts of 256 rows and these into
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import mmap
-from ctypes import c_int32, c_void_p
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["PANEL", "Arena", "Matrix", "pack_panels", "padded", "quantise"]
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Matrix
 
-PANEL, PART = 32, 256
-_TYPES = (torch.float32, torch.float16, torch.bfloat16, torch.int8)  # as denoise.h numbers them
+__all__ = ["PANEL", "Arena", "pack_panels", "padded", "quantise"]
+
+PANEL, PART, _CACHE_LINE = (CONSTANTS[name] for name in ("PANEL", "PART", "CACHE_LINE"))
+_TYPES = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.int8: "I8"}
 _TOGETHER = {torch.bfloat16: 2, torch.int8: 4}  # inputs that lie side by side
-_CACHE_LINE = 64
-
-
-class Matrix(ctypes.Structure):
-    """``struct Matrix`` of denoise.h; :meth:`Arena.matrix` makes one."""
-
-    _fields_ = [
-        *((name, c_void_p) for name in ("weight", "bias", "scale", "sums")),
-        *((name, c_int32) for name in ("rows", "columns", "bias_stride", "type")),
-    ]
 
 
 def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Lay a matrix out in the order in which ``denoise.h`` reads it.
+    """Lay a matrix out in the order in which ``kernels.h`` reads it.
 
     Args:
         weight: [columns, rows], as ``nn.Linear`` keeps it (outputs, inputs).
@@ -135,7 +125,7 @@ class Arena:
             rows=-(-rows // _TOGETHER.get(dtype, 1)),
             columns=bias.shape[-1],
             bias_stride=bias.shape[-1] if bias.ndim == 2 else 0,
-            type=_TYPES.index(dtype),
+            type=CONSTANTS[_TYPES[dtype]],
             **integers,
         )
 

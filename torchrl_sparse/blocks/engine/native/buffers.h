@@ -7,11 +7,15 @@
 
 #include "structs.h"
 
+// What the clean predictions of one query are drawn to; null where they are not.
+struct Guide {
+    const float* actions;  // [horizon][action_dim]
+    const float* pull;     // [horizon], 0 to 1
+};
+
 namespace {
 
 enum Activation { GELU, MISH };
-constexpr int PANEL = 32, PART = 256;
-constexpr int MAX_HIDDEN = 256;   // of a pruner
 constexpr float UNSEEN = -1e30f;  // a score whose weight e^-87 is lost next to that of a score that is seen
 using half = uint16_t;
 struct Pair { uint16_t first, second; };  // of BF16
@@ -33,8 +37,8 @@ struct Buffers {
     float *key, *value, *key_bias;  // shared [layers][obs_steps][heads]: what cross-attention reads of the observations
     size_t size;
     Buffers(const Model& m, int slots, float* own, float* shared)
-        : width(padded(m.width)), ld(stride(m.width)), head((m.width / m.heads + 15) / 16 * 16), inner(m.heads * head),
-          ldh(stride(4 * m.width)), lanes(padded(m.horizon * m.heads)) {
+        : width(padded(m.width)), ld(stride(m.width)), head((m.width / m.heads + HEAD - 1) / HEAD * HEAD),
+          inner(m.heads * head), ldh(stride(4 * m.width)), lanes(padded(m.horizon * m.heads)) {
         size = 0;
         auto take = [this](float* base, size_t n) { float* p = base + size; size += (n + 15) / 16 * 16; return p; };
         const int tokens = m.horizon > m.obs_steps ? m.horizon : m.obs_steps, memory = 1 + m.obs_steps;

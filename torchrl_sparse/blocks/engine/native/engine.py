@@ -1,13 +1,12 @@
 """The native engine: one call of compiled code for each action chunk, on the CPU.
 
-``denoise.h`` holds the loop and ``team.h`` the threads, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the
+``sampler.h`` holds the loop and ``team.h`` the threads, :mod:`~torchrl_sparse.blocks.engine.native.packing` prepares the
 weights and tables that they read, and :mod:`~torchrl_sparse.blocks.engine.native.library` finds the compiled code. It reads
 the mask as it goes: unlike the PyTorch engine's, its program is the mask.
 """
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from ctypes import byref
@@ -19,6 +18,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.base import Overhead, check_query
 from torchrl_sparse.blocks.engine.costs import folded_block_macs, folded_overhead_macs
 from torchrl_sparse.blocks.engine.native.arena import PANEL
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Units
 from torchrl_sparse.blocks.engine.native.library import INSTRUCTION_SETS, instruction_level, loaded
 from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_type
 from torchrl_sparse.blocks.engine.native.supports import native_supports
@@ -32,7 +32,7 @@ from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["MAX_THREADS", "NativeEngine"]
 
-MAX_THREADS = 64  # of a team, see team.h
+MAX_THREADS = CONSTANTS["MAX_THREADS"]  # of a team, see team.h
 
 
 class NativeEngine:
@@ -152,7 +152,7 @@ class NativeEngine:
             loaded().sparse_denoise(*where, len(cond), *query, scratch.data_ptr())
         return actions
 
-    def condition(self, state: Tensor, scales: ctypes.Array) -> Tensor | None:
+    def condition(self, state: Tensor, scales: Units) -> Tensor | None:
         """Return condition f32 [B, To, D] of states in the units of the environment, as PyTorch rounds it.
 
         Args:
@@ -165,7 +165,7 @@ class NativeEngine:
         state = state.contiguous()
         cond, (rows, steps, dim) = torch.empty_like(state), state.shape
         where = state.data_ptr(), cond.data_ptr()
-        finite = loaded().sparse_normalise(scales, rows * steps, dim, *where)
+        finite = loaded().sparse_normalise(byref(scales), rows * steps, dim, *where)
         return cond if finite else None
 
     def ready(self, noise: Tensor, cond: Tensor) -> PackedNetwork:
@@ -183,7 +183,7 @@ class NativeEngine:
         packed: PackedNetwork,
         noise: Tensor,
         cond: Tensor,
-        scales: ctypes.Array,
+        scales: Units,
         mask: Tensor,
         chunks: Tensor,
         reuse: Reuse = "block",
@@ -206,7 +206,7 @@ class NativeEngine:
         tensors = (tensor.data_ptr() for tensor in (cond, actions, chunks))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)
-            query = rows, mask.data_ptr(), slots, noise.data_ptr(), scales, *tensors
+            query = rows, mask.data_ptr(), slots, noise.data_ptr(), byref(scales), *tensors
             loaded().sparse_answer(*where, *query, scratch.data_ptr())
 
     def _num_threads(self, rows: int) -> int:

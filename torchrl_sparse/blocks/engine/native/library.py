@@ -10,11 +10,11 @@ import ctypes
 import importlib.machinery
 import platform
 import warnings
-from ctypes import c_int32, c_int64, c_void_p
+from ctypes import c_int32, c_int64, c_uint64, c_void_p
 from functools import lru_cache
 from pathlib import Path
 
-from torchrl_sparse.blocks.engine.native.packing import Model
+from torchrl_sparse.blocks.engine.native.layout import layout_hash
 
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "loaded", "native_available"]
 
@@ -23,11 +23,11 @@ INSTRUCTION_SETS = (
     "portable",
     *_OF_MACHINE.get(platform.machine(), ("avx2", "avx512", "avx512_bf16", "amx")),
 )
-_INTERFACE = 2  # counted up, here and in native.cpp, whenever the arguments of a function change
-# Each function's result and arguments; c_void_p is any address, of a structure of packing.py or of numbers.
+# Each function's result and arguments; c_void_p is any address, of a structure of layout.py or of numbers. Count INTERFACE of
+# layout.h up whenever they change.
 _SIGNATURES = {
     "sparse_levels": (c_int32, []),
-    "sparse_interface": (c_int64, []),
+    "sparse_layout": (c_uint64, []),
     "sparse_scratch": (c_int64, [c_void_p, c_int32]),
     "sparse_denoise": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_normalise": (c_int32, [c_void_p, c_int32, c_int32, *[c_void_p] * 2]),
@@ -64,10 +64,14 @@ def _load(folder: Path) -> ctypes.CDLL | str:
         return f"{paths[0].name} was not built (install a C++17 compiler, g++ or clang++, then this package again)"
     try:
         found = _declare(ctypes.CDLL(str(path)))
-    except (OSError, AttributeError) as error:
+    except OSError as error:
         return f"{path.name} cannot be loaded ({error}); install the package again"
-    if found.sparse_interface() != _INTERFACE << 32 | ctypes.sizeof(Model):
-        return f"{path.name} was built from other sources; install the package again"
+    except AttributeError:  # not a function of that name
+        found = None
+    if found is None or found.sparse_layout() != layout_hash():
+        return (
+            f"{path.name} was built from other sources than layout.h here; build it again: pip install -e ."
+        )
     return found
 
 

@@ -91,10 +91,9 @@ extern "C" {
 int32_t sparse_levels() { return levels(); }
 
 // For the caller to compare with its own: a library that was built from other sources has other functions and structures.
-// library.py counts INTERFACE up whenever the arguments of a function change.
-int64_t sparse_interface() {
-    constexpr int64_t INTERFACE = 2;
-    return INTERFACE << 32 | (int64_t)sizeof(Model);
+uint64_t sparse_layout() {
+    constexpr uint64_t HASH = layout_hash();
+    return HASH;
 }
 
 // Floats that each thread needs as scratch, which must start on a cache line (64 bytes).

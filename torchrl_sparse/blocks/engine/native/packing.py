@@ -9,13 +9,12 @@ what it returns is packed here:
 * An observation's embedding and the first layer of its encoder are one matrix.
 * Position embeddings are biases of the layers before them, one row for each token.
 
-Heads are padded to multiples of 16, rows to whole panels. ``denoise.h`` declares the same structures.
+Heads are padded to multiples of 16, rows to whole panels. ``layout.h`` describes the structures.
 """
 
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, c_float, c_int32, c_void_p
 
 import torch
 from torch import Tensor
@@ -29,38 +28,18 @@ from torchrl_sparse.blocks.engine.folding import (
     fold_observation_stem,
     fold_tokens,
 )
-from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix, padded
+from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, padded
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Layer, Matrix, Model, Units
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.storage.tensors import check_shapes
 
-__all__ = ["Model", "PackedNetwork", "PackedWeights", "units", "weight_type"]
+__all__ = ["PackedNetwork", "PackedWeights", "units", "weight_type"]
 
 _WEIGHTS = ("float32", "float16", "bfloat16", "int8")
 
-_HEAD = 16  # heads are padded to whole vectors
-
-
-class _Layer(ctypes.Structure):
-    _fields_ = [
-        *((name, Matrix) for name in ("qkv", "out", "up", "down", "kv")),
-        ("fold", POINTER(Matrix)),
-        *((name, c_void_p) for name in ("query_bias", "cross_bias")),
-    ]
-
-
-class Model(ctypes.Structure):
-    """``struct Model`` of denoise.h."""
-
-    _SIZES = ["horizon", "width", "layers", "heads", "obs_steps", "action_dim", "cond_dim", "steps"]
-    _fields_ = [
-        *((name, c_int32) for name in (*_SIZES, "causal", "history")),
-        ("clip", c_float),
-        ("layer", POINTER(_Layer)),
-        *((name, Matrix) for name in ("embed", "head", "encode_up", "encode_down")),
-        *((name, c_void_p) for name in ("time_key", "time_value", "time_bias", "coefficients", "valid")),
-    ]
+_HEAD = CONSTANTS["HEAD"]  # heads are padded to whole vectors
 
 
 class PackedWeights:
@@ -96,10 +75,10 @@ class PackedWeights:
         # What follows each other in the loop or before it does so in memory.
         loop = [self._pack_loop(layer) for layer in layers]
         packed = [
-            _Layer(**blocks, **self._pack_memory(layer)) for blocks, layer in zip(loop, layers, strict=True)
+            Layer(**blocks, **self._pack_memory(layer)) for blocks, layer in zip(loop, layers, strict=True)
         ]
         return {
-            "layer": self._array(_Layer, packed),
+            "layer": self._array(Layer, packed),
             "embed": self._arena.matrix(
                 network.input_emb.weight, network.input_emb.bias + network.pos_emb[0].double()
             ),
@@ -156,7 +135,7 @@ class PackedNetwork:
         weights: of the network.
 
     Attributes:
-        model: the structure that denoise.h reads.
+        model: the structure that the engine reads.
         weights: as given.
         scratch: floats that a thread needs for a query; the engine, which knows compiled code, says so.
     """
@@ -220,7 +199,6 @@ def _parts(tensor: Tensor) -> Tensor:
     return padded(padded(tensor, _HEAD, dim=2).flatten(1, 2), PANEL, dim=1).flatten(0, 1)
 
 
-def units(normalizer: Normalizer) -> ctypes.Array:
-    """Return ``struct Units`` of units.h, which points to the buffers of ``normalizer``."""
-    names = ("state_scale", "state_offset", "action_scale", "action_offset")
-    return (c_void_p * len(names))(*(normalizer._buffers[name].data_ptr() for name in names))
+def units(normalizer: Normalizer) -> Units:
+    """Return a structure that points to the buffers of ``normalizer``."""
+    return Units(*(normalizer._buffers[name].data_ptr() for name, _ in Units._fields_))

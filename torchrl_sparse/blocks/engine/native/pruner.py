@@ -1,4 +1,4 @@
-"""The MLP of a learned planner in the compiled code of ``denoise.h``: a product with all cells of a mask, and nothing
+"""The MLP of a learned planner in the compiled code of ``pruner.h``: a product with all cells of a mask, and nothing
 kept between.
 
 PyTorch takes four passes over an activation of [K * 3L, hidden]; here a dozen cells at a time stay in the L1 cache.
@@ -6,32 +6,20 @@ PyTorch takes four passes over an activation of [K * 3L, hidden]; here a dozen c
 
 from __future__ import annotations
 
-import ctypes
-from ctypes import byref, c_float, c_int32, c_void_p
+from ctypes import byref
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, Matrix
+from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Pruner
 from torchrl_sparse.blocks.engine.native.library import instruction_level, loaded
 
 __all__ = ["MAX_HIDDEN", "NativePruner", "PrunerWeights"]
 
-MAX_HIDDEN = 256  # of denoise.h, which keeps a dozen cells on the stack
-
-
-class _Pruner(ctypes.Structure):
-    """``struct Pruner`` of denoise.h."""
-
-    _fields_ = [
-        *((name, Matrix) for name in ("obs", "middle")),
-        *((name, c_void_p) for name in ("cells", "last")),
-        ("bias", c_float),
-        ("count", c_int32),
-        ("first", c_int32),
-    ]
+MAX_HIDDEN = CONSTANTS["MAX_HIDDEN"]
 
 
 @dataclass(frozen=True)
@@ -66,7 +54,7 @@ class NativePruner:
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
 
     Attributes:
-        packed: the structure that denoise.h reads.
+        packed: the structure that the engine reads.
         hidden: activations of its hidden layers.
 
     Raises:
@@ -89,11 +77,11 @@ class NativePruner:
         self._features = weights.obs[0].shape[1]
         self._shape = weights.cells.shape[:2]
 
-    def _pack(self, weights: PrunerWeights) -> _Pruner:
+    def _pack(self, weights: PrunerWeights) -> Pruner:
         (obs, obs_bias), (fuse, fuse_bias), (last, last_bias) = weights.obs, weights.fuse, weights.last
         obs = fuse.double() @ obs.double()
         bias = fuse.double() @ obs_bias.double() + fuse_bias
-        return _Pruner(
+        return Pruner(
             obs=self._arena.matrix(obs, bias),
             middle=self._arena.matrix(*weights.middle),
             cells=self._padded(weights.cells),

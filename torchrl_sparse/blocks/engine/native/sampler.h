@@ -20,7 +20,7 @@ inline void Query::advance(int step, const float* noise, const Guide& guide) con
     normalise({0, m.horizon});
     const int lda = stride(m.action_dim);
     whole_product(b.y, b.ld, m.horizon, m.head, b.eps, lda);
-    const float* c = m.coefficients + 8 * step;
+    const float* c = m.coefficients + COEFFICIENTS * step;
     float* const previous = b.cleans;
     float* const earlier = previous + m.horizon * lda;
     for (int t = 0; t < m.horizon; t++)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import torch
 
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["native_supports"]
 
-_MAX_OBS_STEPS = 63
+_MAX_OBS_STEPS = CONSTANTS["MAX_OBS_STEPS"]
 
 
 def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:

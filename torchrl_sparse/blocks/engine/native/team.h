@@ -20,10 +20,10 @@
 #include <thread>
 
 #include "member.h"
+#include "structs.h"
 
 namespace {
 
-constexpr int MOST_THREADS = 64;
 constexpr std::chrono::microseconds SPIN{50};  // longer than any block of a published network takes
 
 inline void cpu_relax() {
@@ -83,7 +83,7 @@ class Team {
         if (threads > 1) {
             Team& team = instance();
             const std::unique_lock<std::mutex> turn(team.turn_, std::try_to_lock);
-            if (turn) return team.lead(threads < MOST_THREADS ? threads : MOST_THREADS, job, data);
+            if (turn) return team.lead(threads < MAX_THREADS ? threads : MAX_THREADS, job, data);
         }
         job(Member{}, data);
     }
@@ -157,7 +157,7 @@ class Team {
     void* data_ = nullptr;
     int size_ = 1;
     alignas(64) std::atomic<int> arrived_{0};
-    Counter generation_, orders_[MOST_THREADS];
+    Counter generation_, orders_[MAX_THREADS];
 };
 
 }  // namespace

@@ -9,52 +9,22 @@ from __future__ import annotations
 import ctypes
 import zlib
 from collections.abc import Iterator
-from ctypes import c_char, c_float, c_int32, c_uint32, c_uint64
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.native.arena import Matrix
-from torchrl_sparse.blocks.engine.native.packing import Model, PackedNetwork
+from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Header, Matrix, Model
+from torchrl_sparse.blocks.engine.native.packing import PackedNetwork
 from torchrl_sparse.blocks.engine.native.pruner import NativePruner
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["VERSION", "ExportedPlan", "write_tsp"]
 
-VERSION = 1
-_LINE, _CHECKED_FROM = 64, 16
-_F16, _BF16 = 1, 2  # as arena.py numbers types
-_DENSE, _MASK, _PRUNER = range(3)
-_SAME = (
-    "horizon",
-    "width",
-    "layers",
-    "heads",
-    "obs_steps",
-    "action_dim",
-    "cond_dim",
-    "steps",
-    "causal",
-    "history",
-)
-
-
-class _Header(ctypes.LittleEndianStructure):
-    """``struct Header`` of tsp.cpp."""
-
-    _fields_ = [
-        ("magic", c_char * 8),
-        *((name, c_uint32) for name in ("version", "checksum")),
-        ("size", c_uint64),
-        *((name, c_int32) for name in _SAME),
-        *(
-            (name, c_int32)
-            for name in ("weights", "slots", "plan", "hidden", "rated", "pruned", "description")
-        ),
-        *((name, c_float) for name in ("clip", "bias", "rate")),
-    ]
+VERSION = CONSTANTS["TSP_VERSION"]
+_LINE, _CHECKED_FROM = CONSTANTS["CACHE_LINE"], CONSTANTS["TSP_CHECKED_FROM"]
+_BOTH = [name for name, _ in Header._fields_ if name in dict(Model._fields_)]
 
 
 @dataclass(frozen=True)
@@ -76,9 +46,14 @@ class ExportedPlan:
     def fields(self) -> dict[str, float]:
         """Return the header's fields of the plan."""
         if self.pruner is None:
-            return {"slots": self.slots, "plan": _DENSE if self.mask is None else _MASK}
+            return {"slots": self.slots, "plan": CONSTANTS["DENSE" if self.mask is None else "MASK"]}
         found = self.pruner.packed
-        fields = {"slots": self.slots, "plan": _PRUNER, "hidden": self.pruner.hidden, "bias": found.bias}
+        fields = {
+            "slots": self.slots,
+            "plan": CONSTANTS["PRUNER"],
+            "hidden": self.pruner.hidden,
+            "bias": found.bias,
+        }
         if self.rate is None:
             return fields
         pruned = (torch.tensor(self.rate) * found.count).round().long()  # as rate_threshold counts them
@@ -101,16 +76,15 @@ def write_tsp(
     model, text = network.model, description.encode()
     arrays = [text, *(_bytes(vector) for vector in normalizer), *_network(model), *_plan(plan)]
     body = b"".join(array + bytes(-len(array) % _LINE) for array in arrays)
-    head = ctypes.sizeof(_Header)
+    head = ctypes.sizeof(Header)
     start = -(-head // _LINE) * _LINE
-    header = _Header(
-        magic=b"TSPOLICY",
+    header = Header(
+        magic=CONSTANTS["TSP_MAGIC"].encode(),
         version=VERSION,
         size=start + len(body),
         weights=model.layer[0].qkv.type,
-        clip=model.clip,
         description=len(text),
-        **{name: getattr(model, name) for name in _SAME},
+        **{name: getattr(model, name) for name in _BOTH},
         **plan.fields(),
     )
     content = bytearray(bytes(header) + bytes(start - head) + body)
@@ -129,12 +103,12 @@ def _network(model: Model) -> Iterator[bytes]:
     yield _floats(model.time_key, vectors * width)
     yield _floats(model.time_value, vectors * width)
     yield _floats(model.time_bias, vectors)
-    yield _floats(model.coefficients, model.steps * 8)
+    yield _floats(model.coefficients, model.steps * CONSTANTS["COEFFICIENTS"])
     yield _floats(model.valid, width)
     for layer in model.layer[: model.layers]:
         for matrix in (layer.qkv, layer.out, layer.up, layer.down, layer.kv, *layer.fold[: 2 * model.heads]):
             yield from _matrix(matrix)
-        yield _floats(layer.query_bias, layer.out.rows * (2 if layer.out.type == _BF16 else 1))
+        yield _floats(layer.query_bias, layer.out.rows * (2 if layer.out.type == CONSTANTS["BF16"] else 1))
         yield _floats(layer.cross_bias, width)
 
 
@@ -150,7 +124,9 @@ def _plan(plan: ExportedPlan) -> Iterator[bytes]:
 
 
 def _matrix(matrix: Matrix, biases: int = 1) -> Iterator[bytes]:
-    yield ctypes.string_at(matrix.weight, matrix.rows * matrix.columns * (2 if matrix.type == _F16 else 4))
+    yield ctypes.string_at(
+        matrix.weight, matrix.rows * matrix.columns * (2 if matrix.type == CONSTANTS["F16"] else 4)
+    )
     yield _floats(matrix.bias, biases * matrix.columns)
 
 

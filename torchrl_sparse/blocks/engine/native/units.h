@@ -4,10 +4,7 @@
 
 #include <stddef.h>
 
-// Scale and offset of each number of a state and of an action.
-struct Units {
-    const float *state_scale, *state_offset, *action_scale, *action_offset;
-};
+#include "structs.h"
 
 // normalised = state * scale + offset, [rows][dim]. Returns whether all of the states are finite.
 inline bool normalise(const Units& units, const float* states, size_t rows, size_t dim, float* normalised) {
