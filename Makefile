@@ -66,7 +66,7 @@ build/sanitize/native.so: $(NATIVE)/native.cpp $(HEADERS)
 sanitize: install build/sanitize/native.so
 	LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0 \
 		SANITIZED_NATIVE=$(CURDIR)/build/sanitize/native.so \
-		$(BIN)/python -m pytest tests/blocks/engine/native tests/policies/diffusion/test_export.py -k "not library"
+		$(BIN)/python -m pytest tests/blocks/engine/native tests/policies/diffusion/test_export*.py -k "not library"
 
 # Half an hour of faults, see tests/torture/README.md; MINUTES=5 for less. Linux with g++.
 MINUTES ?= 30

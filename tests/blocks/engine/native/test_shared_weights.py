@@ -76,7 +76,7 @@ def test_weights_that_are_half_precision_numbers_are_read_as_such_without_a_bit_
     types = [
         PackedWeights(network, torch.float32, narrow=n).members["layer"][0].kv.type for n in (True, False)
     ]
-    assert types == [1, 0]  # F16 and F32 of denoise.h
+    assert types == [1, 0]  # F16 and F32 of layout.h
 
 
 def test_nothing_shared_keeps_a_network_alive(network):

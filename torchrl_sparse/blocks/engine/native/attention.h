@@ -1,4 +1,5 @@
-// Self- and cross-attention of a query, and the folding of its observations into the latter. Writes to scores and mixed.
+// Self- and cross-attention of a query, and the folding of its observations into the latter. Writes to
+// its result, b.scores, b.qkv and b.mixed; folding to b.kv, b.key, b.value and b.key_bias.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
 // Of this thread's rows, and of what else their vectors hold.

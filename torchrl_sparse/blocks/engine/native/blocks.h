@@ -1,4 +1,5 @@
 // The feed-forward network; and a block, computed or reused: what it adds to the residual stream.
+// Writes to b.x, b.hidden, and the slots of b.latest.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
 // This thread's columns of hidden = activation(x * up).

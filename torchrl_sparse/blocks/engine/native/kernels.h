@@ -1,4 +1,4 @@
-// Matrix products of f32, f16, BF16 and 8-bit weights, in panels that lie as arena.py packs them.
+// Matrix products of f32, f16, BF16 and 8-bit weights, in panels that lie as arena.py packs them. Writes only to its result.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
 // y[row] = start[row] + x[row] * panel, for MR rows and the 32 columns of a panel, in strips of as many vectors as there are

@@ -201,4 +201,4 @@ def _parts(tensor: Tensor) -> Tensor:
 
 def units(normalizer: Normalizer) -> Units:
     """Return a structure that points to the buffers of ``normalizer``."""
-    return Units(*(normalizer._buffers[name].data_ptr() for name, _ in Units._fields_))
+    return Units(*(normalizer._buffers[field[0]].data_ptr() for field in Units._fields_))

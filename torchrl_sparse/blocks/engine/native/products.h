@@ -1,4 +1,5 @@
 // The matrix products of a query, with the rounding of activations that the type of the weights asks for, and LayerNorm.
+// Writes to its result, b.rounded and b.grid; LayerNorm to b.y.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
 inline void Query::product(const float* x, int ldx, int n, const Matrix& a, Range columns, float* y, int ldy) const {

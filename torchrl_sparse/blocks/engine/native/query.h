@@ -1,7 +1,6 @@
-// One query and what its parts call of each other.
+// One query, or one thread's share of it: what the files named below define of it. Reads the model, writes to its buffers.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
-// One query, or one thread's share of it.
 struct Query {
     const Model& m;
     const Buffers b;

@@ -1,4 +1,5 @@
 // The denoising loop: the observations' encoder, the sampler's steps, and the entry points of an instruction set.
+// Writes to b.sample, b.eps, b.cleans, b.constant and b.token, and the actions.
 // Part of level.h, once for each instruction set: may call only what level.h includes before it.
 
 // Encodes the observations and folds them into the cross-attention of every layer.

@@ -24,7 +24,7 @@ __all__ = ["VERSION", "ExportedPlan", "write_tsp"]
 
 VERSION = CONSTANTS["TSP_VERSION"]
 _LINE, _CHECKED_FROM = CONSTANTS["CACHE_LINE"], CONSTANTS["TSP_CHECKED_FROM"]
-_BOTH = [name for name, _ in Header._fields_ if name in dict(Model._fields_)]
+_BOTH = {field[0] for field in Header._fields_} & {field[0] for field in Model._fields_}
 
 
 @dataclass(frozen=True)
