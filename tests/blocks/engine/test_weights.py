@@ -113,12 +113,6 @@ def test_a_change_is_noticed(way, name, network, query):
     assert_current(engine, network, query, before)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_a_change_is_noticed_where_memory_looks_otherwise(way, network, query, monkeypatch):
-    monkeypatch.setattr(native_weights, "layout_is_known", lambda: False)
-    test_a_change_is_noticed(way, "native", network, query)
-
-
 @pytest.mark.parametrize("name", ["reference", *KEEPING])
 def test_a_change_of_any_single_parameter_is_noticed(name, network, query):
     engine = engine_of(name, network)

@@ -33,22 +33,25 @@ def make_query(batch):
 
 
 def direct(policy, data):
-    return answer_directly(data, *policy.module.values())
+    return answer_directly(0.0, policy._parts, data, *policy.module.values())
 
 
+@pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("noise", ["torch", "philox"])
 @pytest.mark.parametrize("plan", [None, "type", "block"])
 @pytest.mark.parametrize("batch", [(1,), (), (3,), (2, 2)])
-def test_the_same_keys_and_bits(batch, plan, noise, monkeypatch):
+def test_the_same_keys_and_bits(batch, plan, noise, frozen, monkeypatch):
     policy = make_policy(plan=plan and Half(plan))
     policy.noise = noise
+    if frozen:
+        policy.freeze()
     with torch.no_grad():
         data = make_query(batch)
         assert direct(policy, data)
         got = policy(make_query(batch))
         monkeypatch.setattr(module, "answer_directly", lambda *_: False)
         expected = policy(make_query(batch))
-    assert set(got.keys(True, True)) == set(expected.keys(True, True))
+    assert set(data.keys(True, True)) == set(got.keys(True, True)) == set(expected.keys(True, True))
     for key in expected.keys(True, True):
         assert got[key].dtype == expected[key].dtype
         assert got[key].shape == expected[key].shape

@@ -6,6 +6,7 @@ dense policy is the same pipeline with the `Dense` planner, so that every method
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Collection
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import Any, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from torchrl_sparse import keys
@@ -25,15 +25,14 @@ from torchrl_sparse.blocks.saved import load_planner, save_beside
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
-from torchrl_sparse.networks.fingerprint import policy_fingerprint
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
+from torchrl_sparse.policies.diffusion.freezing import FreezablePolicy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
-from torchrl_sparse.policies.diffusion.sizes import PolicySizes
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.convention import source_convention
@@ -41,14 +40,15 @@ from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_p
 from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
 
 
-class DiffusionPolicy(PolicySizes, TensorDictSequential):
+class DiffusionPolicy(FreezablePolicy):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
     Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a query
     follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does),
     else from torch's global generator. Writes the chunk, from the present step on, all that a table needs: see ``out_keys``.
 
-    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. Frames
+    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. `freeze`
+    promises that none will, for faster queries. Frames
     that the query before has encoded (``("diffusion", "frame_features")``) keep its features.
 
     Args:
@@ -151,6 +151,8 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     ) -> DiffusionPolicy:
         """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
 
+        It is frozen if this one is.
+
         Raises:
             ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
                 other training steps.
@@ -161,7 +163,7 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
         policy.noise = self.noise
-        return policy
+        return policy.freeze() if self.frozen else policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
         """Return the same policy with other noise, what chance alone does; ``stream`` 0 is that of every other policy."""
@@ -182,15 +184,6 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
     @noise.setter
     def noise(self, name: str) -> None:
         self.module["denoise"].noise = check_noise(name)
-
-    @property
-    def fingerprint(self) -> str:
-        """A name of its weights, at the fp16 precision in which they are saved, and of its normaliser and training steps.
-
-        Planners and episodes belong to one policy. Earlier files name the weights alone, the part before the hyphen.
-        """
-        units = {"normalizer": self.normalizer.state_dict(), "trained": self.sampler.trained}
-        return policy_fingerprint(self.network, *filter(None, [self.vision]), **units)
 
     @property
     def engine(self) -> EngineName:
@@ -231,12 +224,15 @@ class DiffusionPolicy(PolicySizes, TensorDictSequential):
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        start = synchronised_clock(device := self.device)
-        # Made now: after the engine's call nothing is in the caches of what makes tensors.
-        latency = torch.zeros(*tensordict.batch_size, 1, device=device)
+        start = time.perf_counter()
         try:
-            if not answer_directly(tensordict, *self.module.values()):
-                tensordict = super().forward(tensordict)
+            if answer_directly(start, self._parts, tensordict, *self.module.values()):
+                return tensordict
+            if (device := self.device).type != "cpu":
+                start = synchronised_clock(device)
+            # Made now: after the engine's call nothing is in the caches of what makes tensors.
+            latency = torch.zeros(*tensordict.batch_size, 1, device=device)
+            tensordict = super().forward(tensordict)
         except MaskError as error:
             raise ValueError(f"{type(self.plan).__name__}: {error}") from error
         return tensordict.set(keys.LATENCY, latency.fill_(synchronised_clock(device) - start))

@@ -8,6 +8,9 @@ then it gives the chunk. The keys are the same, and so is every bit of them.
 
 from __future__ import annotations
 
+import copy
+import time
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -17,34 +20,86 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.packing import units
 from torchrl_sparse.blocks.planner import Planner, StaticPlanner
+from torchrl_sparse.networks.frozen import Frozen
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.warm_start import ColdStart
 
-__all__ = ["answer_directly"]
+__all__ = ["Parts", "answer_directly"]
+
+
+class Parts:
+    """What is read of the stages that stay, in every query anew or, of a frozen policy, once.
+
+    Copies and pickles of it are None: those of a frozen policy are not frozen.
+
+    Args:
+        encode: the stage that encodes; see `Parts.of`.
+        denoise: the stage that denoises.
+        frozen: the normaliser's weights where these and the parts of both stages stay; None where they may change.
+    """
+
+    def __init__(
+        self, encode: ObservationEncoder, denoise: ActionDenoiser, frozen: Frozen | None = None
+    ) -> None:
+        self.encode, self.denoise, self.network, self.frozen = encode, denoise, denoise.network, frozen
+        # What is frozen stays as it is, but may be moved through its storage: of that, a copy is read.
+        self._normalizer = denoise.normalizer if frozen is None else copy.deepcopy(denoise.normalizer)
+        self.scales = units(self._normalizer)
+
+    def __reduce__(self) -> tuple:
+        return type(None), ()
+
+    @classmethod
+    def of(
+        cls, encode: ObservationEncoder, denoise: ActionDenoiser, frozen: Frozen | None = None
+    ) -> Parts | None:
+        """Return them, or None where the stages are not those of the library or compiled code cannot read the normaliser."""
+        if type(encode) is not ObservationEncoder or type(denoise) is not ActionDenoiser:
+            return None
+        condition, normalizer = encode.condition, denoise.normalizer
+        known = (
+            condition.vision is None
+            and type(normalizer) is Normalizer
+            and condition.normalizer is normalizer
+            and all(map(_is_plain, normalizer._buffers.values()))
+        )
+        return cls(encode, denoise, frozen) if known else None
 
 
 def answer_directly(
+    began: float,
+    parts: Parts | None,
     tensordict: TensorDictBase,
     encode: ObservationEncoder,
     start: ColdStart,
     plan: Planner,
     denoise: ActionDenoiser,
 ) -> bool:
-    """Write what the four stages would, or return False and leave everything as it is where they have to run themselves."""
+    """Write what the four stages would, or return False and leave everything as it is where they have to run themselves.
+
+    Args:
+        began: when the query began, as ``time.perf_counter`` has it; its latency is written, too.
+        parts: those of a frozen policy.
+    """
     # A plain TensorDict keeps the tensor that it is given, which can then be filled.
-    if type(tensordict) is not TensorDict or not _known(encode, start, plan, denoise):
+    if type(tensordict) is not TensorDict or not _stay_unseen(encode, start, plan, denoise):
         return False
-    network, sampler, normalizer = denoise.network, denoise.sampler, denoise.normalizer
-    engine = denoise.current_engine()
+    if parts is None or parts.encode is not encode or parts.denoise is not denoise:
+        parts = Parts.of(encode, denoise)
+    if parts is None or parts.network.training:
+        return False
+    if parts.frozen is not None:
+        parts.frozen.check()
+    network, sampler, scales = parts.network, denoise.sampler, parts.scales
+    engine = denoise.engine.get(network, sampler)
     state = tensordict.get(keys.HISTORY_STATE, None)
     if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
         return False
     batch = tensordict.batch_size
     if state.shape != (*batch, *encode.state_shape):
         return False
-    scales = units(normalizer)
     cond = engine.condition(state.reshape(-1, *encode.state_shape), scales)
     if cond is None:  # the encoder says what is wrong with the state
         return False
@@ -60,30 +115,24 @@ def answer_directly(
     tensordict.set(keys.PRUNE_MASK, masks)
     tensordict.set(keys.FLOPS, torch.full((*batch, 1), denoise.static_flops(mask)))
     tensordict.set(keys.CHUNK, chunk)
+    latency = torch.full((*batch, 1), 0.0)
+    tensordict.set(keys.LATENCY, latency)
+    seconds = latency.numpy()
     engine.answer(packed, noise, cond, scales, mask, chunk, plan.reuse)
+    seconds.fill(time.perf_counter() - began)
     return True
 
 
-def _known(encode: ObservationEncoder, start: ColdStart, plan: Planner, denoise: ActionDenoiser) -> bool:
-    """Return whether the stages do what they do in the library, without anybody looking in between."""
-    kind, condition, normalizer = type(plan), encode.condition, denoise.normalizer
+def _stay_unseen(*stages: TensorDictModuleBase) -> bool:
+    """Return whether the second does nothing, the third has one mask for all, and nobody looks in between."""
+    _, start, plan, _ = stages
+    kind = type(plan)
     return (
         kind.forward is Planner.forward
         and getattr(kind, "masks", None) is StaticPlanner.masks
-        and type(encode) is ObservationEncoder
         and type(start) is ColdStart
-        and type(denoise) is ActionDenoiser
-        and condition.vision is None
-        and type(normalizer) is Normalizer
-        and condition.normalizer is normalizer
-        and all(map(_is_plain, normalizer._buffers.values()))
-        and not denoise.network.training
-        and not any(map(_is_watched, (encode, start, plan, denoise)))
+        and not any(stage._forward_hooks or stage._forward_pre_hooks for stage in stages)
     )
-
-
-def _is_watched(stage: TensorDictModuleBase) -> bool:
-    return bool(stage._forward_hooks or stage._forward_pre_hooks)
 
 
 def _is_plain(tensor: Tensor) -> bool:

@@ -34,7 +34,6 @@ _SIGNATURES = {
     "sparse_answer": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p, c_int32, *[c_void_p] * 6]),
     "sparse_blocks": (None, [c_int32, c_int32, c_void_p, c_int32, c_void_p]),
     "sparse_gather": (None, [c_int32, *[c_void_p] * 2]),
-    "sparse_kept": (c_int32, [c_void_p, c_int32, *[c_int32, c_void_p] * 3, c_void_p]),
     "sparse_prune": (None, [c_int32, c_int32, c_void_p, c_int32, *[c_void_p] * 3]),
 }
 

@@ -47,43 +47,6 @@ void run(int32_t threads, Task& task) {
     Team::run(threads, [](const Member& who, void* data) { (*static_cast<Task*>(data))(who); }, &task);
 }
 
-// Where CPython keeps a tensor behind its Python object and counts the changes of a dictionary, and PyTorch keeps what it knows
-// of a tensor: guesses, which kept.py tries before it trusts them.
-typedef uint64_t Word;
-constexpr int CHANGES = 3, STORAGE = 2, VERSION = 5, OFFSET = 18, LAYOUT_END = 20, DATA = 2, COUNT = 2;
-constexpr int PARAMETER_WORDS = 1 + LAYOUT_END - STORAGE + 2;
-
-const Word* follow(Word word) { return reinterpret_cast<const Word*>(static_cast<uintptr_t>(word)); }
-
-// A word of what `pointer` points to, 0 if that is nothing: sparse tensors have no storage, those of inference mode no version.
-Word behind(Word pointer, int at) { return pointer ? follow(pointer)[at] : 0; }
-
-// Calls `meet` with each word until it returns false: the tensor, to which word `at` of the object points, its layout, its version
-// and its data.
-template <class Meet>
-void meet_parameter(const Word* object, int at, const Meet& meet) {
-    if (!meet(object[at])) return;
-    const Word* const tensor = follow(object[at]);
-    for (int i = STORAGE; i < LAYOUT_END; i++)
-        if (!meet(tensor[i])) return;
-    meet(behind(tensor[VERSION], COUNT)) && meet(behind(tensor[STORAGE], DATA));
-}
-
-// Where its values begin.
-Word first_value(const Word* object, int at) {
-    const Word* const tensor = follow(object[at]);
-    return behind(tensor[STORAGE], DATA) + tensor[OFFSET] * sizeof(float);
-}
-
-void prefetch_parameter(const Word* object, const Word* kept) {
-    const Word* const layout = kept + 1 - STORAGE;
-    __builtin_prefetch(object + 2);
-    for (int i = 0; i < LAYOUT_END; i += 8) __builtin_prefetch(follow(kept[0]) + i);
-    __builtin_prefetch(follow(kept[0]) + LAYOUT_END - 1);
-    __builtin_prefetch(follow(layout[VERSION]) + COUNT);
-    __builtin_prefetch(follow(layout[STORAGE]) + DATA);
-}
-
 }  // namespace
 
 extern "C" {
@@ -133,32 +96,6 @@ void sparse_blocks(int32_t level, int32_t threads, const Model* m, int32_t kind,
     const size_t piece = Buffers(*m, 3, nullptr, nullptr).size;
     auto task = [&](const Member& who) { LEVELS[level].run_blocks(*m, who, kind, scratch + who.rank * piece, scratch); };
     run(threads, task);
-}
-
-// Of n parameters, of dictionaries and of samples among the values: the words that change when they do, as kept.py says. Returns
-// whether they are those in `kept`. Those are fetched into the caches beforehand, all at once, since none of it is in one; a
-// pointer is followed only where it is what it was. Given `first`, where each parameter's values begin, it writes the words to
-// `kept` instead and returns whether that is where they begin: else no sample is read, which may lie nowhere any more.
-int32_t sparse_kept(const Word* first, int32_t at, int32_t n, const Word* const* objects, int32_t dictionaries,
-                    const Word* const* holders, int32_t samples, const uint32_t* const* values, Word* kept) {
-    const bool record = first != nullptr;
-    if (!record) {
-        for (int32_t i = 0; i < n; i++) prefetch_parameter(objects[i], kept + i * PARAMETER_WORDS);
-        for (int32_t i = 0; i < dictionaries; i++) __builtin_prefetch(holders[i]);
-        for (int32_t i = 0; i < samples; i++) __builtin_prefetch(values[i]);
-    }
-    bool same = true;
-    auto meet = [&](Word word) {
-        if (record) *kept = word;
-        return same = same && *kept++ == word;
-    };
-    for (int32_t i = 0; i < n && same; i++) {
-        meet_parameter(objects[i], at, meet);
-        if (record) same = first_value(objects[i], at) == first[i];
-    }
-    for (int32_t i = 0; i < dictionaries && same; i++) meet(holders[i][CHANGES]);
-    for (int32_t i = 0; i < samples && same; i++) meet(*values[i]);
-    return same;
 }
 
 // What lies at n places.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_float
+from ctypes import c_float, c_void_p
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from torchrl_sparse.blocks.engine.native.kept import Kept, addresses, layout_is_known
 from torchrl_sparse.blocks.engine.native.library import loaded
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
 from torchrl_sparse.blocks.engine.weights import WeightWatch
@@ -19,24 +18,7 @@ __all__ = ["NativeWatch", "SharedWeights"]
 
 
 class NativeWatch(WeightWatch):
-    """Looks at what is kept of the weights in one call of compiled code; asks them one by one only where that has changed."""
-
-    def __init__(self, network: torch.nn.Module) -> None:
-        super().__init__(network)
-        self._seen: tuple[Kept, tuple] | None = None
-
-    def state(self) -> tuple:
-        seen = self._seen  # read and replaced in one go: other threads may do the same
-        if seen is not None and seen[1][-1] == self._refreshed and seen[0].is_same():
-            return seen[1]
-        # Recorded before the weights are asked: what changes meanwhile is a change.
-        members, (places, values), kept = self._members, self._places, None
-        if values is not None and layout_is_known():
-            kept = Kept(members, places[: len(members.parameters)], values)
-        state = super().state()
-        if kept is not None and members is self._members and values is self._places[1]:
-            self._seen = kept, state
-        return state
+    """Reads the first values of each parameter in one call of compiled code."""
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
         for sample in samples:
@@ -45,7 +27,8 @@ class NativeWatch(WeightWatch):
                     f"native engine: it reads float32 weights on the CPU, the network was changed to {sample.dtype} on "
                     f"{sample.device}"
                 )
-        return addresses(value.data_ptr() for sample in samples for value in sample)
+        places = [value.data_ptr() for sample in samples for value in sample]
+        return (c_void_p * len(places))(*places)
 
     def read(self, places: ctypes.Array) -> bytes:
         values = (c_float * len(places))()
