@@ -12,7 +12,7 @@ from tests.evaluation.figures.test_plots import has_color
 from torchrl_sparse.evaluation.results.schema import load_results
 
 LIFT, CAN, SQUARE = (
-    Path("assets", task, "test_split/results.json") for task in ("lift", "can/weaker", "square/weaker")
+    Path("assets", task, "results.json") for task in ("lift", "can/weaker/test_split", "square/weaker/test_split")
 )
 
 
