@@ -6,7 +6,7 @@ Tables with intervals, Pareto fronts, masks and videos, nothing to fetch.
 
 Or put several tasks together:
 
-    python recipes/report.py aggregate=[assets/lift/development/results_development.json,assets/can/results.json] out=outputs/aggregate.json
+    python recipes/report.py aggregate=[assets/lift/results.json,assets/can/results.json] out=outputs/aggregate.json
 
 Or draw what pruners of visual tokens lose over the tokens that they keep, as `calibrate_tokens` measured it:
 
