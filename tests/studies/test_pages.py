@@ -63,7 +63,7 @@ def test_below_verdicts_stands_how_many_there_are_of_their_file(root):
 
 
 def test_several_files_are_one_table_or_stand_side_by_side():
-    files = "lift/development/results_development.json can/weaker/results.json can/weaker/results_steps.json"
+    files = "lift/development/results_development.json can/weaker/development/results_development.json can/weaker/development/results_steps.json"
     heading, *rows = table(f'{files} methods="sag" tasks="Lift | Can"', ASSETS)
     assert heading[:2] == ["task", "method"]
     assert [row[:2] for row in rows] == [["Lift", "sag"], ["Can", "sag"], ["Can", "sag"]]
@@ -122,7 +122,7 @@ def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
 
 def test_published_figures_stand_before_ours():
     options = 'methods="dense | bac" cells="success, %" tasks=Can published=published.json'
-    heading, dense, bac = table(f"can/weaker/results.json {options}", ASSETS)
+    heading, dense, bac = table(f"can/weaker/development/results_development.json {options}", ASSETS)
     assert heading == ["method", "Can, published", "here"]
     assert dense == ["full / `dense`", "99", "87.0 [83, 90]"]
     assert bac == ["BAC / `bac`", "94, 3.42×", "74.2 [70, 78]"]
