@@ -40,7 +40,7 @@ def _normalise(line: str) -> str:
 
 def _maker(path: Path):
     makers = {
-        "lift/results_steps.json": _sweep,
+        "lift/development/results_steps.json": _sweep,
         "results*.json": _results,
         "realtime.json": _realtime,
         "engine/engine*.json": _engine,
@@ -89,12 +89,13 @@ def _episodes(folder: Path) -> list[str]:
     """Tables of the logs that are long enough, numbers to more digits, and all methods against ddim10 or dense."""
     logs = {log.name.removesuffix(".jsonl.gz"): build.episodes_of(log) for log in sorted(folder.iterdir())}
     made = []
+    like = min(folder.parent.glob("results*.json"))
     for count in _COUNTS:
         episodes = {name: log[:count] for name, log in logs.items() if len(log) >= count}
         if "dense" not in episodes:
             continue
         other = "ddim10" if "ddim10" in episodes else "dense"
-        results = build.results_of(episodes, like=build.load_results(folder.parent / "results.json"))
+        results = build.results_of(episodes, like=build.load_results(like))
         made.append(build.format_table(results))
         made += [f"{name}: {_numbers(build.to_plain(method))}" for name, method in results.methods.items()]
         made.append(build.pairs_against(other, episodes, results.episode_horizon))

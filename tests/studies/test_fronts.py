@@ -12,7 +12,12 @@ from tests.evaluation.figures.test_plots import has_color
 from torchrl_sparse.evaluation.results.schema import load_results
 
 LIFT, CAN, SQUARE = (
-    Path("assets", task, "test_split/results.json") for task in ("lift", "can/weaker", "square/weaker")
+    Path("assets", task, name)
+    for task, name in (
+        ("lift", "results.json"),
+        ("can/weaker", "results_300.json"),
+        ("square/weaker", "results_150.json"),
+    )
 )
 
 

@@ -63,7 +63,7 @@ def test_below_verdicts_stands_how_many_there_are_of_their_file(root):
 
 
 def test_several_files_are_one_table_or_stand_side_by_side():
-    files = "lift/results.json can/weaker/results.json can/weaker/results_steps.json"
+    files = "lift/development/results_development.json can/weaker/development/results_development.json can/weaker/development/results_steps.json"
     heading, *rows = table(f'{files} methods="sag" tasks="Lift | Can"', ASSETS)
     assert heading[:2] == ["task", "method"]
     assert [row[:2] for row in rows] == [["Lift", "sag"], ["Can", "sag"], ["Can", "sag"]]
@@ -79,14 +79,14 @@ def test_several_files_are_one_table_or_stand_side_by_side():
 
 
 def test_a_policy_with_cameras_has_a_column_of_its_own():
-    files = "lift/test_split/results.json lift_image/results.json"
+    files = "lift/results.json lift_image/results.json"
     heading, row = table(f'{files} methods="dense" cells="success, %"', ASSETS)
     assert heading == ["method", "Lift", "Lift, cameras"]
     assert row[1:] == ["99.5 [99, 100]", "100.0 [99, 100]"]
 
 
 def test_policies_of_one_task_are_told_apart_by_the_names_that_they_are_given():
-    files = "lift/results.json lift/test_split/results.json"
+    files = "lift/development/results_development.json lift/results.json"
     options = 'methods="dense" cells="success, %"'
     heading, row = table(f'{files} {options} policies="older | newer"', ASSETS)
     assert heading == ["method", "older", "newer"]
@@ -98,12 +98,12 @@ def test_policies_of_one_task_are_told_apart_by_the_names_that_they_are_given():
 
 
 def test_files_of_one_policy_share_its_column():
-    files = "lift/test_split/results.json lift/test_split/results_reuse.json square/results.json"
+    files = "lift/results.json lift/results_reuse.json square/results.json"
     options = 'methods="dense | searched" cells="success, %" policies="Lift | Lift | Square"'
     heading, dense, searched = table(f"{files} {options}", ASSETS)
     assert heading == ["method", "Lift", "Square"]
     assert (dense[1], searched[1]) == tuple(
-        table(f'lift/test_split/{file}.json methods="{method}" columns="success, %"', ASSETS)[1][0]
+        table(f'lift/{file}.json methods="{method}" columns="success, %"', ASSETS)[1][0]
         for file, method in (("results", "dense"), ("results_reuse", "searched"))
     )
     with pytest.raises(ValueError, match=r"policies: expected Lift to be of Lift, got a file of NutAssembly"):
@@ -122,7 +122,7 @@ def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
 
 def test_published_figures_stand_before_ours():
     options = 'methods="dense | bac" cells="success, %" tasks=Can published=published.json'
-    heading, dense, bac = table(f"can/weaker/results.json {options}", ASSETS)
+    heading, dense, bac = table(f"can/weaker/development/results_development.json {options}", ASSETS)
     assert heading == ["method", "Can, published", "here"]
     assert dense == ["full / `dense`", "99", "87.0 [83, 90]"]
     assert bac == ["BAC / `bac`", "94, 3.42×", "74.2 [70, 78]"]

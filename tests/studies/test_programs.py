@@ -57,10 +57,10 @@ def test_offline_errors_are_held_against_episodes(work, demos, policy, schedules
     aggregate = f"aggregate=[{work}/offline/offline_errors_Lift.json]"
     assert "few, 4 |" in run("studies.offline_errors", aggregate, f"out={work}/together")
     assert {path.suffix for path in (work / "together").iterdir()} == {".json", ".png"}
-    other = "results=[assets/can/weaker/results.json]"
+    other = "results=[assets/can/weaker/development/results_development.json]"
     refused = run("studies.offline_errors", *options, other, f"out={work}/no", expect=2)
     assert (
-        "results: assets/can/weaker/results.json: expected a table of Lift, got one of PickPlaceCan"
+        "results: assets/can/weaker/development/results_development.json: expected a table of Lift, got one of PickPlaceCan"
         in refused
     )
     assert not (work / "no").exists()

@@ -1,6 +1,6 @@
 """Draw what methods gain and lose on all tasks of this repository in one picture.
 
-    python -m recipes.studies.fronts results=[assets/lift/test_split/results.json,assets/pusht/results.json]
+    python -m recipes.studies.fronts results=[assets/lift/results.json,assets/pusht/results.json]
 
 Of several files of a task the first that has a method counts. With ``by=spending`` methods that ask more often, or for several
 samples, are drawn against what a second of the robot's time costs.

@@ -1,6 +1,6 @@
 """Measure what methods do to a policy's answers, and whether that says what they do to its episodes.
 
-    python -m recipes.studies.offline_errors task=can demos=data/can.h5 results=[assets/can/weaker/test_split/results.json]
+    python -m recipes.studies.offline_errors task=can demos=data/can.h5 results=[assets/can/weaker/results_300.json]
 
 No simulator is needed: demonstrations are asked many times, and the tables of episodes were made before. What was measured on
 several tasks is put together:

@@ -30,7 +30,7 @@ def best_within(results: Results, seconds: float) -> str | None:
 
     Soonest is the smallest ratio of its restricted mean time, failures counted as the horizon, to dense's on the same seeds.
 
-    >>> best_within(load_results("assets/lift/test_split/results.json"), 0.01)  # doctest: +SKIP
+    >>> best_within(load_results("assets/lift/results.json"), 0.01)  # doctest: +SKIP
     'ddpm3_logsnr'
     """
     ratios = _time_ratios(results)
