@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from torchrl_sparse.evaluation.results.comparisons import num_comparisons, survivors
-from torchrl_sparse.evaluation.results.parts import (
-    Difference,
-    EpisodeCost,
-    PairedEntry,
-    TimeDifference,
-)
+from torchrl_sparse.evaluation.results.parts import EpisodeCost, PairedEntry
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -26,6 +21,7 @@ from torchrl_sparse.evaluation.results.text import (
     verdict_text,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 from torchrl_sparse.evaluation.statistics.intervals import (
     episodes_needed,
 )
