@@ -10,44 +10,31 @@ Kill it and run it again to go on: finished episodes are read from OUT/episodes.
 
 from __future__ import annotations
 
-from functools import cache, partial
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
-from torchrl_sparse.control.queries import record_queries
-from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.control.roll_forward import StateModel
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.contract import policy_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
-from torchrl_sparse.envs.seeds import CALIBRATION_SEED, evaluation_seeds, tuning_seeds
-from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
-from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods, time_methods
-from torchrl_sparse.evaluation.benchmarks.late import evaluate_late
-from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon
-from torchrl_sparse.evaluation.figures.realtime import plot_realtime
-from torchrl_sparse.evaluation.latency.measure import describe_machine
-from torchrl_sparse.evaluation.results.build import Terms
-from torchrl_sparse.evaluation.results.realtime import RealtimeRun, build_realtime, format_realtime
-from torchrl_sparse.evaluation.statistics.sequential import Design
+from torchrl_sparse.evaluation.benchmarks.benchmark import BenchmarkOptions
+from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
+from torchrl_sparse.evaluation.benchmarks.late import RealtimeBenchmark
+from torchrl_sparse.evaluation.results.realtime import format_realtime
 from torchrl_sparse.methods.diffusion import check_method
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
-from torchrl_sparse.runtime.backends import backend_runtime
-from torchrl_sparse.storage.json import write_json
-from torchrl_sparse.training.diffusion.calibration import calibrate_policy
+from torchrl_sparse.training.diffusion.calibration import lazy_calibration
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.state_model import fit_state_model
 
 
 @recipe("realtime")
 def main(config: DictConfig) -> None:
-    out, task, planners = Path(config.out), find_robosuite_task(config.task), Path(config.planners)
+    task, planners = find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
@@ -59,44 +46,13 @@ def main(config: DictConfig) -> None:
     model = state_model(config, task, policy)
     config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
-    first_observations = tuning_seeds(CALIBRATION_SEED, config.calibration_samples)
-    calibration = cache(partial(calibrate_policy, policy, make_env, first_observations))
+    calibration = lazy_calibration(policy, make_env, config.calibration_samples)
     methods = make_methods(
         config.methods, policy, num_updates=config.num_updates, planners=planners, calibration=calibration
     )
-    seeds = evaluation_seeds(config.split, config.seed, config.episodes)
-    queries = record_queries(ChunkExecutor(policy), make_env, seeds[:1])
-    latency = time_methods(methods, queries, repeats=config.latency_repeats, threads=config.threads)
-
-    horizon, margins = episode_horizon(make_env, seeds), (config.margin, config.time_margin)
-    terms = Terms(Design(len(seeds)), horizon, task.early_cut, *margins)
-    shared = {name: config[name] for name in ("out", "num_envs", "workers", "backend")}
-    settings = {name: config[name] for name in ("task", "horizon", "n_action_steps")}
-    shared |= {"model": model, "settings": settings, "policy_device": config.device}
-    runs = {}
-    with backend_runtime(config.backend, config.workers):  # one Ray for all runs
-        for name, method in methods.items():
-            delays = delay_steps(torch.tensor([latency[name].p50, *config.latencies]), CONTROL_FREQ)
-            episodes = {
-                steps: evaluate_late(
-                    name, method, steps, make_env, seeds, control_freq=CONTROL_FREQ, **shared
-                )
-                for steps in delays.unique().tolist()
-            }
-            runs[name] = RealtimeRun(latency[name].p50, episodes)
-    results = build_realtime(
-        runs,
-        task=task.name,
-        split=config.split,
-        seed=config.seed,
-        control_freq=CONTROL_FREQ,
-        n_action_steps=config.n_action_steps,
-        machine=describe_machine(config.device, config.threads),
-        terms=terms,
-    )
-    write_json(out / "realtime.json", results)
-    plot_realtime(results, out / "realtime.png")
-    print(f"\n{format_realtime(results)}\n\nfiles are in {out}")
+    options = BenchmarkOptions.of(config)
+    results = RealtimeBenchmark(options, task, methods, make_env, config.latencies, model).run()
+    print(f"\n{format_realtime(results)}\n\nfiles are in {options.out}")
 
 
 def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy) -> StateModel | None:

@@ -18,18 +18,18 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
-from torchrl_sparse.cli.trials import check_served, check_trials
-from torchrl_sparse.evaluation.figures.pareto import plot_pareto
-from torchrl_sparse.evaluation.results.report import format_table
-from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.results.sweep_files import find_program, read_sweep
-from torchrl_sparse.evaluation.results.sweeps import (
+from torchrl_sparse.cli.sweep_files import find_program, read_sweep
+from torchrl_sparse.cli.sweeps import (
     LocalSweep,
     ServedSweep,
     merge_trials,
     run_trial,
     write_trials,
 )
+from torchrl_sparse.cli.trials import check_served, check_trials
+from torchrl_sparse.evaluation.figures.pareto import plot_pareto
+from torchrl_sparse.evaluation.results.report import format_table
+from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.runtime.lock import lock_output
 from torchrl_sparse.storage.json import describe_differences, read_json, write_json
 

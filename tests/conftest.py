@@ -20,7 +20,7 @@ def ctrl_c_interrupts():
 FULL = (
     "pinned", "torture", "studies", "envs", "training", "data", "options",
     "evaluation/accelerate", "evaluation/benchmarks", "evaluation/figures", "evaluation/rollouts",
-    "evaluation/results/test_sweep_recipe.py", "evaluation/results/test_engine_report.py",
+    "cli/test_sweep_recipe.py", "evaluation/results/test_engine_report.py",
     "evaluation/statistics/test_sequential.py", "cli/test_recipe.py", "control/test_matrix.py",
     "policies/diffusion/test_export.py", "policies/vla/test_trained.py", "storage/published",
     "storage/test_exhaustion.py", "tokens/test_closed_loop.py", "valid_inputs/test_demonstrations.py",

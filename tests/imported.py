@@ -10,7 +10,7 @@ import torchrl_sparse.cli.recipe
 import torchrl_sparse.data.robomimic
 import torchrl_sparse.envs.robosuite
 import torchrl_sparse.evaluation.benchmarks.diffusion
-import torchrl_sparse.evaluation.benchmarks.vla_measure  # noqa: F401
+import torchrl_sparse.evaluation.benchmarks.vla_benchmark  # noqa: F401
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy

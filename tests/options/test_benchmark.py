@@ -12,7 +12,15 @@ from torchrl_sparse.evaluation.rollouts.evaluate import evaluate
 from torchrl_sparse.runtime.wandb_run import wandb_arguments
 
 LOOKS = {"max_episodes": 20, "looks": 2}
-TIMED = "torchrl_sparse.evaluation.benchmarks.diffusion.time_queries"
+BENCHMARK = "torchrl_sparse.evaluation.benchmarks.benchmark"
+DIFFUSION = "torchrl_sparse.evaluation.benchmarks.diffusion"
+CALIBRATED = "torchrl_sparse.training.diffusion.calibration.calibrate_policy"
+EVALUATED, TIMED = f"{BENCHMARK}.evaluate", f"{DIFFUSION}.time_queries"
+RECORDED, ROUNDS, FILMED = (
+    f"{DIFFUSION}.record_queries",
+    f"{BENCHMARK}.play_rounds",
+    f"{DIFFUSION}.film_masks",
+)
 
 
 def results(*names):
@@ -31,7 +39,7 @@ def played(argument, name="dense"):
     """An argument of the call that plays a method's episodes."""
 
     def read(run):
-        return next(call[argument] for call in run.calls["evaluate"] if call["name"] == name)
+        return next(call[argument] for call in run.calls[EVALUATED] if call["name"] == name)
 
     return read
 
@@ -70,12 +78,12 @@ class TestOptions(OptionTests):
         *("methods=[uniform,saved]", "episodes=1", "horizon=9", "latency_repeats=1", "probe_episodes=1"),
         *("videos=[]", "logger=wandb"),
     )
-    watched = ("DiffusionPolicy.to", "calibrate_policy", "record_queries", "play_rounds", TIMED)
+    watched = ("DiffusionPolicy.to", CALIBRATED, RECORDED, ROUNDS, TIMED)
     replaced = {
-        "evaluate": evaluated,
-        "backend_runtime": lambda *_: nullcontext(),
-        "draw_methods": returning(None),
-        "film_masks": returning(None),
+        EVALUATED: evaluated,
+        f"{BENCHMARK}.backend_runtime": lambda *_: nullcontext(),
+        f"{DIFFUSION}.draw_methods": returning(None),
+        FILMED: returning(None),
         "log_benchmark": lambda results, folder, config: wandb_arguments(config, folder, "default"),
     }
     groups = (
@@ -88,7 +96,7 @@ class TestOptions(OptionTests):
             Row("dense_log", "logs/one.jsonl", lambda run: (run.folder / "logs/one.jsonl").is_file(), True),
             Row("horizon", "8", results("episode_horizon")),
             Row("num_updates", "5", updates),
-            Row("calibration_samples", "2", lambda run: len(run.call("calibrate_policy")["seeds"])),
+            Row("calibration_samples", "2", lambda run: len(run.call(CALIBRATED)["seeds"])),
             Row("n_action_steps", "5", lambda run: played("actor")(run).n_action_steps, 5),
             Row("num_envs", "2", played("num_envs")),
             Row("workers", "2", played("workers")),
@@ -97,8 +105,8 @@ class TestOptions(OptionTests):
             Row("time_margin", "0.3", uniform("time_vs_dense", "margin")),
             Row("threads", "2", lambda run: run.call(TIMED)["threads"]),
             Row("latency_repeats", "2", lambda run: run.call(TIMED)["repeats"]),
-            Row("probe_episodes", "2", lambda run: len(run.call("record_queries")["seeds"])),
-            Row("videos", "[dense,saved]", calls_of("film_masks", "name")),
+            Row("probe_episodes", "2", lambda run: len(run.call(RECORDED)["seeds"])),
+            Row("videos", "[dense,saved]", calls_of(FILMED, "name")),
             *wandb_rows(wandb),
         ],
         [
@@ -114,7 +122,7 @@ class TestOptions(OptionTests):
         [
             Row("task", "touch", results("task"), "Touch"),
             Row("until", "decided", lambda run: run.json("results.json").get("until_decided"), LOOKS),
-            Row("max_episodes", "20", lambda run: run.call("play_rounds")["terms"].design.max_episodes, 20),
+            Row("max_episodes", "20", lambda run: run.call(ROUNDS)["terms"].design.max_episodes, 20),
             "methods=[uniform]",
         ],
     )

@@ -1,6 +1,9 @@
 """Options of success against latency: what arrives where queries are timed and episodes played, whose own tests do so."""
 
 from contextlib import nullcontext
+from types import SimpleNamespace
+
+import torch
 
 from tests.options.harness import OptionTests, Row, returning
 from tests.options.inputs import write_demos, write_policy
@@ -12,24 +15,33 @@ def timed(methods, queries, **_):
     return {name: summarize_latency([0.01]) for name in methods}
 
 
+BENCHMARK, LATE = (
+    "torchrl_sparse.evaluation.benchmarks.benchmark",
+    "torchrl_sparse.evaluation.benchmarks.late",
+)
+CALIBRATED = "torchrl_sparse.training.diffusion.calibration.calibrate_policy"
+EVALUATED, TIMED, BUILT = f"{BENCHMARK}.evaluate", f"{LATE}.time_methods", f"{LATE}.build_realtime"
+
+
 def delays(run):
-    return sorted({call["delay_steps"] for call in run.calls["evaluate_late"]})
+    return sorted({int(call["name"].rpartition("+")[2]) for call in run.calls[EVALUATED]})
 
 
 class TestOptions(OptionTests):
     recipe = "realtime"
     base = ("methods=[uniform]",)
-    watched = ("calibrate_policy", "fit_state_model", "make_methods", "diffusion_env", "DiffusionPolicy.to")
+    watched = (CALIBRATED, "fit_state_model", "make_methods", "diffusion_env", "DiffusionPolicy.to")
     replaced = {
-        "time_methods": timed,
-        "fit_state_model": returning((None, 0.5)),
+        TIMED: timed,
+        "fit_state_model": returning((SimpleNamespace(weight=torch.zeros(1)), 0.5)),
+        f"{LATE}.make_realtime_executor": returning(SimpleNamespace(n_action_steps=8)),
         "format_realtime": returning("table"),
-        "episode_horizon": returning(9),
+        f"{BENCHMARK}.episode_horizon": returning(9),
         **dict.fromkeys(
-            ("record_queries", "evaluate_late", "build_realtime", "write_json", "plot_realtime"),
+            (f"{LATE}.record_queries", EVALUATED, BUILT, f"{BENCHMARK}.write_json", f"{LATE}.plot_realtime"),
             returning(None),
         ),
-        "backend_runtime": lambda *_: nullcontext(),
+        f"{BENCHMARK}.backend_runtime": lambda *_: nullcontext(),
     }
     groups = (
         [
@@ -37,29 +49,29 @@ class TestOptions(OptionTests):
             Row("device", "'cpu:0'", device()),
             Row("planners", "plans", lambda run: str(argument("make_methods", "planners")(run))),
             Row("latencies", "[0.2]", delays, [1, 4]),
-            Row("episodes", "3", size("evaluate_late", "seeds")),
-            Row("seed", "7", first("evaluate_late", "seeds", 100_000)),
-            Row("out", "elsewhere", argument("evaluate_late", "out")),
-            Row("n_action_steps", "5", argument("build_realtime", "n_action_steps")),
+            Row("episodes", "3", size(EVALUATED, "seeds")),
+            Row("seed", "7", first(EVALUATED, "seeds", 100_000)),
+            Row("out", "elsewhere", lambda run: str(argument(EVALUATED, "log")(run).parents[1])),
+            Row("n_action_steps", "5", argument(BUILT, "n_action_steps")),
             Row("horizon", "9", argument("diffusion_env", "horizon")),
             Row("num_updates", "5", argument("make_methods", "num_updates")),
-            Row("margin", "0.2", lambda run: run.call("build_realtime")["terms"].margin),
-            Row("time_margin", "0.3", lambda run: run.call("build_realtime")["terms"].time_margin),
-            Row("num_envs", "2", argument("evaluate_late", "num_envs")),
-            Row("workers", "2", argument("evaluate_late", "workers")),
-            Row("backend", "ray", argument("evaluate_late", "backend")),
-            Row("threads", "2", argument("time_methods", "threads")),
-            Row("latency_repeats", "2", argument("time_methods", "repeats")),
+            Row("margin", "0.2", lambda run: run.call(BUILT)["terms"].margin),
+            Row("time_margin", "0.3", lambda run: run.call(BUILT)["terms"].time_margin),
+            Row("num_envs", "2", argument(EVALUATED, "num_envs")),
+            Row("workers", "2", argument(EVALUATED, "workers")),
+            Row("backend", "ray", argument(EVALUATED, "backend")),
+            Row("threads", "2", argument(TIMED, "threads")),
+            Row("latency_repeats", "2", argument(TIMED, "repeats")),
         ],
         [
             Row("policy", "other", lambda run: run.call("make_methods")["policy"].horizon, 12),
             Row("methods", "[ddim2_ahead]", lambda run: [*run.call("make_methods").result], ["dense", "ddim2_ahead"]),
             Row("demos", "data/more.h5", lambda run: [len(call["demos"]) for call in run.calls["fit_state_model"]], [3]),
-            Row("split", "test", first("evaluate_late", "seeds"), 210_000),
+            Row("split", "test", first(EVALUATED, "seeds"), 210_000),
         ],
         [
-            Row("task", "lift_moving", argument("build_realtime", "task"), "LiftMoving"),
-            Row("calibration_samples", "2", lambda run: [len(call["seeds"]) for call in run.calls["calibrate_policy"]], [2]),
+            Row("task", "lift_moving", argument(BUILT, "task"), "LiftMoving"),
+            Row("calibration_samples", "2", lambda run: [len(call["seeds"]) for call in run.calls[CALIBRATED]], [2]),
             "methods=[bac]",
         ],
     )  # fmt: skip

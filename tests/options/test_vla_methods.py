@@ -12,6 +12,7 @@ from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.wandb_run import wandb_arguments
 
+BENCHMARK, VLA = (f"torchrl_sparse.evaluation.benchmarks.{name}" for name in ("benchmark", "vla_benchmark"))
 LOAD = "torchrl_sparse.cli.vla.VLAPolicy.from_pretrained"
 THRESHOLDS = {
     "translation": 0.1,
@@ -116,11 +117,13 @@ class TestCalibrateTokens(OptionTests):
 
 
 def settings(run):
-    return run.call("record_methods")["settings"]
+    return run.call(f"{VLA}.record_methods")["settings"]
 
 
 def played(name, method="dense"):
-    return lambda run: next(call[name] for call in run.calls["evaluate"] if call["name"] == method)
+    return lambda run: next(
+        call[name] for call in run.calls[f"{BENCHMARK}.evaluate"] if call["name"] == method
+    )
 
 
 class TestBenchmark(OptionTests):
@@ -129,24 +132,22 @@ class TestBenchmark(OptionTests):
     watched = (
         "load_vla",
         "torchrl_sparse.policies.vla.policy.VLAPolicy.to",
-        "make_design",
-        "describe_policy",
+        f"{BENCHMARK}.make_design",
+        f"{BENCHMARK}.describe_policy",
     )
     replaced = {
         LOAD: load,
         "instructed_env": returning(None),
-        "episode_horizon": returning(9),
-        "record_methods": lambda texts, *_, **__: dict.fromkeys(texts),
-        "skipped_layers": returning([2]),
-        "matched_number": returning(None),
-        "play_rounds": lambda names, play, terms: {name: play(name, terms.design.max_episodes) for name in names},
+        f"{BENCHMARK}.episode_horizon": returning(9),
+        f"{VLA}.record_methods": lambda texts, *_, **__: dict.fromkeys(texts),
+        f"{VLA}.skipped_layers": returning([2]),
+        f"{VLA}.matched_number": returning(None),
+        f"{BENCHMARK}.play_rounds": lambda names, play, terms: {name: play(name, terms.design.max_episodes) for name in names},
         "log_benchmark": lambda results, folder, config: wandb_arguments(config, folder, "default"),
         "print_results": returning(None),
-        "backend_runtime": lambda *_: nullcontext(),
-        **dict.fromkeys(
-            ("evaluate", "measure_methods", "build_results", "save_results", "draw_methods", "film_tokens"),
-            returning(None),
-        ),
+        f"{BENCHMARK}.backend_runtime": lambda *_: nullcontext(),
+        **dict.fromkeys((f"{BENCHMARK}.{name}" for name in ("evaluate", "build_results", "write_json")), returning(None)),
+        **dict.fromkeys((f"{VLA}.{name}" for name in ("measure_methods", "draw_methods", "film_tokens")), returning(None)),
     }  # fmt: skip
     groups = (
         [
@@ -154,35 +155,35 @@ class TestBenchmark(OptionTests):
             Row("calibrated", "false", lambda run: "alpha" in settings(run)["specprune"]),
             Row("specprune.keep_share", "0.95", lambda run: settings(run)["specprune"].get("keep_share")),
             *controller_rows(lambda run: settings(run)["controller"]),
-            Row("pairs", "[[dense,fastv@0.5]]", argument("build_results", "pairs")),
+            Row("pairs", "[[dense,fastv@0.5]]", argument(f"{BENCHMARK}.build_results", "pairs")),
             Row("episodes", "3", lambda run: len(played("seeds")(run))),
-            Row("seed", "7", first("evaluate", "seeds", 100_000)),
+            Row("seed", "7", first(f"{BENCHMARK}.evaluate", "seeds", 100_000)),
             Row("dense_log", "logs/one.jsonl", lambda run: str(played("log")(run)), "logs/one.jsonl"),
-            Row("n_action_steps", "2", argument("describe_policy", "n_action_steps")),
-            Row("num_envs", "2", argument("evaluate", "num_envs")),
-            Row("workers", "2", argument("evaluate", "workers")),
-            Row("backend", "ray", argument("evaluate", "backend")),
-            Row("margin", "0.2", lambda run: run.call("build_results")["terms"].margin),
-            Row("time_margin", "0.3", lambda run: run.call("build_results")["terms"].time_margin),
-            Row("threads", "2", argument("measure_methods", "threads")),
-            Row("latency_repeats", "2", argument("measure_methods", "repeats")),
-            Row("probe_episodes", "2", size("record_methods", "seeds")),
-            Row("videos", "[fastv@0.5]", lambda run: [call["name"] for call in run.calls["film_tokens"]]),
+            Row("n_action_steps", "2", argument(f"{BENCHMARK}.describe_policy", "n_action_steps")),
+            Row("num_envs", "2", argument(f"{BENCHMARK}.evaluate", "num_envs")),
+            Row("workers", "2", argument(f"{BENCHMARK}.evaluate", "workers")),
+            Row("backend", "ray", argument(f"{BENCHMARK}.evaluate", "backend")),
+            Row("margin", "0.2", lambda run: run.call(f"{BENCHMARK}.build_results")["terms"].margin),
+            Row("time_margin", "0.3", lambda run: run.call(f"{BENCHMARK}.build_results")["terms"].time_margin),
+            Row("threads", "2", argument(f"{VLA}.measure_methods", "threads")),
+            Row("latency_repeats", "2", argument(f"{VLA}.measure_methods", "repeats")),
+            Row("probe_episodes", "2", size(f"{VLA}.record_methods", "seeds")),
+            Row("videos", "[fastv@0.5]", lambda run: [call["name"] for call in run.calls[f"{VLA}.film_tokens"]]),
             *wandb_rows(lambda run: run.call("log_benchmark").result),
         ],
         [
             Row("policy", "other", lambda run: run.call("load_vla").result.chunk_size, 5),
-            Row("methods", "[efficientvla_layers]", lambda run: argument("record_methods", "texts")(run)[1:]),
-            Row("skipped_layers", "1", lambda run: [call["count"] for call in run.calls["skipped_layers"]], [1]),
-            Row("split", "test", first("evaluate", "seeds"), 210_000),
-            Row("out", "elsewhere", lambda run: str(run.call("draw_methods")["out"])),
+            Row("methods", "[efficientvla_layers]", lambda run: argument(f"{VLA}.record_methods", "texts")(run)[1:]),
+            Row("skipped_layers", "1", lambda run: [call["count"] for call in run.calls[f"{VLA}.skipped_layers"]], [1]),
+            Row("split", "test", first(f"{BENCHMARK}.evaluate", "seeds"), 210_000),
+            Row("out", "elsewhere", lambda run: str(run.call(f"{VLA}.draw_methods")["out"])),
             Row("logger", "null", lambda run: "wandb" if run.calls["log_benchmark"] else None),
             Row("table", "full", argument("print_results", "style")),
         ],
         [
-            Row("task", "lift_crowded", argument("build_results", "task")),
-            Row("until", "decided", argument("make_design", "until")),
-            Row("max_episodes", "20", lambda run: run.call("build_results")["terms"].design.max_episodes, 20),
+            Row("task", "lift_crowded", argument(f"{BENCHMARK}.build_results", "task")),
+            Row("until", "decided", argument(f"{BENCHMARK}.make_design", "until")),
+            Row("max_episodes", "20", lambda run: run.call(f"{BENCHMARK}.build_results")["terms"].design.max_episodes, 20),
         ],
     )  # fmt: skip
     prepare = staticmethod(write_inputs)

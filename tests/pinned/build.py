@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine import native_available
+from torchrl_sparse.cli.sweeps import Trial, merge_trials
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results, compare_pair
@@ -20,7 +21,6 @@ from torchrl_sparse.evaluation.results.engine_report import format_engine_table,
 from torchrl_sparse.evaluation.results.realtime import format_realtime, load_realtime
 from torchrl_sparse.evaluation.results.report import comparison_rows, format_table
 from torchrl_sparse.evaluation.results.schema import Results, load_results
-from torchrl_sparse.evaluation.results.sweeps import Trial, merge_trials
 from torchrl_sparse.evaluation.results.tables import markdown_table, select_columns
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table, load_vla_results

@@ -21,8 +21,8 @@ from tests.storage.published.checkpoints import LowDimPolicy, put_config, write_
 from tests.torture.formats import SWEEP, small_policy, small_pruner
 from tests.torture.grammar import OUT_OF_BOUNDS, Change
 from torchrl_sparse.blocks.saved import load_planner
+from torchrl_sparse.cli.sweep_files import read_sweep
 from torchrl_sparse.data.robomimic import read_demos
-from torchrl_sparse.evaluation.results.sweep_files import read_sweep
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 STATE_KEYS = ("object", "robot0_eef_pos")

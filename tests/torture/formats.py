@@ -20,9 +20,9 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.blocks.sag.planner import PrunerInfo, SAGPruner
 from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule
+from torchrl_sparse.cli.sweeps import LocalSweep, SavedSweep, Trial
 from torchrl_sparse.evaluation.results.realtime import Realtime, load_realtime
 from torchrl_sparse.evaluation.results.schema import Results, load_results, save_results
-from torchrl_sparse.evaluation.results.sweeps import LocalSweep, SavedSweep, Trial
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer

@@ -8,11 +8,11 @@ import yaml
 from hydra import compose, initialize
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from tests.evaluation.results.test_sweeps import finish
+from tests.cli.test_sweeps import finish
 from tests.recipe_modules import load_recipe
+from torchrl_sparse.cli.sweep_files import parameter_sets, read_sweep, trial_command
+from torchrl_sparse.cli.sweeps import LocalSweep, Trial
 from torchrl_sparse.cli.trials import check_served, check_trials
-from torchrl_sparse.evaluation.results.sweep_files import parameter_sets, read_sweep, trial_command
-from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.yaml import read_yaml
 

@@ -9,14 +9,14 @@ from typing import Any
 from unittest.mock import patch
 
 from torchrl_sparse.cli.recipe import check_command
-from torchrl_sparse.evaluation.results.sweep_files import (
+from torchrl_sparse.cli.sweep_files import (
     find_program,
     hydra_word,
     parameter_sets,
     parameter_values,
     trial_command,
 )
-from torchrl_sparse.evaluation.results.sweeps import Trial
+from torchrl_sparse.cli.sweeps import Trial
 
 __all__ = ["check_served", "check_trials"]
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from recipes.studies.pages.result_tables import subject
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.pareto import plain_log_ticks
-from torchrl_sparse.evaluation.results.parts import Interval
 from torchrl_sparse.evaluation.results.schema import MethodEntry, Results
+from torchrl_sparse.evaluation.statistics.differences import Interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

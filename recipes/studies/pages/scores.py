@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from torchrl_sparse.evaluation.results.parts import Difference
 from torchrl_sparse.evaluation.results.text import difference_text, mean_text, verdict_text
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
+from torchrl_sparse.evaluation.statistics.differences import Difference
 from torchrl_sparse.evaluation.statistics.intervals import verdict
 from torchrl_sparse.evaluation.statistics.scores import mean_interval
 

@@ -4,7 +4,8 @@ import pytest
 
 from torchrl_sparse.evaluation.accelerate.choice import choose, rank, within_budget
 from torchrl_sparse.evaluation.results.acceleration import Candidate, Played
-from torchrl_sparse.evaluation.results.parts import Difference, Percentiles, Success, TimeDifference
+from torchrl_sparse.evaluation.results.parts import Percentiles, Success
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 
 
 def candidate(family, error, p50, p95=None):

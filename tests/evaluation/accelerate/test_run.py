@@ -12,6 +12,7 @@ from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, ask, episo
 from torchrl_sparse import Sampler, Uniform
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
+from torchrl_sparse.evaluation.benchmarks import benchmark
 from torchrl_sparse.evaluation.results.acceleration import load_acceleration
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -132,8 +133,8 @@ def test_a_larger_grid_extends_what_is_there(go, monkeypatch):
 def test_finalists_are_played_until_they_are_decided_and_the_right_one_is_taken(go, monkeypatch, tmp_path):
     times = {"dense": 90, "ddim4": 20, "ddpm2_logsnr": 10}
     monkeypatch.setattr(run, "time_queries", fixed_times({name: times.get(name, 200) for name in METHODS}))
-    monkeypatch.setattr(run, "episode_horizon", lambda make_env, seeds: HORIZON)
-    monkeypatch.setattr(run, "evaluate", episodes_of({"dense": 20, "ddim4": 20}))
+    monkeypatch.setattr(benchmark, "episode_horizon", lambda make_env, seeds: HORIZON)
+    monkeypatch.setattr(benchmark, "evaluate", episodes_of({"dense": 20, "ddim4": 20}))
     found, _ = go(episodes=300, grid=replace(GRID, searched=()))
     assert set(found.played) == {"dense", "ddim4", "ddpm2_logsnr"}
     assert found.chosen == "ddim4"  # the other is faster, and never solves the task

@@ -17,7 +17,7 @@ from torchrl_sparse.evaluation.benchmarks.vla import (
     record_methods,
     token_settings,
 )
-from torchrl_sparse.evaluation.benchmarks.vla_measure import replay_all, time_methods
+from torchrl_sparse.evaluation.benchmarks.vla_benchmark import replay_all, time_methods
 from torchrl_sparse.methods.vla import TOKEN_METHODS, TokenMethod, make_controller, make_pruner
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -98,7 +98,7 @@ def test_a_controlled_method_is_measured_with_its_controller(policy, recorded):
 def test_queries_are_timed_in_turn(policy, recorded, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "torchrl_sparse.evaluation.benchmarks.vla_measure.answer", lambda policy, query: asked.append(query)
+        "torchrl_sparse.evaluation.benchmarks.vla_benchmark.answer", lambda policy, query: asked.append(query)
     )
     policies = {"turning": policy.with_pruner(SpecPrune(budget=2))}
     time_methods(policies, recorded, repeats=4, threads=1, device="cpu")

@@ -13,9 +13,10 @@ from torchrl_sparse.evaluation.results.aggregate import (
     load_aggregate,
 )
 from torchrl_sparse.evaluation.results.build import MethodRun
-from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
+from torchrl_sparse.evaluation.results.parts import PValues, Success
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 from torchrl_sparse.storage.json import write_json
 
 NAMES = ("dense", "ddim10", "bac")

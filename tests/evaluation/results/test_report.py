@@ -7,16 +7,11 @@ from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
-from torchrl_sparse.evaluation.results.parts import (
-    ActionError,
-    Difference,
-    Flops,
-    Percentiles,
-    Success,
-)
+from torchrl_sparse.evaluation.results.parts import ActionError, Flops, Percentiles, Success
 from torchrl_sparse.evaluation.results.report import format_table, results_rows
 from torchrl_sparse.evaluation.results.schema import load_results, save_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, TokensKept
+from torchrl_sparse.evaluation.statistics.differences import Difference
 from torchrl_sparse.evaluation.statistics.durations import time_ratio
 from torchrl_sparse.evaluation.statistics.intervals import tango_interval, wilson_interval
 from torchrl_sparse.evaluation.statistics.sequential import Design
@@ -196,7 +191,7 @@ def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_
     assert (entry.success.n, results.dense.success.n) == (20, 40)
     assert entry.paired_vs_dense.ci95 == tango_interval(0, 5, 20, level)
     ours, theirs = [30, 60, 30, 60] * 5, [30, 30, 30, 60] * 5
-    assert entry.time_vs_dense.ci95 == time_ratio(ours, theirs, 60, confidence=level).ci
+    assert entry.time_vs_dense.ci95 == time_ratio(ours, theirs, 60, confidence=level).ci95
     assert "looked at 2 times up to 40" in format_table(results)
 
 

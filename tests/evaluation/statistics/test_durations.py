@@ -31,7 +31,7 @@ def test_the_interval_covers_the_true_ratio(name, n):
     population, generator, trials = POPULATIONS[name], np.random.default_rng(n), 1000
     covered = 0
     for _ in range(trials):
-        low, high = time_ratio(*population.draw(n, generator), population.horizon).ci
+        low, high = time_ratio(*population.draw(n, generator), population.horizon).ci95
         covered += low <= population.ratio <= high
     assert covered / trials > 0.95 - 3 * np.sqrt(0.05 * 0.95 / trials)
 
@@ -40,7 +40,7 @@ def test_pairs_that_share_their_difficulty_have_a_shorter_interval():
     generator = np.random.default_rng(0)
     dense = generator.gamma(12, 10, 300).round()
     near, far = dense + generator.integers(-3, 4, 300), generator.permutation(dense)
-    widths = [np.diff(time_ratio(other, dense, 400).ci)[0] for other in (near, far)]
+    widths = [np.diff(time_ratio(other, dense, 400).ci95)[0] for other in (near, far)]
     assert correlation(near, dense) > 0.9 > 0.2 > abs(correlation(far, dense))
     assert widths[0] < 0.8 * widths[1]
 
@@ -50,7 +50,7 @@ def test_pairs_that_share_their_difficulty_have_a_shorter_interval():
 def test_interval_and_statistic_agree(seed, confidence):
     ours, theirs = CAN.draw(60, np.random.default_rng(seed))
     z = norm.ppf((1 + confidence) / 2)
-    low, high = time_ratio(ours, theirs, 400, confidence=confidence).ci
+    low, high = time_ratio(ours, theirs, 400, confidence=confidence).ci95
     assert time_z(ours, theirs, 400, high) == pytest.approx(z, rel=1e-6)
     assert time_z(ours, theirs, 400, low) == pytest.approx(-z, rel=1e-6)
 

@@ -19,25 +19,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse import keys
-from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.envs.contract import provenance
-from torchrl_sparse.envs.seeds import evaluation_seeds
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.evaluation.accelerate.candidates import Grid, calibrate_candidates, family
 from torchrl_sparse.evaluation.accelerate.choice import choose, rank, within_budget
+from torchrl_sparse.evaluation.accelerate.finalists import Finalists
 from torchrl_sparse.evaluation.accelerate.pruner import train_candidate
 from torchrl_sparse.evaluation.accelerate.request import Request
 from torchrl_sparse.evaluation.accelerate.stages import Errors, Timings, read_or_make
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
-from torchrl_sparse.evaluation.benchmarks.rounds import episode_horizon, make_design, play_rounds
-from torchrl_sparse.evaluation.benchmarks.summary import describe_policy, error_to_dense
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine, describe_machine
 from torchrl_sparse.evaluation.latency.queries import time_queries
 from torchrl_sparse.evaluation.results.acceleration import (
@@ -45,12 +42,8 @@ from torchrl_sparse.evaluation.results.acceleration import (
     Candidate,
     Played,
 )
-from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.parts import Percentiles
-from torchrl_sparse.evaluation.results.schema import DENSE, Results, save_results
-from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
-from torchrl_sparse.methods.diffusion import method_identity
+from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.storage.json import write_json
@@ -134,7 +127,8 @@ def accelerate(
     played: dict[str, Played] = {}
     if request.episodes:
         finalists = {name: methods[name] for name in [DENSE, *ranking[: request.finalists]]}
-        results = _play(finalists, timings, answer(policy, queries), make_env, out, machine, request)
+        measured = {"machine": machine, "timings": timings, "queries": answer(policy, queries)}
+        results = Finalists(request, finalists, make_env, out, **measured).run()
         played = {name: Played.of(entry) for name, entry in results.methods.items()}
     found = Acceleration(
         1,
@@ -232,52 +226,3 @@ def _time(
 
     found = read_or_make(out / "timings.json", Timings, settings, make, anew=True)
     return found.machine, found.timings
-
-
-def _play(
-    methods: Mapping[str, DiffusionPolicy],
-    timings: Mapping[str, Latency],
-    queries: TensorDictBase,
-    make_env: Callable[..., EnvBase],
-    out: Path,
-    machine: Machine,
-    request: Request,
-) -> Results:
-    """Play the finalists against dense until their verdicts are reached, and write ``results.json``."""
-    seeds = evaluation_seeds("development", request.seed, request.episodes)
-    horizon, task = episode_horizon(make_env, seeds), find_task(request.task)
-    design = make_design("decided", request.episodes, request.episodes)
-    terms = Terms(design, horizon, task.early_cut, request.margin, request.time_margin, task.by_degrees)
-    settings = {"task": task.name, "horizon": horizon, "n_action_steps": request.n_action_steps}
-
-    def play(name: str, count: int) -> list[EpisodeResult]:
-        return evaluate(
-            name,
-            ChunkExecutor(methods[name], request.n_action_steps),
-            make_env,
-            seeds[:count],
-            log=episode_log(out, name),
-            identity=method_identity(name, methods[name]) | settings,
-            policy_device=methods[name].device,
-            num_envs=1,  # in a batch all would be stepped on until the last, perhaps a failure, ends
-            workers=request.workers,
-        )
-
-    episodes = play_rounds(methods, play, terms)
-    runs = {
-        name: MethodRun(
-            episodes[name], timings[name], error_to_dense(method, answer(method, queries), queries)
-        )
-        for name, method in methods.items()
-    }
-    results = build_results(
-        runs,
-        task=task.name,
-        split="development",
-        seed=request.seed,
-        terms=terms,
-        machine=machine,
-        policy=describe_policy(methods[DENSE], request.n_action_steps),
-    )
-    save_results(results, out / "results.json")
-    return results

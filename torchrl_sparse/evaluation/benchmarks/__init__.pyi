@@ -1,4 +1,9 @@
+from .benchmark import (
+    Benchmark as Benchmark,
+    BenchmarkOptions as BenchmarkOptions,
+)
 from .diffusion import (
+    DiffusionBenchmark as DiffusionBenchmark,
     default_methods as default_methods,
     draw_methods as draw_methods,
     make_methods as make_methods,
@@ -9,7 +14,7 @@ from .film import (
     film_masks as film_masks,
     film_tokens as film_tokens,
 )
-from .late import evaluate_late as evaluate_late
+from .late import RealtimeBenchmark as RealtimeBenchmark
 from .rounds import (
     episode_horizon as episode_horizon,
     make_design as make_design,

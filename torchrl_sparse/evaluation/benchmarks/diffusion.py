@@ -1,16 +1,22 @@
-"""A benchmark of a diffusion policy: its methods, what is measured of them, and the figures."""
+"""The benchmark of a diffusion policy: its methods, what is measured of them, and the figures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration
 from torchrl_sparse.blocks.saved import saved_planners
-from torchrl_sparse.control.queries import answer
+from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.control.queries import answer, record_queries
+from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.evaluation.benchmarks.benchmark import Benchmark, BenchmarkOptions, Episodes
+from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.benchmarks.summary import error_to_dense, flops_executed
 from torchrl_sparse.evaluation.figures.curves import plot_success_within
 from torchrl_sparse.evaluation.figures.masks import plot_mask_statistics, plot_mask_strip
@@ -20,17 +26,20 @@ from torchrl_sparse.evaluation.figures.plots import (
     plot_schedule,
     plot_similarity,
 )
+from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
 from torchrl_sparse.evaluation.latency.measure import Latency
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 from torchrl_sparse.evaluation.results.build import MethodRun
-from torchrl_sparse.evaluation.results.schema import Results
+from torchrl_sparse.evaluation.results.schema import DENSE, Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.statistics.fidelity import block_errors
-from torchrl_sparse.methods.diffusion import MethodName, make_method
+from torchrl_sparse.methods.diffusion import MethodName, make_method, method_identity
+from torchrl_sparse.methods.executor import make_executor
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 
 __all__ = [
+    "DiffusionBenchmark",
     "default_methods",
     "draw_methods",
     "make_methods",
@@ -42,6 +51,68 @@ __all__ = [
 _ALWAYS = ("dense", "dense_noise", "ddim10", "uniform", "bac_unified", "bac_blockwise", "bac")
 _SAME_COMPUTATION = {"dense_noise": "dense"}  # of other numbers: it takes as long, and is not timed again
 _SURGING = ("uniform", "bac_blockwise", "bac")  # whose errors BAC's third figure compares
+
+
+class DiffusionBenchmark(Benchmark):
+    """A diffusion policy, dense against other methods, in a world that waits.
+
+    Args:
+        options, make_env: see `Benchmark`.
+        methods: name -> policy, see `make_methods`.
+        calibration: of the dense policy, whose similarities are drawn; called once, at the end.
+
+    Raises:
+        ValueError: see `make_executor`.
+    """
+
+    def __init__(
+        self,
+        options: BenchmarkOptions,
+        methods: Mapping[str, DiffusionPolicy],
+        make_env: Callable[..., EnvBase],
+        calibration: Callable[[], Calibration],
+    ) -> None:
+        self.methods, self.calibration, self.names = methods, calibration, methods
+        self.actors = {
+            name: make_executor(name, method, options.n_action_steps) for name, method in methods.items()
+        }
+        super().__init__(options, find_task(options.task), make_env)
+
+    def dense(self) -> DiffusionPolicy:
+        return self.methods[DENSE]
+
+    def actor(self, name: str) -> ChunkExecutor:
+        return self.actors[name]
+
+    def identity(self, name: str) -> dict[str, Any]:
+        executed = {"n_action_steps": self.actors[name].n_action_steps}
+        return method_identity(name, self.methods[name]) | self.settings | executed
+
+    def measure(self, episodes: Episodes) -> dict[str, MethodRun]:
+        options = self.options
+        settle_rates(self.methods, episodes)
+        probed = self.seeds[: options.probe_episodes]
+        self.queries = record_queries(self.actors[DENSE], self.make_env, probed)
+        timing = {"repeats": options.latency_repeats, "threads": options.threads}
+        return measure_methods(self.methods, episodes, self.queries, **timing)
+
+    def draw(self, results: Results, episodes: Episodes) -> None:
+        draw_methods(results, self.methods, self.queries, self.calibration(), self.out)
+        if ways := told_ways(episodes):
+            title = f"{results.task}, {results.split} seeds: ways that were taken"
+            plot_ways(ways, self.out / "ways.png", title=title)
+        self.film(self.options.videos)
+
+    def film(self, names: Sequence[str]) -> None:
+        """Film an episode of each method of these that is measured, where there is a GL library."""
+        if left_out := [name for name in names if name not in self.actors]:
+            print(f"no video of {', '.join(left_out)}: not among the methods")
+        try:
+            for name in filter(self.actors.__contains__, names):
+                first, threads = self.seeds[0], self.options.threads
+                film_masks(name, self.actors[name], self.make_env, first, self.out, threads)
+        except RuntimeError as error:  # no GL library
+            print(f"no video: {error}")
 
 
 def default_methods(planners: Path) -> list[str]:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from torchrl_sparse.canvas import make_figure, save_figure
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.evaluation.figures.labels import place_labels
-from torchrl_sparse.evaluation.results.parts import Interval
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.text import threads_text
+from torchrl_sparse.evaluation.statistics.differences import Interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,14 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from torchrl_sparse.evaluation.latency.measure import Machine
-from torchrl_sparse.evaluation.results.parts import (
-    Difference,
-    Percentiles,
-    Score,
-    Success,
-    TimeDifference,
-    require,
-)
+from torchrl_sparse.evaluation.results.parts import Percentiles, Score, Success
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry
 from torchrl_sparse.evaluation.results.text import (
     NO_VERDICT,
@@ -28,7 +21,7 @@ from torchrl_sparse.evaluation.results.text import (
     threads_text,
     verdict_text,
 )
-from torchrl_sparse.evaluation.statistics.intervals import Verdict
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference, Verdict, require
 from torchrl_sparse.storage.json import read_json
 
 __all__ = [

@@ -10,12 +10,13 @@ from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
 from torchrl_sparse.evaluation.results.comparisons import surviving
-from torchrl_sparse.evaluation.results.parts import Difference, PValues, TimeDifference
+from torchrl_sparse.evaluation.results.parts import PValues
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.text import NONE_SOLVED, p_text, points_text, ratio_text, verdict_text
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, read_episodes
 from torchrl_sparse.evaluation.rollouts.pairs import pair_episodes
 from torchrl_sparse.evaluation.statistics.aggregate import TaskPairs, aggregate_tasks
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 from torchrl_sparse.evaluation.statistics.durations import time_verdict
 from torchrl_sparse.evaluation.statistics.intervals import verdict
 from torchrl_sparse.evaluation.statistics.sequential import Design

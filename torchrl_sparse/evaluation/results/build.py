@@ -9,22 +9,20 @@ from typing import Any
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
-    Difference,
     EpisodeCost,
     Flops,
-    Interval,
     PairedEntry,
     Percentiles,
     PolicyShape,
     PValues,
     Score,
     Success,
-    TimeDifference,
 )
 from torchrl_sparse.evaluation.results.schema import DENSE, SCHEMA, MethodEntry, Results, Stopping
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, tokens_kept, totals
 from torchrl_sparse.evaluation.rollouts.pairs import EpisodePairs, pair_by_design, pair_episodes
 from torchrl_sparse.evaluation.statistics.bootstrap import median_ratio_interval
+from torchrl_sparse.evaluation.statistics.differences import Difference, Interval, TimeDifference
 from torchrl_sparse.evaluation.statistics.durations import (
     DEFAULT_TIME_MARGIN,
     allowed_steps,
@@ -224,8 +222,8 @@ def compare_pair(
         against,
         solved=tuple(map(sum, pairs.solved)),
         n=len(pairs.method),
-        success=Difference.of(solved),
-        time=TimeDifference.of(times),
+        success=solved,
+        time=times,
         score=_gain(pairs, terms.margin) if terms.by_degrees else None,
     )
 
@@ -281,8 +279,8 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
         solved, times = (replace(one, verdict="undecided") for one in (solved, times))
         p_values = [0.5, 0.5]
     return {
-        "paired_vs_dense": Difference.of(solved),
-        "time_vs_dense": TimeDifference.of(times),
+        "paired_vs_dense": solved,
+        "time_vs_dense": times,
         "p_values": PValues(*p_values),
     }
 

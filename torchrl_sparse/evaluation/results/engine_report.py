@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -21,7 +20,7 @@ from torchrl_sparse.evaluation.latency.limits import (
 )
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.evaluation.results.tables import markdown_table, select_columns
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "EngineResults",
@@ -31,7 +30,6 @@ __all__ = [
     "format_engine_table",
     "image_part_rows",
     "load_engine_results",
-    "save_engine_results",
     "shape_results",
 ]
 
@@ -174,11 +172,6 @@ def _all_pruned_steps(case: EngineCase, rows: Mapping[str, EngineRow]) -> dict[s
         runner: (rows[f"{runner} all-pruned"].p50_s - rows[f"{runner} ddim1"].p50_s) / (steps - 1)
         for runner in runners
     }
-
-
-def save_engine_results(results: EngineResults, path: str | os.PathLike) -> Path:
-    """Write an ``engine.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)
 
 
 def load_engine_results(path: str | os.PathLike) -> EngineResults:

@@ -5,29 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 from torchrl_sparse.evaluation.latency.measure import Latency
-from torchrl_sparse.evaluation.statistics.durations import TimeRatio
-from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Verdict, wilson_interval
+from torchrl_sparse.evaluation.statistics.differences import (
+    Difference,
+    Interval,
+    TimeDifference,
+    check_interval,
+    require,
+)
+from torchrl_sparse.evaluation.statistics.intervals import wilson_interval
 
 __all__ = [
     "ActionError",
-    "Difference",
     "EpisodeCost",
     "Flops",
-    "Interval",
     "PValues",
     "Score",
     "PairedEntry",
     "Percentiles",
     "PolicyShape",
     "Success",
-    "TimeDifference",
-    "require",
 ]
-
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -72,38 +71,6 @@ class Success:
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Success minus dense success on the same seeds, with Tango's 95 % interval and the verdict against a margin.
-
-    The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
-    ``mcnemar_p`` is the exact two-sided p-value of no difference at all, see `torchrl_sparse.evaluation.statistics.intervals`;
-    None of dense, of scores and in older files.
-    """
-
-    diff: float
-    ci95: Interval
-    margin: float
-    verdict: Verdict
-    mcnemar_p: float | None = None
-
-    def __post_init__(self) -> None:
-        require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
-        check_interval(self.ci95)
-        require(self.mcnemar_p is None or 0 <= self.mcnemar_p <= 1, "mcnemar_p", "0 to 1", self.mcnemar_p)
-        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
-
-    @classmethod
-    def of(cls, paired: PairedDifference) -> Difference:
-        """Keep what a file holds of a comparison."""
-        return cls(paired.diff, paired.ci, paired.margin, paired.verdict, paired.mcnemar_p)
-
-    @property
-    def worse(self) -> bool:
-        """Whether the whole interval lies below zero, wherever the margin is."""
-        return self.ci95[1] < 0
-
-
-@dataclass(frozen=True)
 class Score:
     """Mean score of episodes, of a task that is done by degrees, with Student's 95 % interval, and beside dense's.
 
@@ -121,34 +88,6 @@ class Score:
         require(0 <= self.mean <= 1, "mean", "0 to 1", self.mean)
         check_interval(self.ci95)
         _check_p("p_value", self.p_value)
-
-
-@dataclass(frozen=True)
-class TimeDifference:
-    """Restricted mean time over dense's on the same seeds, with its 95 % interval and the verdict against a margin.
-
-    The dense policy's own is 1 without width and "non-inferior", as of `Difference`.
-    """
-
-    ratio: float
-    ci95: Interval
-    margin: float
-    verdict: Verdict
-
-    def __post_init__(self) -> None:
-        require(self.ratio > 0, "ratio", "a number above 0", self.ratio)
-        check_interval(self.ci95)
-        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
-
-    @classmethod
-    def of(cls, paired: TimeRatio) -> TimeDifference:
-        """Keep what a file holds of a comparison."""
-        return cls(paired.ratio, paired.ci, paired.margin, paired.verdict)
-
-    @property
-    def worse(self) -> bool:
-        """Whether the whole interval lies above one, wherever the margin is."""
-        return self.ci95[0] > 1
 
 
 @dataclass(frozen=True)
@@ -274,14 +213,3 @@ class ActionError:
         for name in ("mean", "max"):
             value = getattr(self, name)
             require(0 <= value < math.inf, name, "a finite number >= 0", value)
-
-
-def check_interval(interval: Interval) -> None:
-    low, high = interval
-    require(low <= high, "ci95", "low <= high", list(interval))
-
-
-def require(condition: bool, key: str, expected: str, got: Any) -> None:
-    """Raise ValueError naming the key unless the condition holds."""
-    if not condition:
-        raise ValueError(f"{key}: expected {expected}, got {got!r}")

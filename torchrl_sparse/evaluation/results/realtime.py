@@ -17,7 +17,7 @@ from torchrl_sparse.envs.seeds import Split
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
 from torchrl_sparse.evaluation.results.comparisons import surviving
-from torchrl_sparse.evaluation.results.parts import Difference, PValues, Success, TimeDifference
+from torchrl_sparse.evaluation.results.parts import PValues, Success
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -29,6 +29,7 @@ from torchrl_sparse.evaluation.results.text import (
     verdict_text,
 )
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 from torchrl_sparse.storage.json import read_json
 
 __all__ = [

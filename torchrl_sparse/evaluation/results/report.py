@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from torchrl_sparse.evaluation.results.comparisons import num_comparisons, survivors
-from torchrl_sparse.evaluation.results.parts import (
-    Difference,
-    EpisodeCost,
-    PairedEntry,
-    TimeDifference,
-)
+from torchrl_sparse.evaluation.results.parts import EpisodeCost, PairedEntry
 from torchrl_sparse.evaluation.results.schema import DENSE, MethodEntry, Results
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.evaluation.results.text import (
@@ -116,27 +111,19 @@ def _tokens_text(tokens: TokensKept) -> str:
 
 def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:
     """Return the rows of the table of a file's pairs, with times where success and time decide: column -> text."""
-    return [
-        {
-            **_success_cells((pair.method, pair.against), pair.solved, pair.judged),
-            **({} if pair.score else _pair_time_cells(pair.time)),
-        }
-        for pair in pairs
-    ]
+    return [_pair_row(pair) for pair in pairs]
 
 
-def _pair_time_cells(time: TimeDifference) -> dict[str, str]:
-    return {"time ratio": ratio_text(time), "time verdict": verdict_text(time)}
-
-
-def _success_cells(pair: Sequence[str], solved: Sequence[int], difference: Difference) -> dict[str, str]:
+def _pair_row(pair: PairedEntry) -> dict[str, str]:
+    timed = {"time ratio": ratio_text(pair.time), "time verdict": verdict_text(pair.time)}
     return {
-        "method": pair[0],
-        "against": pair[1],
-        "success": f"{solved[0]} : {solved[1]}",
-        "difference, points": difference_text(difference),
-        "verdict": verdict_text(difference),
-        "McNemar's p": p_text(difference.mcnemar_p),
+        "method": pair.method,
+        "against": pair.against,
+        "success": f"{pair.solved[0]} : {pair.solved[1]}",
+        "difference, points": difference_text(pair.judged),
+        "verdict": verdict_text(pair.judged),
+        "McNemar's p": p_text(pair.judged.mcnemar_p),
+        **({} if pair.score else timed),
     }
 
 

@@ -15,21 +15,23 @@ from torchrl_sparse.envs.seeds import Split, evaluation_seeds
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
-    Difference,
     EpisodeCost,
     Flops,
-    Interval,
     PairedEntry,
     Percentiles,
     PolicyShape,
     PValues,
     Score,
     Success,
+)
+from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
+from torchrl_sparse.evaluation.statistics.differences import (
+    Difference,
+    Interval,
     TimeDifference,
     check_interval,
     require,
 )
-from torchrl_sparse.evaluation.rollouts.episodes import TokensKept
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from torchrl_sparse.evaluation.results.parts import Difference, Interval, Success, TimeDifference
+from torchrl_sparse.evaluation.results.parts import Success
+from torchrl_sparse.evaluation.statistics.differences import Difference, Interval, TimeDifference
 
 __all__ = [
     "NONE_SOLVED",

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.tables import markdown_table
-from torchrl_sparse.storage.json import read_json, write_json
+from torchrl_sparse.storage.json import read_json
 
 __all__ = [
     "Helper",
@@ -20,7 +19,6 @@ __all__ = [
     "VLAShape",
     "format_vla_table",
     "load_vla_results",
-    "save_vla_results",
     "vla_method_rows",
     "vla_part_rows",
     "vla_product_rows",
@@ -110,11 +108,6 @@ class VLALatency:
     parts: dict[str, Part]
     methods: dict[str, VLAMethod]
     products: dict[str, Product] | None = None
-
-
-def save_vla_results(results: VLALatency, path: str | os.PathLike) -> Path:
-    """Write a ``vla_latency.json`` in one piece or not at all; return the path."""
-    return write_json(path, results)
 
 
 def load_vla_results(path: str | os.PathLike) -> VLALatency:

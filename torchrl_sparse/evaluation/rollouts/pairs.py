@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
-from torchrl_sparse.evaluation.statistics.durations import TimeRatio, restricted_times, time_ratio, time_z
+from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
+from torchrl_sparse.evaluation.statistics.durations import restricted_times, time_ratio, time_z
 from torchrl_sparse.evaluation.statistics.intervals import (
-    PairedDifference,
     discordant_pairs,
     paired_difference,
     tango_z,
@@ -43,11 +43,11 @@ class EpisodePairs:
         """Return the restricted times of both; see `restricted_times`."""
         return _times(self.method, horizon), _times(self.other, horizon)
 
-    def success_difference(self, margin: float, confidence: float = 0.95) -> PairedDifference:
+    def success_difference(self, margin: float, confidence: float = 0.95) -> Difference:
         """Compare what both solved; see `paired_difference`."""
         return paired_difference(*self.solved, margin, confidence)
 
-    def time_ratio(self, horizon: int, margin: float, confidence: float = 0.95) -> TimeRatio:
+    def time_ratio(self, horizon: int, margin: float, confidence: float = 0.95) -> TimeDifference:
         """Compare how long both took; see `torchrl_sparse.evaluation.statistics.durations.time_ratio`."""
         return time_ratio(*self.times(horizon), horizon, margin, confidence)
 

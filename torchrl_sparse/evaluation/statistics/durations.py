@@ -17,17 +17,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
-from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level, checked_pairs
+from torchrl_sparse.evaluation.statistics.differences import TimeDifference, Verdict
+from torchrl_sparse.evaluation.statistics.intervals import check_level, checked_pairs
 
 __all__ = [
     "DEFAULT_TIME_MARGIN",
-    "TimeRatio",
     "allowed_steps",
     "correlation",
     "one_seed",
@@ -40,25 +39,6 @@ __all__ = [
 
 DEFAULT_TIME_MARGIN = 0.10
 _PER_OCTAVE, _OCTAVES = 6, 5  # of the allowed times that a curve shows
-
-
-@dataclass(frozen=True)
-class TimeRatio:
-    """Restricted mean time of a method over that of the one that it is compared with, on the same seeds.
-
-    Attributes:
-        ratio: above 1 where the method is slower.
-        ci: two-sided confidence interval of ``ratio``.
-        margin: of ``verdict``: the share by which a method may be slower.
-        verdict: see :func:`time_verdict`.
-        n: pairs.
-    """
-
-    ratio: float
-    ci: tuple[float, float]
-    margin: float
-    verdict: Verdict
-    n: int
 
 
 def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: int) -> NDArray[np.float64]:
@@ -89,7 +69,7 @@ def time_ratio(
     horizon: int,
     margin: float = DEFAULT_TIME_MARGIN,
     confidence: float = 0.95,
-) -> TimeRatio:
+) -> TimeDifference:
     """Compare the restricted mean times of two methods on the same seeds.
 
     Args:
@@ -103,7 +83,7 @@ def time_ratio(
         ValueError: if the lengths differ or are zero, or a number is out of range.
 
     >>> result = time_ratio([30.0] * 500, [30.0] * 500, 400)
-    >>> result.ratio, result.verdict, [round(limit, 2) for limit in result.ci]
+    >>> result.ratio, result.verdict, [round(limit, 2) for limit in result.ci95]
     (1.0, 'non-inferior', [0.91, 1.09])
     """
     check_level(confidence)
@@ -113,7 +93,7 @@ def time_ratio(
     own = of_method + (z2 * one_seed(method, other, horizon)) ** 2
     ci = _fieller(x * x - of_other, x * y - shared, y * y - own)
     low, high = (min(max(limit, 1 / horizon), float(horizon)) for limit in ci)
-    return TimeRatio(y / x, (low, high), margin, time_verdict((low, high), margin), len(np.asarray(method)))
+    return TimeDifference(y / x, (low, high), margin, time_verdict((low, high), margin))
 
 
 def _moments(method: ArrayLike, other: ArrayLike) -> tuple[tuple[float, float], tuple[float, float, float]]:

@@ -11,18 +11,16 @@ Wald interval collapses: with n pairs and no discordant one it is ``±z²/(n + z
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import bdtr, ndtri
 
+from torchrl_sparse.evaluation.statistics.differences import Difference, Verdict
+
 __all__ = [
     "DEFAULT_MARGIN",
-    "PairedDifference",
-    "Verdict",
     "check_level",
     "checked_pairs",
     "discordant_pairs",
@@ -35,36 +33,7 @@ __all__ = [
     "wilson_interval",
 ]
 
-Verdict = Literal["non-inferior", "inferior", "undecided"]
 DEFAULT_MARGIN = 0.05
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """Success of a method minus success of the one that it is compared with, on the same seeds.
-
-    Attributes:
-        diff: difference of the two success rates, in [-1, 1]; negative where the method is worse.
-        ci: two-sided confidence interval of ``diff``.
-        margin: the non-inferiority margin of ``verdict``, a positive difference of rates.
-        verdict: see :func:`verdict`.
-        won: pairs that only the method solved.
-        lost: pairs that only the other solved.
-        n: pairs.
-    """
-
-    diff: float
-    ci: tuple[float, float]
-    margin: float
-    verdict: Verdict
-    won: int
-    lost: int
-    n: int
-
-    @property
-    def mcnemar_p(self) -> float:
-        """Exact two-sided p-value of no difference at all, whatever the margin; see the function."""
-        return mcnemar_p(self.won, self.lost)
 
 
 def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -191,7 +160,7 @@ def paired_difference(
     other: Sequence[bool],
     margin: float = DEFAULT_MARGIN,
     confidence: float = 0.95,
-) -> PairedDifference:
+) -> Difference:
     """Compare two methods on the same seeds; entry *i* of both sequences belongs to the same seed.
 
     Args:
@@ -203,12 +172,12 @@ def paired_difference(
         ValueError: if the lengths differ or are zero.
 
     >>> result = paired_difference([True, True, False, True], [True, True, True, True])
-    >>> result.diff, result.lost, result.verdict
-    (-0.25, 1, 'undecided')
+    >>> result.diff, result.mcnemar_p, result.verdict
+    (-0.25, 1.0, 'undecided')
     """
     won, lost, n = discordant_pairs(method, other)
     ci = tango_interval(won, lost, n, confidence)
-    return PairedDifference((won - lost) / n, ci, margin, verdict(ci, margin), won, lost, n)
+    return Difference((won - lost) / n, ci, margin, verdict(ci, margin), mcnemar_p(won, lost))
 
 
 def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int, int, int]:

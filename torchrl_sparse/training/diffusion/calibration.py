@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import torch
 from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
+from torchrl_sparse.envs.seeds import CALIBRATION_SEED, tuning_seeds
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
-__all__ = ["calibrate_policy"]
+__all__ = ["calibrate_policy", "lazy_calibration"]
 
 
 def calibrate_policy(
@@ -24,3 +26,10 @@ def calibrate_policy(
     encoded = policy.module["encode"](first)
     noise = policy.sample_noise(encoded[keys.SEED].squeeze(-1))
     return calibrate(policy.network, policy.sampler, noise, encoded[keys.COND])
+
+
+def lazy_calibration(
+    policy: DiffusionPolicy, make_env: Callable[..., EnvBase], samples: int
+) -> Callable[[], Calibration]:
+    """Return a function that calibrates on that many first observations when it is first called."""
+    return cache(partial(calibrate_policy, policy, make_env, tuning_seeds(CALIBRATION_SEED, samples)))

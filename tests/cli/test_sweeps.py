@@ -6,10 +6,10 @@ import pytest
 import yaml
 
 from tests.evaluation.synthetic import make_results
+from torchrl_sparse.cli.sweep_files import read_sweep, trial_command
+from torchrl_sparse.cli.sweeps import LocalSweep, Trial, merge_trials
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, evaluation_seeds
 from torchrl_sparse.evaluation.results.schema import save_results
-from torchrl_sparse.evaluation.results.sweep_files import read_sweep, trial_command
-from torchrl_sparse.evaluation.results.sweeps import LocalSweep, Trial, merge_trials
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 
 SWEEPS = sorted((Path(__file__).parents[3] / "recipes" / "sweeps").glob("*.yaml"))

@@ -243,7 +243,7 @@ def find_program(name: str) -> Path:
     >>> find_program("recipes/benchmark.py").name
     'benchmark.py'
     """
-    package = Path(__file__).parents[2]
+    package = Path(__file__).parents[1]
     # a wheel has the recipes in the package, a repository beside it
     folders = Path(), package, package.parent
     return next((folder / name for folder in folders if (folder / name).is_file()), Path(name))

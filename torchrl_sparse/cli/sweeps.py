@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_sparse.cli.sweep_files import sweep_engine, trial_command
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
-from torchrl_sparse.evaluation.results.sweep_files import sweep_engine, trial_command
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.atomic import atomic_path

@@ -1,0 +1,72 @@
+"""What is told of two methods on the same seeds, checked whenever it is made or read: a difference, or a ratio of times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+__all__ = ["Difference", "Interval", "TimeDifference", "Verdict", "check_interval", "require"]
+
+Interval = tuple[float, float]
+Verdict = Literal["non-inferior", "inferior", "undecided"]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Success or score of a method minus that of another on the same seeds, with its interval and the verdict.
+
+    The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
+    ``mcnemar_p`` is the exact two-sided p-value of no difference at all, see `torchrl_sparse.evaluation.statistics.intervals`;
+    None of dense, of scores and in older files.
+    """
+
+    diff: float
+    ci95: Interval
+    margin: float
+    verdict: Verdict
+    mcnemar_p: float | None = None
+
+    def __post_init__(self) -> None:
+        require(-1 <= self.diff <= 1, "diff", "-1 to 1", self.diff)
+        check_interval(self.ci95)
+        require(self.mcnemar_p is None or 0 <= self.mcnemar_p <= 1, "mcnemar_p", "0 to 1", self.mcnemar_p)
+        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
+
+    @property
+    def worse(self) -> bool:
+        """Whether the whole interval lies below zero, wherever the margin is."""
+        return self.ci95[1] < 0
+
+
+@dataclass(frozen=True)
+class TimeDifference:
+    """Restricted mean time of a method over that of another on the same seeds, with its interval and the verdict.
+
+    The dense policy's own is 1 without width and "non-inferior", as of `Difference`.
+    """
+
+    ratio: float
+    ci95: Interval
+    margin: float
+    verdict: Verdict
+
+    def __post_init__(self) -> None:
+        require(self.ratio > 0, "ratio", "a number above 0", self.ratio)
+        check_interval(self.ci95)
+        require(0 < self.margin < 1, "margin", "between 0 and 1", self.margin)
+
+    @property
+    def worse(self) -> bool:
+        """Whether the whole interval lies above one, wherever the margin is."""
+        return self.ci95[0] > 1
+
+
+def check_interval(interval: Interval) -> None:
+    low, high = interval
+    require(low <= high, "ci95", "low <= high", list(interval))
+
+
+def require(condition: bool, key: str, expected: str, got: Any) -> None:
+    """Raise ValueError naming the key unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{key}: expected {expected}, got {got!r}")
