@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler
 
-policy = DiffusionPolicy.from_pretrained("assets/lift")
+policy = DiffusionPolicy.from_pretrained("assets/lift").freeze()
 policy.sampler = Sampler("ddpm", 3, spacing="logsnr")
 print(policy.describe())
 

@@ -37,7 +37,7 @@ def query_seed(episode_seed: Tensor, episode_step: Tensor, stream: int = 0) -> T
     """
     # In Python's numbers: for a few rows, torch's first operation takes longer than all of this.
     begin = stream * NOISE_STREAM
-    pairs = zip(episode_seed.flatten().tolist(), episode_step.flatten().tolist(), strict=True)
+    pairs = zip(episode_seed.reshape(-1).tolist(), episode_step.reshape(-1).tolist(), strict=True)
     seeds = [_mix((seed + begin) * 1_000_003 + step) for seed, step in pairs]
     shape, kind = episode_seed.shape, {"dtype": torch.int64, "device": episode_seed.device}
     if len(seeds) == 1:  # a number is written faster than a list of one
@@ -67,7 +67,7 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
         generator.manual_seed(value)
         row[:1].normal_(generator=generator)
         row[1:].normal_(generator=generator)
-    return noise.to(seed.device)
+    return noise if seed.is_cpu else noise.to(seed.device)
 
 
 def check_whole(name: Any, tensor: Tensor) -> None:

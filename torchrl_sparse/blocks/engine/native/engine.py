@@ -163,7 +163,7 @@ class NativeEngine:
             None if a state is not finite.
         """
         state = state.contiguous()
-        cond, (rows, steps, dim) = torch.empty_like(state), state.shape
+        cond, (rows, steps, dim) = torch.empty(state.shape, dtype=state.dtype, device="cpu"), state.shape
         where = state.data_ptr(), cond.data_ptr()
         finite = loaded().sparse_normalise(byref(scales), rows * steps, dim, *where)
         return cond if finite else None
@@ -202,7 +202,7 @@ class NativeEngine:
         noise, cond, mask = noise.contiguous(), cond.contiguous(), mask.contiguous()
         rows, _, horizon, dim = noise.shape
         threads, slots = self._num_threads(rows), num_buffers(reuse, self._dense.shape[1])
-        actions = noise.new_empty(rows, horizon, dim)
+        actions = torch.empty(rows, horizon, dim, dtype=noise.dtype, device="cpu")
         tensors = (tensor.data_ptr() for tensor in (cond, actions, chunks))
         with self._scratch(packed, threads) as scratch:
             where = self._level, threads, byref(packed.model)

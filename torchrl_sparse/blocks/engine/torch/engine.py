@@ -8,6 +8,7 @@ network, observations once per query, cross-attention reads folded memory
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -28,6 +29,7 @@ from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
+from torchrl_sparse.networks.frozen import Frozen
 
 __all__ = ["TorchEngine"]
 
@@ -120,8 +122,10 @@ class TorchEngine:
         state = self._watch.state()
         known, tables, pool = self._known  # read and replaced in one go: other threads may do the same
         if known != state:
-            with _in_weights_type(self._network.pos_emb.device):
-                tables = Tables(self._network, self._sampler)
+            # Frozen tensors look at every operation: the tables are made of a copy's.
+            network = self._network if Frozen.of(self._network) is None else copy.deepcopy(self._network)
+            with _in_weights_type(network.pos_emb.device):
+                tables = Tables(network, self._sampler)
             pool = WorkspacePool(tables)
             self._known = state, tables, pool
         return tables, pool
