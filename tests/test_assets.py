@@ -20,6 +20,9 @@ from torchrl_sparse.storage.json import describe_differences
 
 ASSETS = Path(__file__).parents[1] / "assets"
 FOLDERS = sorted(path.parent for path in ASSETS.rglob("episodes"))
+CARDS = sorted(
+    {path.parent for path in ASSETS.rglob("model.safetensors")} | {ASSETS / "square" / "weaker"}
+)  # whose weights are not kept
 UNKEPT = [folder for folder in FOLDERS if not is_kept(folder)]
 SEEING = [folder for folder in FOLDERS if is_vla(policy_of(folder))]
 
@@ -34,6 +37,12 @@ def logs(folder: Path) -> dict[str, Path]:
 
 def outcomes(log: Path) -> dict[int, bool]:
     return {episode.seed: episode.success for episode in read_episodes(log)}
+
+
+@pytest.mark.parametrize("folder", CARDS, ids=name)
+def test_a_policy_has_a_short_card_and_held_out_results(folder):
+    assert (folder / "README.md").read_text(encoding="utf-8").count("\n") <= 60
+    assert load_results(folder / "results.json").split == "test"
 
 
 @pytest.mark.parametrize("folder", [path for path in FOLDERS if path not in [*SEEING, *UNKEPT]], ids=name)

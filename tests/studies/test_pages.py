@@ -63,7 +63,10 @@ def test_below_verdicts_stands_how_many_there_are_of_their_file(root):
 
 
 def test_several_files_are_one_table_or_stand_side_by_side():
-    files = "lift/development/results_development.json can/weaker/development/results_development.json can/weaker/development/results_steps.json"
+    can = "can/weaker/development"
+    files = (
+        f"lift/development/results_development.json {can}/results_development.json {can}/results_steps.json"
+    )
     heading, *rows = table(f'{files} methods="sag" tasks="Lift | Can"', ASSETS)
     assert heading[:2] == ["task", "method"]
     assert [row[:2] for row in rows] == [["Lift", "sag"], ["Can", "sag"], ["Can", "sag"]]
