@@ -43,10 +43,10 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
         ValueError: if wandb would refuse it, an entry would not be honoured, or its trials would see test seeds; the message
             names file and entry.
     """
-    config = read_yaml(path)
-    if not isinstance(config, dict):
-        raise ValueError(f"{path}: expected a wandb sweep, got {type(config).__name__}")
-    config = {"command": [*DEFAULT_COMMAND]} | config
+    written = read_yaml(path)
+    if not isinstance(written, dict):
+        raise ValueError(f"{path}: expected a wandb sweep, got {type(written).__name__}")
+    config: dict[str, Any] = {"command": [*DEFAULT_COMMAND], **written}
     _check_entries(path, config)
     _check_parameters(path, config["parameters"])
     _check_command(path, config)
