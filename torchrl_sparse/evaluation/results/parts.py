@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Latency
 from torchrl_sparse.evaluation.statistics.durations import TimeRatio
 from torchrl_sparse.evaluation.statistics.intervals import PairedDifference, Verdict, wilson_interval
@@ -284,4 +285,4 @@ def check_interval(interval: Interval) -> None:
 def require(condition: bool, key: str, expected: str, got: Any) -> None:
     """Raise ValueError naming the key unless the condition holds."""
     if not condition:
-        raise ValueError(f"{key}: expected {expected}, got {got!r}")
+        raise InputError(f"{key}: expected {expected}, got {got!r}")

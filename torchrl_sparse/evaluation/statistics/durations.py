@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.statistics.intervals import Verdict, check_level, checked_pairs
 
 __all__ = [
@@ -77,7 +78,7 @@ def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: in
     """
     for solved, steps in zip(success, length, strict=True):
         if steps > horizon or not (solved or steps == horizon):
-            raise ValueError(
+            raise InputError(
                 f"horizon: expected at most {horizon} steps of an episode, fewer only of solved ones, got {steps}"
             )
     return np.asarray(length, dtype=np.float64)
@@ -170,7 +171,7 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
     ('non-inferior', 'inferior', 'undecided')
     """
     if not 0 < margin < 1:
-        raise ValueError(f"time margin must lie strictly between 0 and 1, got {margin}")
+        raise InputError(f"time margin must lie strictly between 0 and 1, got {margin}")
     low, high = ci
     if high < 1 + margin:
         return "non-inferior"

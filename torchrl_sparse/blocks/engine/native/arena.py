@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["PANEL", "Arena", "Matrix", "pack_panels", "padded", "quantise"]
 
 PANEL, PART = 32, 256
@@ -54,7 +56,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """
     rounded = weight.to(dtype)
     if not rounded.isfinite().all():
-        raise ValueError(
+        raise InputError(
             f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
         )
     if dtype in _TOGETHER:
