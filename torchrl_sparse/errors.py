@@ -17,5 +17,6 @@ class InputError(ValueError):
 
     @property
     def entry(self) -> str:
-        entry, expected, _ = str(self).partition(": expected ")
-        return entry if expected else entry.partition(": ")[0]
+        text = str(self)
+        entry, form, _ = text.partition(": expected ")
+        return entry if form else text.partition(": ")[0]

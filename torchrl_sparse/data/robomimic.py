@@ -108,7 +108,9 @@ class Demonstrations:
             windows.append((begin[:, None] + torch.arange(horizon)).clamp(first, last))
         rows = torch.cat(windows) if windows else torch.empty(0, horizon, dtype=torch.int64)
         if not len(rows):
-            raise InputError(f"no window of horizon {horizon} fits in the {len(windows)} episodes given")
+            raise InputError(
+                f"horizon: expected one that fits in one of {len(windows)} episodes, got {horizon}"
+            )
         return rows
 
     def windows(self, rows: Tensor, n_obs_steps: int) -> TensorDict:
@@ -238,6 +240,6 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
 def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:
     if min(horizon, n_obs_steps, n_action_steps) < 1 or n_obs_steps - 1 + n_action_steps > horizon:
         raise InputError(
-            "expected n_obs_steps >= 1, n_action_steps >= 1 and n_obs_steps - 1 + n_action_steps <= horizon, "
+            "horizon: expected n_obs_steps >= 1, n_action_steps >= 1 and n_obs_steps - 1 + n_action_steps <= horizon, "
             f"got horizon={horizon}, n_obs_steps={n_obs_steps}, n_action_steps={n_action_steps}"
         )

@@ -138,6 +138,6 @@ def redundant_layers(similarity: Tensor, count: int) -> list[int]:
     mean = similarity.mean(0)
     free = len(mean) - EfficientVLAPruner._LAYER - 1
     if not 0 <= count <= free:
-        raise InputError(f"expected 0 to {free} layers to skip, got {count}")
+        raise InputError(f"skipped: expected 0 to {free} layers, got {count}")
     order = mean[-free:].argsort(descending=True, stable=True)[:count] + len(mean) - free
     return sorted(order.tolist())

@@ -204,7 +204,9 @@ class SpecPrune(TokenPruner):
         for name in ("keep_share", "wrist_share", "beta"):
             check_share(name, getattr(self.options, name))
         if not (self.options.carry or self.options.changed or self.options.local):
-            raise InputError("expected one of carry, changed and local, got none of them: nothing would stay")
+            raise InputError(
+                "SpecPrune: expected one of carry, changed and local, got none of them: nothing would stay"
+            )
         self.look_back = self.options.look_back
         past = past_frame_keys(self.look_back)
         self.in_keys = [*FRAME_KEYS, *past, keys.TOKEN_BUDGET]

@@ -57,7 +57,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.max_steps < 1 or self.batch_size < 1:
             raise InputError(
-                f"expected max_steps and batch_size >= 1, "
+                f"max_steps, batch_size: expected at least 1, "
                 f"got max_steps={self.max_steps}, batch_size={self.batch_size}"
             )
         for name in ("lr_warmup_steps", "weight_decay", "max_grad_norm"):
@@ -178,7 +178,9 @@ def split_windows(
     """
     num_val = math.ceil(val_ratio * len(demos))
     if num_val >= len(demos):
-        raise InputError(f"val_ratio {val_ratio} of {len(demos)} episodes leaves none to train on")
+        raise InputError(
+            f"val_ratio: expected one that leaves episodes to train on, got {val_ratio} of {len(demos)}"
+        )
     split = len(demos) - num_val
     held_out = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
     return demos.window_rows(*sizes, range(split)), held_out

@@ -74,7 +74,7 @@ def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path
     """
     if not len(pictures) or len(pictures) != len(labels):
         raise InputError(
-            f"expected at least one picture and a label for each, got {len(pictures)} and {len(labels)}"
+            f"pictures: expected at least one and a label for each, got {len(pictures)} and {len(labels)}"
         )
     cameras = pictures[0].shape[1] // pictures[0].shape[0]
     size = 9 / len(pictures)

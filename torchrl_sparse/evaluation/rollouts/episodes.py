@@ -103,7 +103,9 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
     """
     queries = sum(episode.queries for episode in episodes)
     if queries == 0:
-        raise InputError(f"expected at least one query of the policy, got none in {len(episodes)} episodes")
+        raise InputError(
+            f"episodes: expected at least one call of the policy, got none in {len(episodes)} episodes"
+        )
     return Totals(
         flops_per_query=sum(episode.flops_total for episode in episodes) / queries,
         prune_rate=sum(episode.prune_rate * episode.queries for episode in episodes) / queries,

@@ -113,7 +113,9 @@ def rollout_episodes(
     if len(set(seeds)) != len(seeds):
         raise InputError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
     if num_envs < 1 or (max_steps is not None and max_steps < 1):
-        raise InputError(f"expected num_envs >= 1 and max_steps >= 1 or None, got {num_envs}, {max_steps}")
+        raise InputError(
+            f"num_envs, max_steps: expected at least 1, or no max_steps, got {num_envs}, {max_steps}"
+        )
     runtime = backend_runtime(backend, workers)
     log = None
     finished: dict[int, EpisodeResult] = {}

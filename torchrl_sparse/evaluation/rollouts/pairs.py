@@ -125,5 +125,5 @@ def _scores(episodes: Sequence[EpisodeResult]) -> NDArray[np.float64]:
 def _by_seed(episodes: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
     by_seed = {episode.seed: episode for episode in episodes}
     if len(by_seed) != len(episodes):
-        raise InputError(f"expected one episode per seed, got {len(episodes)} for {len(by_seed)} seeds")
+        raise InputError(f"episodes: expected one per seed, got {len(episodes)} for {len(by_seed)} seeds")
     return by_seed

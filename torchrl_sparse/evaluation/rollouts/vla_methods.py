@@ -76,7 +76,7 @@ def matching_share(
     low, high = most * 2.0**-_HALVINGS, most
     if (least := keeps(low)) > kept:
         raise InputError(
-            f"expected a pruner that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
+            f"pruner: expected one that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
         )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2

@@ -171,7 +171,7 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
     ('non-inferior', 'inferior', 'undecided')
     """
     if not 0 < margin < 1:
-        raise InputError(f"time margin must lie strictly between 0 and 1, got {margin}")
+        raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     low, high = ci
     if high < 1 + margin:
         return "non-inferior"

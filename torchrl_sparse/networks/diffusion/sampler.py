@@ -266,7 +266,7 @@ class Sampler:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
         if noise_k is None and self.coefficients.reads_noise(k):
             raise InputError(
-                f"{self.name} step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None"
+                f"noise_k: expected noise for step k={k} of {self.name} (timestep {int(self.timesteps[k])}), got None"
             )
         if len(cleans) < (needed := min(k, self.coefficients.history)):
             raise InputError(

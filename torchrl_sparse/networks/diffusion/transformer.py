@@ -45,7 +45,7 @@ class SinusoidalPosEmb(nn.Module):
     def __init__(self, dim: int) -> None:
         super().__init__()
         if dim < 4 or dim % 2:
-            raise InputError(f"dim must be an even number of at least 4, got {dim}")
+            raise InputError(f"dim: expected an even number of at least 4, got {dim}")
         self.dim = dim
 
     def forward(self, timestep: Tensor) -> Tensor:
@@ -196,7 +196,7 @@ class TransformerForDiffusion(nn.Module):
         timestep = torch.as_tensor(timestep, device=cond.device)
         if timestep.shape not in ((), (1,), (cond.shape[0],)):
             raise InputError(
-                f"timestep must be a number or have shape [{cond.shape[0]}], got {list(timestep.shape)}"
+                f"timestep: expected a number or shape [{cond.shape[0]}], got {list(timestep.shape)}"
             )
         time_token = self.time_emb(timestep.expand(cond.shape[0])).to(cond.dtype)[:, None]
         tokens = torch.cat((time_token, self.cond_obs_emb(cond)), dim=1)
@@ -254,7 +254,7 @@ class TransformerForDiffusion(nn.Module):
     def _check(name: str, value: Tensor, trailing: tuple[int, int]) -> None:
         if value.ndim != 3 or tuple(value.shape[1:]) != trailing:
             raise InputError(
-                f"{name} must have shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
+                f"{name}: expected shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
             )
 
 
@@ -278,6 +278,4 @@ def _check_config(config: dict) -> None:
     if not isinstance(config["causal_attn"], bool):
         raise InputError(f"causal_attn: expected true or false, got {config['causal_attn']!r}")
     if config["n_emb"] % config["n_head"]:
-        raise InputError(
-            f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"
-        )
+        raise InputError(f"n_emb: expected a multiple of n_head={config['n_head']}, got {config['n_emb']}")

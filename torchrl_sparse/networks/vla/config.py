@@ -120,7 +120,7 @@ class VLAConfig:
             )
         if min(self.dino.layers, self.siglip.layers) < 2:
             raise InputError(
-                f"expected towers of at least 2 layers, got dino {self.dino.layers}, siglip {self.siglip.layers}"
+                f"dino, siglip: expected towers of at least 2 layers, got {self.dino.layers} and {self.siglip.layers}"
             )
         if self.dino.mlp % self.dino.dim:
             raise InputError(

@@ -45,7 +45,7 @@ class GroundingConfig:
     def __post_init__(self) -> None:
         if min(self.locate_steps, self.refer_steps) < 0:
             raise InputError(
-                f"expected locate_steps >= 0 and refer_steps >= 0, got {self.locate_steps} and {self.refer_steps}"
+                f"locate_steps, refer_steps: expected at least 0, got {self.locate_steps} and {self.refer_steps}"
             )
 
 
