@@ -31,6 +31,7 @@ from torchrl_sparse.data.instructions import read_instructions
 from torchrl_sparse.envs.instructed import instructed_env
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget, fewest_tokens, numbered_pruner
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -50,7 +51,7 @@ Pruners = dict[float, TokenPruner]
 def main(config: DictConfig) -> None:
     measures = {"action_error": errors, "success": lost_episodes}
     if config.measure not in measures:
-        raise ValueError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
+        raise InputError(f"measure: expected one of {', '.join(measures)}, got {config.measure!r}")
     tried = pruners(config)  # first, since what it refuses need not be recorded
     policy = load_vla(config, config.task).to(config.device)
     points = tuple(measures[config.measure](policy, tried, config))

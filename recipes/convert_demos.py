@@ -21,6 +21,7 @@ from torchrl_sparse.data.absolute import convert_demos
 from torchrl_sparse.data.hdf5_reader import demo_group, open_demos
 from torchrl_sparse.data.pusht_human import convert_pusht
 from torchrl_sparse.data.rendering import render_demos
+from torchrl_sparse.errors import InputError
 
 
 @recipe("convert_demos", out="file")
@@ -29,7 +30,7 @@ def main(config: DictConfig) -> None:
     kind, cameras = config.format or find_format(demos), list(config.cameras)
     check_read(config, kind)
     if demos.resolve() == out.resolve():
-        raise ValueError(f"out: expected another file than the demonstrations, got {out}")
+        raise InputError(f"out: expected another file than the demonstrations, got {out}")
     if not cameras:
         print(f"{out}: {convert(kind, demos, out, config.poses)}")
     elif config.format is None and not config.poses and is_ours(demos):
@@ -57,9 +58,9 @@ def is_ours(demos: Path) -> bool:
 def check_read(config: DictConfig, kind: str) -> None:
     """Refuse options that nothing would read, before anything is written."""
     if kind == "pusht" and config.cameras:
-        raise ValueError(f"cameras: expected [] of Push-T, which is not rendered, got {list(config.cameras)}")
+        raise InputError(f"cameras: expected [] of Push-T, which is not rendered, got {list(config.cameras)}")
     if kind == "pusht" and config.poses:
-        raise ValueError("poses: expected false of Push-T, whose actions are positions, got true")
+        raise InputError("poses: expected false of Push-T, whose actions are positions, got true")
 
 
 def convert(kind: str, demos: Path, out: Path, poses: bool) -> str:

@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.cli.recipe import recipe, refuse_unread
 from torchrl_sparse.cli.vla import is_vla, load_vla
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.engine_times import measure_engines
 from torchrl_sparse.evaluation.benchmarks.policy_call import measure_call
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla, token_pruners
@@ -46,7 +47,7 @@ def main(config: DictConfig) -> None:
     if config.shape is not None:
         refuse_unread(config, ("policy", *_FILES), __file__, "beside a shape")
         if config.shape not in shapes:
-            raise ValueError(f"shape: expected one of {', '.join(shapes)}, got {config.shape!r}")
+            raise InputError(f"shape: expected one of {', '.join(shapes)}, got {config.shape!r}")
     if config.shape in vla_cases.SHAPES or (config.shape is None and is_vla(config.policy)):
         profile_vla(config)
     else:

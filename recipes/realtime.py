@@ -20,6 +20,7 @@ from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.contract import policy_contract
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.benchmark import BenchmarkOptions
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.benchmarks.late import RealtimeBenchmark
@@ -40,7 +41,7 @@ def main(config: DictConfig) -> None:
     policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device).freeze()
     seen = policy_contract(task.name, policy).state_keys
     if seen != task.state_keys:  # from which the pose to hold is read
-        raise ValueError(
+        raise InputError(
             f"policy: expected one that observes {', '.join(task.state_keys)}, got one of {', '.join(seen)}"
         )
     model = state_model(config, task, policy)
@@ -60,7 +61,7 @@ def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy
     if not any(MethodName.parse(name).ahead for name in config.methods):
         return None
     if config.demos is None:
-        raise ValueError("demos: expected demonstrations to fit the _ahead methods' model to, got null")
+        raise InputError("demos: expected demonstrations to fit the _ahead methods' model to, got null")
     demos, steps = policy_demos(config.demos, task.name, policy), 3
     model, error = fit_state_model(demos, steps)
     print(

@@ -21,6 +21,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_sparse.cli.recipe import recipe
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.html_report import write_report
 from torchrl_sparse.evaluation.figures.tokens import plot_token_budgets
 from torchrl_sparse.evaluation.results.aggregate import aggregate_results, aggregate_rows
@@ -33,7 +34,7 @@ from torchrl_sparse.storage.json import write_json
 def main(config: DictConfig) -> None:
     asked = [name for name in ("aggregate", "budgets") if config[name]]
     if len(asked) > 1:
-        raise ValueError(f"{asked[1]}: expected [] with {asked[0]}, got {list(config[asked[1]])}")
+        raise InputError(f"{asked[1]}: expected [] with {asked[0]}, got {list(config[asked[1]])}")
     if config.aggregate:
         results = aggregate_results(config.aggregate)
         write_json(config.out, results)

@@ -27,6 +27,7 @@ from torchrl_sparse.cli.sweeps import (
     write_trials,
 )
 from torchrl_sparse.cli.trials import check_served, check_trials
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.pareto import plot_pareto
 from torchrl_sparse.evaluation.results.report import format_table
 from torchrl_sparse.evaluation.results.schema import save_results
@@ -81,7 +82,7 @@ def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
         )
     note = read_json(path, ServedSweep)
     if differing := describe_differences(note.made_for, made_for):
-        raise ValueError(f"out: {path} is of another sweep: {differing}; choose another out or move it away")
+        raise InputError(f"out: {path} is of another sweep: {differing}; choose another out or move it away")
     wandb.agent(note.sweep_id, entity=sweep.get("entity"), project=config.project, count=config.count)
 
 

@@ -23,6 +23,7 @@ from torchrl_sparse.data.images import chosen_cameras
 from torchrl_sparse.envs.contract import policy_contract, task_contract
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.training.demonstrations import TrainConfig
 from torchrl_sparse.training.diffusion.begun import continued_policy
 from torchrl_sparse.training.diffusion.published import executed_steps, with_published
@@ -52,7 +53,7 @@ def make_trainer(config: DictConfig) -> PolicyTrainer:
         asked = {"state_mode": config.state_normalization, **config.vision}
         begun = continued_policy(config.init, task.name, cameras, config.network, **asked)
     if not cameras and (seen := given(config.vision)):
-        raise ValueError(f"vision: expected null without cameras, got {seen}")
+        raise InputError(f"vision: expected null without cameras, got {seen}")
     source, train = begun.source if begun else {}, config.train
     train.n_action_steps = executed_steps(task.name, source, train.n_action_steps)
     config.train = with_published(task.name, train)

@@ -22,6 +22,7 @@ from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.contract import policy_contract, provenance
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
@@ -41,7 +42,7 @@ def main(config: DictConfig) -> None:
     out, settings = Path(config.out), OmegaConf.to_container(config, resolve=True)
     masks = [CacheSchedule.from_pretrained(path).mask() for path in initial_schedules(config)]
     if config.spread and (masks or config.method == "l2c"):
-        raise ValueError(f"spread: expected null with an init or with method=l2c, got {config.spread}")
+        raise InputError(f"spread: expected null with an init or with method=l2c, got {config.spread}")
     trainer = make_trainer(config)
     if not (out / CHECKPOINT).exists():
         begin(trainer, masks, config)
@@ -91,7 +92,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
         targets = make_targets(policy, demos, **config.targets, on_progress=show)
     if config.rollouts:
         if (source := config.targets.source) != "teacher":
-            raise ValueError(f"targets.source: expected 'teacher' with rollouts, got {source!r}")
+            raise InputError(f"targets.source: expected 'teacher' with rollouts, got {source!r}")
         queries = closed_loop_queries(policy, config.task, config.rollouts, *initial_schedules(config)[:1])
         with progress("targets", "query") as show:
             targets = add_queries(policy, targets, queries, seed=config.targets.seed, on_progress=show)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.refusals import refused
 from torchrl_sparse.rotations import (
     absolute_to_pose,
     downward_quaternion,
@@ -36,7 +37,7 @@ def test_any_two_independent_rows_become_a_rotation():
 
 @pytest.mark.parametrize("rot6d", [np.zeros(6), np.array([1.0, 0, 0, 2, 0, 0]), np.full(6, 1e300)])
 def test_rows_that_fix_no_rotation_are_refused(rot6d):
-    with pytest.raises(ValueError, match="parallel, zero or beyond"):
+    with refused("rot6d"):
         rot6d_to_matrix(rot6d)
 
 
@@ -44,7 +45,7 @@ def test_rows_that_fix_no_rotation_are_refused(rot6d):
 def test_rotation_vectors_of_no_angle_are_refused(angle):
     pose = np.zeros((2, 7))
     pose[1, 4] = angle
-    with pytest.raises(ValueError, match="rotation vector: expected at most 100 rad, got"):
+    with refused("rotation vector"):
         pose_to_absolute(pose)
 
 
@@ -64,7 +65,7 @@ def test_actions_of_two_arms_round_trip():
 
 
 def test_action_of_a_wrong_size_is_named():
-    with pytest.raises(ValueError, match="expected 10 numbers per arm, got a last axis of 7"):
+    with refused("action"):
         absolute_to_pose(np.zeros(7))
 
 

@@ -20,6 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
@@ -116,7 +117,7 @@ def dense(tensordict: TensorDictBase, module: TensorDictModuleBase) -> TensorDic
 def refuse(key: NestedKey, lost: Tensor) -> None:
     """Raise ValueError if the rows ``lost``, bool [*B, 1], are any: the environment dropped ``key``."""
     if lost.any():
-        raise ValueError(
+        raise InputError(
             f"{key}: expected what the step before left, since 'is_init' is False, got none in {int(lost.sum())} of "
             f"{lost.numel()} rows: the environment drops it; wrap it, TransformedEnv(env, actor.make_tensordict_primer()), "
             "or have the collector do so, auto_register_policy_transforms=True"

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from torchrl_sparse.errors import InputError
+
 POSE_DIM = 7
 """Position (3), rotation vector (3) and gripper (1) of one arm, as robosuite's absolute controller takes them."""
 
@@ -29,7 +31,7 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
         ValueError: if the last axis is not 6, or the two rows are parallel, zero or beyond measure.
     """
     if rot6d.shape[-1] != 6:
-        raise ValueError(f"rot6d: expected a last axis of 6, got shape {tuple(rot6d.shape)}")
+        raise InputError(f"rot6d: expected a last axis of 6, got shape {tuple(rot6d.shape)}")
     first, second = rot6d[..., :3], rot6d[..., 3:]
     row0 = _unit(first)
     row1 = _unit(second - (row0 * second).sum(-1, keepdims=True) * row0)
@@ -59,7 +61,7 @@ def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
     array([1., 0., 0., 0., 1., 0.])
     """
     if rotvec.size and not (longest := np.abs(rotvec).max()) <= _MAX_ANGLE:
-        raise ValueError(f"rotation vector: expected at most {_MAX_ANGLE} rad, got {longest:g}")
+        raise InputError(f"rotation vector: expected at most {_MAX_ANGLE} rad, got {longest:g}")
     matrix = Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_matrix()
     return matrix_to_rot6d(matrix.reshape(*rotvec.shape[:-1], 3, 3))
 
@@ -105,12 +107,12 @@ def downward_quaternion(quat: np.ndarray) -> np.ndarray:
 
 def _split_arms(flat: np.ndarray, dim: int) -> np.ndarray:
     if flat.shape[-1] == 0 or flat.shape[-1] % dim:
-        raise ValueError(f"action: expected {dim} numbers per arm, got a last axis of {flat.shape[-1]}")
+        raise InputError(f"action: expected {dim} numbers per arm, got a last axis of {flat.shape[-1]}")
     return flat.reshape(*flat.shape[:-1], flat.shape[-1] // dim, dim)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(vector, axis=-1, keepdims=True)
     if not ((norm >= 1e-6) & np.isfinite(norm)).all():
-        raise ValueError("rot6d: its two rows are parallel, zero or beyond measure, so they fix no rotation")
+        raise InputError("rot6d: its two rows are parallel, zero or beyond measure, so they fix no rotation")
     return vector / norm

@@ -3,6 +3,7 @@ from itertools import combinations
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.blocks.bac import (
     BAC,
     SCHEDULES,
@@ -106,9 +107,7 @@ def test_schedules_differ_in_value_so_that_acs_is_not_decided_by_ties_alone():
     similarity = random_similarity(10, seed=3)
     for value in (anchored, consecutive):
         assert len({round(value(similarity, updates), 9) for updates in candidates(10, 4)}) == 84
-    with pytest.raises(
-        ValueError, match='objective: expected "anchor" or "consecutive", got \'telescoping\''
-    ):
+    with refused("objective"):
         acs(similarity, 4, "telescoping")
 
 
@@ -123,15 +122,15 @@ def test_acs_finds_the_phases_of_a_block():
 @pytest.mark.parametrize(
     ("similarity", "num_updates", "message"),
     [
-        (torch.ones(4, 5), 2, r"similarity: expected a square matrix \[K, K\], got shape \[4, 5\]"),
-        (torch.ones(3, 4, 4), 2, r"expected a square matrix \[K, K\], got shape \[3, 4, 4\]"),
-        (torch.full((4, 4), torch.nan), 2, "similarity: expected finite values"),
-        (torch.ones(4, 4), 0, r"num_updates: expected 1\.\.4 \(K\), got 0"),
-        (torch.ones(4, 4), 5, r"num_updates: expected 1\.\.4 \(K\), got 5"),
+        (torch.ones(4, 5), 2, "similarity"),
+        (torch.ones(3, 4, 4), 2, "similarity"),
+        (torch.full((4, 4), torch.nan), 2, "similarity"),
+        (torch.ones(4, 4), 0, "num_updates"),
+        (torch.ones(4, 4), 5, "num_updates"),
     ],
 )
 def test_acs_refuses_wrong_input(similarity, num_updates, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         acs(similarity, num_updates)
 
 
@@ -182,14 +181,14 @@ def test_upstream_blocks_are_the_highest_scores_and_the_shallower_of_equals():
 @pytest.mark.parametrize(
     ("errors", "top_k", "message"),
     [
-        ([1.0, 2.0], 1, "errors: expected one score per schedule .*got 2 for 3"),
-        ([1.0, float("nan"), 2.0], 1, "errors: expected finite scores"),
-        ([1.0, 2.0, 3.0], 4, r"top_k: expected 0\.\.3 .*got 4"),
-        ([1.0, 2.0, 3.0], -1, r"top_k: expected 0\.\.3 .*got -1"),
+        ([1.0, 2.0], 1, "errors"),
+        ([1.0, float("nan"), 2.0], 1, "errors"),
+        ([1.0, 2.0, 3.0], 4, "top_k"),
+        ([1.0, 2.0, 3.0], -1, "top_k"),
     ],
 )
 def test_bua_is_never_skipped_silently(errors, top_k, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         bubbling_union([[0], [0], [0]], errors, top_k)
 
 
@@ -248,5 +247,5 @@ def test_fewer_updates_prune_more():
 
 def test_a_schedule_of_another_method_is_refused():
     uniform = CacheSchedule("uniform", "p", 4, 1, ((0, 2),) * 3)
-    with pytest.raises(ValueError, match=r"BAC: expected a schedule of \['bac', .*got one of 'uniform'"):
+    with refused("BAC"):
         BAC(uniform)

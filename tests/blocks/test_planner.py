@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner, tensors_fingerprint
 from torchrl_sparse.keys import COND, PRUNE_MASK
@@ -76,9 +77,7 @@ def test_keys_are_declared():
 def test_a_reuse_that_is_no_rule_is_refused():
     planner = RestAtRest(1.0)
     planner.reuse = "types"
-    with pytest.raises(
-        ValueError, match=r"reuse: expected one of \['block', 'type', 'single'\], got 'types'"
-    ):
+    with refused("reuse"):
         planner.bind(SPEC)
 
 
@@ -95,16 +94,16 @@ def test_dense_prunes_nothing_and_its_rows_can_be_written_one_by_one():
 @pytest.mark.parametrize(
     ("masks", "message"),
     [
-        (torch.zeros(3, NUM_STEPS, 6), r"Returns\.masks: .*expected .*torch\.bool, got dtype torch\.float32"),
-        (torch.zeros(1, NUM_STEPS, 6, dtype=torch.bool), r"expected shape \[3, 10, 6\].*got \[1, 10, 6\]"),
-        (torch.zeros(3, NUM_STEPS, 24, dtype=torch.bool), r"expected shape \[3, 10, 6\].*got \[3, 10, 24\]"),
-        (None, "got NoneType"),
+        (torch.zeros(3, NUM_STEPS, 6), "Returns.masks: prune mask"),
+        (torch.zeros(1, NUM_STEPS, 6, dtype=torch.bool), "Returns.masks: prune mask"),
+        (torch.zeros(3, NUM_STEPS, 24, dtype=torch.bool), "Returns.masks: prune mask"),
+        (None, "Returns.masks: prune mask"),
     ],
 )
 def test_what_a_planner_returns_is_checked(masks, message):
     planner = Returns(masks)
     planner.bind(SPEC)
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         planner(observations(3))
 
 
@@ -118,7 +117,7 @@ def test_a_static_mask_is_checked_when_bound_and_a_failure_leaves_the_planner_as
     before = planner(observations(2))[PRUNE_MASK]
 
     planner.mask = lambda spec: torch.ones(spec.num_inference_steps, spec.num_blocks, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"FirstRow\.mask: .*row 0 .* to prune nothing"):
+    with refused("FirstRow.mask: prune mask"):
         planner.bind(SPEC)
     assert planner.spec.num_inference_steps == 20
     assert torch.equal(planner(observations(2))[PRUNE_MASK], before)

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from tests.recipe_modules import RECIPES, load_recipe, run
+from tests.refusals import refused
 from torchrl_sparse.runtime.lock import lock_output
 
 
@@ -158,7 +159,7 @@ def test_a_sweep_on_a_server_is_taken_up_by_itself_alone(fail, monkeypatch, tmp_
 def test_the_whole_traceback_can_be_had(monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["benchmark.py", "margin=2"])
-    with pytest.raises(ValueError, match="margin: expected less than 1, got 2"):
+    with refused("margin"):
         load_recipe("benchmark").main()
 
 

@@ -6,13 +6,14 @@ import pytest
 import yaml
 
 from tests.evaluation.synthetic import make_results
+from tests.refusals import refused
 from torchrl_sparse.cli.sweep_files import read_sweep, trial_command
 from torchrl_sparse.cli.sweeps import LocalSweep, Trial, merge_trials
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, evaluation_seeds
 from torchrl_sparse.evaluation.results.schema import save_results
 from torchrl_sparse.evaluation.results.tracking import trial_metrics
 
-SWEEPS = sorted((Path(__file__).parents[3] / "recipes" / "sweeps").glob("*.yaml"))
+SWEEPS = sorted((Path(__file__).parents[2] / "recipes" / "sweeps").glob("*.yaml"))
 BAYES = {
     "program": "trial.py",
     "method": "bayes",
@@ -50,7 +51,7 @@ def test_a_search_learns_from_finished_trials_and_stops_at_its_count(tmp_path):
         assert 2 <= trial.parameters["num_updates"] <= 50
         finish(sweep, trial)
     assert len(LocalSweep(BAYES, tmp_path, count=3).trials) == 3
-    with pytest.raises(ValueError, match="count: expected a number of trials for method 'bayes'"):
+    with refused("count"):
         LocalSweep(BAYES, tmp_path)
 
 
@@ -58,7 +59,7 @@ def test_a_trial_is_on_disk_before_it_runs_and_runs_again_after_a_kill(tmp_path)
     trial = LocalSweep(BAYES, tmp_path, count=2).next_trial()
     again = LocalSweep(BAYES, tmp_path, count=2)
     assert again.next_trial() == trial
-    with pytest.raises(FileNotFoundError, match=r"trial num_updates=\d+: expected .*results.json, got none"):
+    with refused("trial num_updates=40", FileNotFoundError):
         again.finish(trial)
 
 
@@ -70,22 +71,20 @@ def test_another_sweep_in_the_folder_is_refused_once_a_trial_of_it_is_through(tm
     other.results_file(trial).parent.mkdir()
     other.results_file(trial).touch()
     other.finish(trial)
-    with pytest.raises(
-        ValueError, match=r"sweep.json: holds another sweep: method is 'bayes' here and 'random'"
-    ):
+    with refused("sweep.json"):
         LocalSweep(BAYES, tmp_path, count=2)
 
 
 def test_what_wandb_would_refuse_is_named(tmp_path):
-    for change, fault in (
-        ({"method": "guess"}, "method: expected one of grid, random, bayes, got 'guess'"),
-        ({"program": 3}, "program: expected a str, got 3"),
-        ({"parameters": [1]}, r"parameters: expected a dict, got \[1\]"),
-        ({"command": None}, "command: expected a list, got None"),
-        ({"parameters": {"n": {"value": 1, "values": [1]}}}, "expected a wandb sweep, got .*"),
+    for change, entry in (
+        ({"method": "guess"}, "bad.yaml: method"),
+        ({"program": 3}, "bad.yaml: program"),
+        ({"parameters": [1]}, "bad.yaml: parameters"),
+        ({"command": None}, "bad.yaml: command"),
+        ({"parameters": {"n": {"value": 1, "values": [1]}}}, "bad.yaml"),
     ):
         (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, **change}))
-        with pytest.raises(ValueError, match=f"bad.yaml: {fault}$"):
+        with refused(entry):
             read_sweep(tmp_path / "bad.yaml")
 
 
@@ -99,7 +98,7 @@ def test_what_wandb_would_refuse_is_named(tmp_path):
 )
 def test_a_sweep_on_test_seeds_is_refused(tmp_path, change):
     (tmp_path / "bad.yaml").write_text(yaml.safe_dump({**BAYES, **change}))
-    with pytest.raises(ValueError, match=r"bad.yaml: split: expected development, got test"):
+    with refused("bad.yaml: split"):
         read_sweep(tmp_path / "bad.yaml")
 
 
@@ -125,5 +124,5 @@ def test_trials_go_by_what_they_tested_or_else_by_their_parameters():
 
 
 def test_nothing_finished_cannot_be_merged():
-    with pytest.raises(ValueError, match="trials: expected at least one finished"):
+    with refused("trials"):
         merge_trials([])

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.collectors import Collector
 
+from tests.refusals import refused
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys, make_env
 from torchrl_sparse.control.realtime_executor import HoldPose, RealtimeExecutor, delay_steps
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
@@ -117,7 +118,7 @@ def test_a_gate_is_not_heard_while_an_answer_is_awaited():
 
 @pytest.mark.parametrize("latency", [-0.1, float("nan"), float("inf")])
 def test_a_bad_latency_is_named(latency):
-    with pytest.raises(ValueError, match="latency: expected None or seconds >= 0"):
+    with refused("latency"):
         RealtimeExecutor(ClockPolicy(), HOLD, latency=latency)
 
 

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.control.realtime_executor import RealtimeExecutor
@@ -93,9 +94,9 @@ def test_losses_are_the_sums_that_the_paper_writes():
 
 
 def test_numbers_out_of_range_are_named():
-    with pytest.raises(ValueError, match="num_samples: expected 1, or more with a selector, got 4"):
+    with refused("num_samples"):
         ChunkExecutor(Drawing(), num_samples=4)
-    with pytest.raises(ValueError, match="num_samples: expected 1, or more with a selector, got 1"):
+    with refused("num_samples"):
         ChunkExecutor(Drawing(), selector=CoherentChunk())
-    with pytest.raises(ValueError, match=r"decay: expected a number in \(0, 1\], got 0"):
+    with refused("decay"):
         CoherentChunk(decay=0)

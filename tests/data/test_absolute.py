@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.data.published_demos import env_args_14, env_args_15, record, write
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.data import absolute
 from torchrl_sparse.data.absolute import AbsoluteActions, convert_demos
@@ -62,8 +63,8 @@ def replay(path, task):
 
 
 def test_deltas_are_not_read_as_poses(published):
-    message = r"low_dim_v15\.hdf5: expected absolute poses, got deltas, as its controller says; recipes/convert_demos"
-    with pytest.raises(ValueError, match=message):
+    message = "low_dim_v15.hdf5"
+    with refused(message):
         read_demos(published, ["robot0_eef_pos"])
 
 
@@ -130,9 +131,7 @@ def test_files_with_poses_keep_them(lifts, converted, tmp_path):
         poses = [file[f"data/demo_{i}/actions"][()] for i in range(2)]
     demos = [lift | {"actions": pose} for lift, pose in zip(lifts, poses, strict=True)]
     path = write(tmp_path / "low_dim_abs.hdf5", demos, env_args_14(LIFT))
-    with pytest.raises(
-        ValueError, match=r"demo_0: actions: expected deltas, .* got absolute poses; poses=true"
-    ):
+    with refused("low_dim_abs.hdf5, demo_0: actions"):
         convert_demos(path, tmp_path / "again.h5")
     convert_demos(path, tmp_path / "again.h5", poses=True)
     with h5py.File(tmp_path / "again.h5") as file:
@@ -182,9 +181,7 @@ def test_a_finished_file_is_reported_and_never_mixed(published, converted, tmp_p
     assert convert_demos(published, converted) == 2
     other = tmp_path / "other.hdf5"
     other.write_bytes(published.read_bytes())
-    with pytest.raises(
-        ValueError, match=r"lift\.h5: made with .*source is 'other\.hdf5' here and 'low_dim_v15\.hdf5' there"
-    ):
+    with refused("lift.h5"):
         convert_demos(other, converted)
 
 
@@ -216,21 +213,24 @@ def sawyer():
     [
         (
             shift_hand,
-            r"demo_1, obs/robot0_eef_pos: expected the hand where the states put it, got 0\.0200 m off",
+            "changed.hdf5, demo_1, obs/robot0_eef_pos",
         ),
-        (shorten_states, "demo_1: expected 32 numbers of a state and 7 of an action of Lift, got 31 and 7"),
+        (shorten_states, "changed.hdf5, demo_1"),
         (
             lambda file: file["data"].attrs.pop("env_args"),
-            "expected an attribute env_args of 'data', .* got none",
+            "changed.hdf5",
         ),
-        (set_env_args("{"), "env_args: expected robomimic's description"),
-        (set_env_args(env_args_15(LIFT, type="JOINT_VELOCITY")), "JOINT_VELOCITY"),
-        (set_env_args(env_args_15(LIFT, frame="base", input_type="absolute")), "frame of the robot's base"),
+        (set_env_args("{"), "changed.hdf5, env_args"),
+        (set_env_args(env_args_15(LIFT, type="JOINT_VELOCITY")), "controller_configs.body_parts.right.type"),
+        (
+            set_env_args(env_args_15(LIFT, frame="base", input_type="absolute")),
+            "env_args.env_kwargs.controller_configs",
+        ),
         (
             set_env_args(env_args_14(LIFT, impedance_mode="variable")),
-            "impedance_mode: expected 'fixed', got 'variable'",
+            "env_kwargs.controller_configs.impedance_mode",
         ),
-        (set_env_args(sawyer()), "robots: expected 1 times Panda, got 'Sawyer'"),
+        (set_env_args(sawyer()), "changed.hdf5, env_args.env_kwargs.robots"),
     ],
 )
 def test_what_cannot_be_converted_is_named_and_leaves_no_file(published, tmp_path, change, message):
@@ -238,7 +238,7 @@ def test_what_cannot_be_converted_is_named_and_leaves_no_file(published, tmp_pat
     path.write_bytes(published.read_bytes())
     with h5py.File(path, "r+") as file:
         change(file)
-    with pytest.raises(ValueError, match=message) as error:
+    with refused(message) as error:
         convert_demos(path, tmp_path / "out.h5")
     assert str(error.value).startswith(str(path))
     assert not (tmp_path / "out.h5").exists()
@@ -253,7 +253,7 @@ def test_a_damaged_picture_is_copied_as_it_is_and_named_by_the_reader(published,
         raw.seek(chunk.byte_offset)
         raw.write(b"\xff" * chunk.size)
     convert_demos(path, out)
-    with pytest.raises(ValueError, match=r"out\.h5, demo_1, obs/agentview_image: cannot be read"):
+    with refused("out.h5, demo_1, obs/agentview_image"):
         read_demos(
             out, LIFT.state_keys, cameras={"image": "agentview_image"}, image_folder=tmp_path / "images"
         )

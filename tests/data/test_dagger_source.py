@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from tests.data.test_dagger import driving  # noqa: F401  a fixture
 from tests.policies.diffusion.conftest import make_image_policy  # noqa: F401  a fixture
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy
 from torchrl_sparse.data.dagger import load_driver
 from torchrl_sparse.data.demonstrate import demonstrate
@@ -43,5 +43,5 @@ def test_a_policy_of_another_convention_drives_as_it_would_in_its_own_environmen
 def test_a_policy_with_cameras_cannot_drive(driving, monkeypatch, make_image_policy):  # noqa: F811
     seeing = make_image_policy()
     monkeypatch.setattr(DiffusionPolicy, "from_pretrained", lambda path: seeing)
-    with pytest.raises(ValueError, match="policy: expected one that observes states, got one with cameras"):
+    with refused("policy"):
         load_driver("Lift", replace(driving, fingerprint=seeing.fingerprint))

@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.data.hdf5_reader import demo_names, open_demos
 from torchrl_sparse.data.hdf5_writer import lay_out
 
@@ -55,14 +56,14 @@ def test_of_an_index_at_the_end_nothing_is_left(tmp_path):
             fill(file.create_group(f"data/{name}"), number)
         file["data"].attrs["env_args"] = "as published, written last" * 100
     path.write_bytes(path.read_bytes()[: end_of(path, "demo_5")])
-    with pytest.raises(ValueError, match="; its index of demonstrations is lost"), open_demos(path):
+    with refused("demos.h5"), open_demos(path):
         pass
 
 
 @pytest.mark.parametrize("text", [b"", b"not HDF5 at all"])
 def test_what_is_no_hdf5_file(path, text):
     path.write_bytes(text)
-    with pytest.raises(ValueError, match=r"demos\.h5: expected a complete HDF5 file"), open_demos(path):
+    with refused("demos.h5"), open_demos(path):
         pass
 
 
@@ -71,9 +72,9 @@ def test_filter_keys(path):
         assert demo_names(file) == DEMOS
         assert demo_names(file, "train") == ["demo_2", "demo_10"]
         for key, message in (
-            ("valid", "expected a filter key mask/valid, got empty, gone, train"),
-            ("gone", "mask/gone: expected demonstrations of the file, got demo_99"),
-            ("empty", "mask/empty: expected at least one demonstration, got none"),
+            ("valid", "demos.h5"),
+            ("gone", "demos.h5, mask/gone"),
+            ("empty", "demos.h5, mask/empty"),
         ):
-            with pytest.raises(ValueError, match=rf"demos\.h5.*{message}"):
+            with refused(message):
                 demo_names(file, key)

@@ -12,6 +12,7 @@ import torch
 
 from tests.data.big_files import write_big
 from tests.fixtures.demonstrations import describe
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import read_demos
 
@@ -75,11 +76,9 @@ def test_a_later_file_with_other_images_or_none_is_named_and_nothing_is_written(
     with h5py.File(without, "r+") as file:
         replaced(None)(file, "demo_0")
     options = {"cameras": CAMERAS, "image_folder": tmp_path / "images"}
-    with pytest.raises(
-        ValueError, match=r"smaller\.h5, demo_0, obs/agentview_image: expected images \[3, 6, 8\]"
-    ):
+    with refused("smaller.h5, demo_0, obs/agentview_image"):
         read_demos([path, smaller], ["robot0_eef_pos"], **options)
-    with pytest.raises(ValueError, match=r"without\.h5, demo_0: expected a dataset 'obs/agentview_image'"):
+    with refused("without.h5, demo_0"):
         read_demos([path, without], ["robot0_eef_pos"], **options)
     assert not list((tmp_path / "images").iterdir())
 
@@ -96,27 +95,27 @@ def replaced(value):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (None, r": expected a dataset 'obs/agentview_image', got \['actions'"),
+        (None, "demos.h5, demo_1"),
         (
             np.zeros((3, 6, 8, 3), np.float32),
-            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got float32",
+            "demos.h5, demo_1, obs/agentview_image",
         ),
         (
             np.zeros((2, 6, 8, 3), np.uint8),
-            r", obs/agentview_image: expected uint8 \[3, h, w, 3\], got uint8 \[2, 6, 8, 3\]",
+            "demos.h5, demo_1, obs/agentview_image",
         ),
         (
             np.zeros((3, 6, 6, 3), np.uint8),
-            r", obs/agentview_image: expected images \[3, 6, 8\] as before, got \[3, 6, 6\]",
+            "demos.h5, demo_1, obs/agentview_image",
         ),
     ],
 )
 def test_a_wrong_file_names_the_demonstration(path, value, message):
     with h5py.File(path, "r+") as file:
         replaced(value)(file)
-    with pytest.raises(ValueError, match=rf"demos\.h5, demo_1{message}"):
+    with refused(message):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS)
-    with pytest.raises(ValueError, match="demo_1"):
+    with refused(message):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=path.parent / "images")
     assert not list((path.parent / "images").glob("*agentview*"))
 

@@ -5,6 +5,7 @@ import json
 import h5py
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.instructions import read_instruction, read_instructions
 
@@ -29,14 +30,14 @@ def test_they_come_in_the_order_of_the_demonstrations_numbers(tmp_path):
 @pytest.mark.parametrize("meta", [None, "{}", '{"lang": ""}'])
 def test_a_demonstration_without_one_is_named(tmp_path, meta):
     path = write(tmp_path / "demos.h5", ['{"lang": "lift"}', meta])
-    with pytest.raises(ValueError, match=r"demos.h5, demo_1: expected an instruction"):
+    with refused("demos.h5, demo_1"):
         read_instructions(path)
 
 
 @pytest.mark.parametrize("meta", ["{", "[3]", "4", '{"lang": 4}'])
 def test_a_damaged_one_is_named(tmp_path, meta):
     path = write(tmp_path / "demos.h5", [meta])
-    with pytest.raises(ValueError, match=r"demos.h5, demo_0, ep_meta: expected a .* got "):
+    with refused("demos.h5, demo_0, ep_meta"):
         read_instructions(path)
 
 
@@ -46,5 +47,5 @@ def test_older_files_have_none(tmp_path):
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected a file of demonstrations, got none"):
+    with refused("demos.h5", FileNotFoundError):
         read_instructions(tmp_path / "demos.h5")

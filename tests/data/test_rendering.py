@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse import keys, make_env
 from torchrl_sparse.data.demos import Collection, collect, read_initial_state
 from torchrl_sparse.data.rendering import render_demos
@@ -72,11 +73,11 @@ def test_everything_else_is_copied_and_the_file_is_never_its_own_source(files):
         assert other["data/demo_0/obs/agentview_image"].shape[1:] == (32, 32, 3)
         cube = other["data/demo_0/obs/object_positions"][()]
         np.testing.assert_allclose(cube, one["data/demo_0/obs/object"][:, :3], atol=2e-3)
-    with pytest.raises(ValueError, match="out: expected another file"):
+    with refused("out"):
         render_demos(plain, plain, ["agentview"])
 
 
 def test_an_unknown_camera_is_named_and_leaves_no_file(files, tmp_path):
-    with pytest.raises(ValueError, match=r"camera: expected one of .*agentview.* got 'nowhere'"):
+    with refused("camera"):
         render_demos(files[0], tmp_path / "out.h5", ["nowhere"])
     assert not list(tmp_path.iterdir())

@@ -8,6 +8,7 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from tests.refusals import refused
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Normalizer, Sampler, keys, make_env
 from torchrl_sparse.envs.tasks import find_task
 from torchrl_sparse.training.diffusion.published import published_network, published_shape
@@ -68,12 +69,12 @@ def check_horizon_and_errors(make, action):
     assert steps["done"][-1]
     assert steps[keys.EPISODE_STEP].flatten().tolist() == [1, 2, 3]
     size = len(action)
-    with pytest.raises(ValueError, match=rf"action: expected \w+ shape \({size},\), got \({size + 1},\)"):
+    with refused("action"):
         env._step(env.reset().set(keys.ACTION, torch.zeros(size + 1)))
-    with pytest.raises(ValueError, match="action: expected finite numbers"):
+    with refused("action"):
         env._step(env.reset().set(keys.ACTION, torch.full((size,), float("nan"))))
     env.close()
-    with pytest.raises(ValueError, match="seeds: expected at least one"):
+    with refused("seeds"):
         make(seeds=[])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from torchrl.envs import SerialEnv
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.control.realtime_executor import HoldPose
 from torchrl_sparse.data.demonstrate import demonstrate
@@ -112,11 +113,11 @@ def test_the_state_is_that_of_the_named_cube(env):
 
 
 def test_unknown_words_are_refused(env):
-    with pytest.raises(ValueError, match=r"instruction: expected one of 'lift the red cube'.* got 'lift it'"):
+    with refused("instruction"):
         RobosuiteEnv("LiftNamed", instruction="lift it")
     start(env, 0)
     state = replace(env.get_initial_state(), instruction="lift the pink cube")
-    with pytest.raises(ValueError, match="got 'lift the pink cube'"):
+    with refused("instruction"):
         env.reset(initial_state=state)
 
 

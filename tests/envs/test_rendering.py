@@ -8,6 +8,7 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
+from tests.refusals import refused
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.rendering import CameraRenderer
@@ -90,7 +91,7 @@ def test_a_renderer_does_not_follow_into_another_scene(env):
 
 
 def test_unknown_camera_is_named(env):
-    with pytest.raises(ValueError, match=r"camera: expected one of .*agentview.*got 'drone'"):
+    with refused("camera"):
         env.render("drone")
 
 
@@ -117,7 +118,7 @@ def test_frames_that_no_query_sees_are_not_rendered_and_change_nothing(env):
 
 
 def test_no_frames_seen_at_all_is_refused():
-    with pytest.raises(ValueError, match="seen_frames: expected None or at least 1, got 0"):
+    with refused("seen_frames"):
         RobosuiteEnv("Lift", camera="agentview", seen_frames=0)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import TASKS, find_robosuite_task
@@ -192,13 +193,13 @@ def test_a_delta_beyond_its_bounds_counts_as_the_bound(lift, far):
 
 @pytest.mark.parametrize("seeds", [[1.7], [torch.tensor(1.7)], ["7"], [None], [-1], [2**63]])
 def test_seeds_that_are_no_whole_numbers_are_refused(seeds):
-    with pytest.raises(ValueError, match="seed: expected a whole number from 0"):
+    with refused("seed"):
         RobosuiteEnv("Lift", seeds=seeds)
 
 
 def test_a_seed_that_is_a_fraction_is_refused_and_changes_nothing(lift):
     lift.set_seed(5)
-    with pytest.raises(ValueError, match=r"seed: expected a whole number from 0 to .*, got 1\.7"):
+    with refused("seed"):
         lift._set_seed(1.7)
     assert lift.reset()[keys.EPISODE_SEED] == 5
 
@@ -210,23 +211,21 @@ def test_whole_numbers_of_any_type_are_seeds():
 
 
 def test_bad_input_is_named(lift):
-    with pytest.raises(ValueError, match=r"expected one of Lift, .*PickPlaceCan.*got 'Fly'"):
+    with refused("task"):
         find_robosuite_task("Fly")
     assert find_robosuite_task("can") is find_robosuite_task("PickPlaceCan")
-    with pytest.raises(ValueError, match="action_mode: expected 'absolute' or 'delta', got 'joint'"):
+    with refused("action_mode"):
         RobosuiteEnv("Lift", action_mode="joint")
-    with pytest.raises(ValueError, match="seeds: expected at least one"):
+    with refused("seeds"):
         RobosuiteEnv("Lift", seeds=[])
-    with pytest.raises(ValueError, match=r"action: expected delta shape \(7,\), got \(10,\)"):
+    with refused("action"):
         lift._step(lift.reset().set("action", torch.zeros(10)))
-    with pytest.raises(ValueError, match="action: expected finite numbers"):
+    with refused("action"):
         lift._step(lift.reset().set("action", torch.full((7,), float("nan"))))
 
 
 def test_a_size_of_images_without_a_camera_is_refused():
-    with pytest.raises(
-        ValueError, match=r"image_size: expected a camera or wrist_camera with it, got 84 alone"
-    ):
+    with refused("image_size"):
         make_env("LiftNamed", image_size=84)
 
 

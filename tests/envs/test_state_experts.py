@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.envs.experts.disturbance import next_noise
 from torchrl_sparse.envs.tasks import find_task
@@ -78,7 +79,5 @@ def test_commands_of_a_demonstration_of_pushing_seldom_turn_back():
 
 
 def test_tasks_without_an_expert_are_named():
-    with pytest.raises(
-        ValueError, match=r"expected one with an expert \(Lift, .*PushT, BlockPush\), got 'FrankaKitchen'"
-    ):
+    with refused("task"):
         find_task("FrankaKitchen").load_expert()

@@ -8,6 +8,7 @@ import torch
 from torchrl.data import Bounded
 from torchrl.envs.utils import check_env_specs
 
+from tests.refusals import refused
 from torchrl_sparse.data.demos import Collection, collect
 from torchrl_sparse.data.robomimic import read_demos
 from torchrl_sparse.envs.seeded import SeededEnv
@@ -62,17 +63,13 @@ def test_a_task_from_outside_is_one_line(walk, tmp_path):
     assert (summary.successes, summary.attempts) == (2, 2)
     demos = read_demos(tmp_path / "walk.h5", walk.state_keys, poses=False)
     assert torch.equal(demos.episode(1)["observation", "state"][0], torch.tensor([-2.0]))
-    with pytest.raises(
-        ValueError, match=r"task: expected one of Lift, .*FrankaKitchen, Walk or their aliases, got 'run'"
-    ):
+    with refused("task"):
         find_task("run")
 
 
 def test_only_robosuites_tasks_are_found_as_such(walk):
     assert find_robosuite_task("can") is find_task("PickPlaceCan")
-    with pytest.raises(
-        ValueError, match=r"task: expected one of Lift, .*ToolHang or their aliases, got 'walk'"
-    ):
+    with refused("task"):
         find_robosuite_task("walk")
 
 
@@ -84,9 +81,7 @@ def test_every_entry_offers_what_a_task_has(task):
     assert task.state_keys
     assert hasattr(task.demonstrator, "env_args")
     if task.name == "FrankaKitchen":
-        with pytest.raises(
-            ValueError, match=r"expected one with an expert \(Lift, .*BlockPush\), got 'FrankaKitchen'"
-        ):
+        with refused("task"):
             task.load_expert()
     else:
         assert task.load_expert().__module__.startswith("torchrl_sparse.envs.experts.")

@@ -7,6 +7,7 @@ from scipy.stats import norm, ttest_1samp, ttest_rel
 from recipes.studies.pages.page_rows import read_table
 from recipes.studies.pages.scores import score_rows, told_scores
 from tests.evaluation.synthetic import MACHINE, POLICY, make_results
+from tests.refusals import refused
 from torchrl_sparse.evaluation.benchmarks.rounds import play_rounds
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.acceleration import Played
@@ -26,9 +27,9 @@ def test_intervals_are_those_of_the_t_tests():
 
 
 def test_one_number_has_no_interval():
-    with pytest.raises(ValueError, match=r"values: expected at least two numbers, got shape \(1,\)"):
+    with refused("values"):
         mean_interval([0.5])
-    with pytest.raises(ValueError, match="pairs: expected at least two, got 1"):
+    with refused("pairs"):
         difference_interval([0.5], [0.4])
 
 

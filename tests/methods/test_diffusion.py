@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.fixtures.diffusion import SIZES
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
 from torchrl_sparse.blocks.bac import bac_schedule
 from torchrl_sparse.blocks.calibration import calibrate
@@ -66,12 +67,12 @@ class Odd(StaticPlanner):
 
 
 def test_one_line_adds_a_method_from_outside(policy, make, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"methods: expected dense, .*, got 'odd'"):
+    with refused("methods"):
         make("odd")
     monkeypatch.setitem(METHODS, "odd", Method(lambda inputs: (Odd(), inputs.sampler)))
     mask = make("odd")(QUERY.clone())[keys.PRUNE_MASK]
     assert mask[0].any(dim=1).tolist() == 10 * [False, True]
-    with pytest.raises(ValueError, match=r"methods: expected dense, .*, odd, or a planner in .*, got 'even'"):
+    with refused("methods"):
         check_method("even", tmp_path)
 
 
@@ -81,7 +82,7 @@ def test_a_warm_start_is_written_behind_its_sampler(make):
     assert method_identity("ddpm_82_41_14_warm2", warm)["start"] == "warm2"
     assert warm.with_noise(1).start is warm.start
     assert "start" not in method_identity("ddpm_82_41_14", make("ddpm_82_41_14"))
-    with pytest.raises(ValueError, match="num_steps: expected fewer than the sampler's 2, got 2"):
+    with refused("num_steps"):
         make("ddim2_warm2")
 
 
@@ -99,9 +100,7 @@ def test_how_often_and_for_how_many_chunks_is_written_behind_any_method(make):
 
 
 def test_a_chunk_is_not_executed_beyond_its_end(make):
-    with pytest.raises(
-        ValueError, match="methods: dense_every9: expected at most the 5 actions of a chunk, got 9"
-    ):
+    with refused("methods: dense_every9"):
         make_executor("dense_every9", make("dense_every9"), n_action_steps=2)
 
 
@@ -174,7 +173,7 @@ def test_samplers_are_taken_from_the_name(make, name, timesteps):
     ],
 )
 def test_other_names_are_refused(make, name):
-    with pytest.raises(ValueError, match="methods: expected"):
+    with refused("methods"):
         make(name)
 
 
@@ -221,7 +220,7 @@ def test_bac_of_another_sampler_is_a_saved_planner(policy, make, tmp_path, chain
     method = make(f"bac_{chain}")
     assert method.sampler.config == sampler.config
     assert torch.equal(method(QUERY.clone())[keys.PRUNE_MASK][0], schedule.mask())
-    with pytest.raises(ValueError, match=f"made for .*{sampler.name}|made for num_inference_steps"):
+    with refused("SchedulePlanner"):
         policy.with_plan(SchedulePlanner(schedule))
 
 
@@ -270,12 +269,10 @@ def test_rates_are_written_behind_the_name(make):
 @pytest.mark.usefixtures("pruner")
 @pytest.mark.parametrize("text", ["sag@0.9", "sag@0.7-0.1", "sag@0.9-0.5"])
 def test_a_rate_out_of_range_is_refused_at_once(make, text):
-    with pytest.raises(ValueError, match=r"rate: expected prune rates in \[0.3, 0.7\]"):
+    with refused("rate"):
         make(text)
 
 
 def test_planners_without_a_rate_say_so(make):
-    with pytest.raises(
-        ValueError, match="methods: uniform: expected a planner that takes a prune rate, got Uniform"
-    ):
+    with refused("methods: uniform"):
         make("uniform@0.5")

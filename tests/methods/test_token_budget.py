@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.methods.token_budget import BudgetPoint, TokenBudget, fewest_tokens, numbered_pruner
 from torchrl_sparse.methods.vla import TOKEN_METHODS
 from torchrl_sparse.tokens.specprune import SpecPrune
@@ -38,9 +39,7 @@ def test_every_method_with_a_number_is_made_at_that_number():
 
 
 def test_a_tolerance_that_none_keeps_is_refused():
-    with pytest.raises(
-        ValueError, match=r"at most 0.02 where most tokens are kept, got 0.2: 0.05, 0.7: 0.03"
-    ):
+    with refused("tolerance"):
         fewest_tokens([POINTS[0], POINTS[2]], 0.02)
 
 
@@ -56,25 +55,25 @@ def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"method": "mine"}, "method: expected one of specprune, .*, got 'mine'"),
-        ({"method": "dense"}, "method: expected one of specprune, .*, got 'dense'"),
+        ({"method": "mine"}, "budget.json: method"),
+        ({"method": "dense"}, "budget.json: method"),
         (
             {"method": "fastv", "settings": {"keep_share": 1}},
-            "settings: expected none for fastv, got .*keep_share",
+            "budget.json: settings",
         ),
-        ({"settings": {"preset": "mine"}}, "preset: expected .*paper.*release.*, got 'mine'"),
-        ({"points": 3}, "points: expected a valid array, got 3"),
-        ({"more": 1}, "more: expected no such key, got 1"),
-        ({"settings": {"keep_shere": 0.5}}, "settings: expected arguments of specprune, got .*keep_shere"),
-        ({"settings": {"keep_share": 2}}, "keep_share: expected more than 0 and at most 1, got 2"),
+        ({"settings": {"preset": "mine"}}, "budget.json: preset"),
+        ({"points": 3}, "budget.json: points"),
+        ({"more": 1}, "budget.json: more"),
+        ({"settings": {"keep_shere": 0.5}}, "budget.json: settings"),
+        ({"settings": {"keep_share": 2}}, "budget.json: keep_share"),
     ],
 )
 def test_wrong_files_are_named(tmp_path, change, message):
     path = tmp_path / "budget.json"
     TokenBudget("specprune", 0.5, "action_error", 0.03, POINTS).save_pretrained(path)
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(ValueError, match=message) as error:
+    with refused(message) as error:
         TokenBudget.from_pretrained(path)
     assert str(path) in str(error.value)
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+    with refused("expected a file none.json, got none", FileNotFoundError):
         TokenBudget.from_pretrained(tmp_path / "none.json")

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.networks.normalize import Normalizer
 
 
@@ -60,24 +61,20 @@ def test_state_dict_rebuilds_it(data):
 
 def test_bad_data_is_named(data):
     state, action = data
-    with pytest.raises(ValueError, match='"global" or "range", got \'mean\''):
+    with refused("state_mode"):
         Normalizer.fit(state, action, state_mode="mean")
-    with pytest.raises(ValueError, match=r"10 numbers per arm, got a last axis of 7"):
+    with refused("action"):
         Normalizer.fit(state, action[:, :7])
-    with pytest.raises(ValueError, match=r"got \[50, 6\], \[49, 20\]"):
+    with refused("state, action"):
         Normalizer.fit(state, action[1:])
     state[3, 2] = torch.nan
-    with pytest.raises(ValueError, match="state: expected finite numbers, got nan"):
+    with refused("state"):
         Normalizer.fit(state, action)
 
 
 def test_bad_constants_are_named():
     one, zero = torch.ones(3), torch.zeros(3)
-    with pytest.raises(
-        ValueError, match=r"action_scale and action_offset must be vectors .* \[3\] and \[2\]"
-    ):
+    with refused("action_scale, action_offset"):
         Normalizer(one, zero, one, zero[:2])
-    with pytest.raises(
-        ValueError, match="state_scale and state_offset must be finite and the scale without zeros"
-    ):
+    with refused("state_scale, state_offset"):
         Normalizer(zero, zero, one, zero)

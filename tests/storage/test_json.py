@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.storage import json as strict
 from torchrl_sparse.storage.json import parse_json, read_json, to_plain, write_json
 
@@ -71,32 +72,32 @@ def test_a_field_without_a_default_is_written_where_it_is_none():
 def test_a_fault_is_named_with_file_and_key(tmp_path, text, message):
     file = tmp_path / "f.json"
     file.write_text(text)
-    with pytest.raises(ValueError, match=r"f\.json") as error:
+    with refused(message.partition(": expected ")[0]) as error:
         read_json(file, Table)
     assert str(error.value) == f"{tmp_path}/{message}"
 
 
 @pytest.mark.parametrize("text", ["", '{"a":', '{"a": NaN}', "\x00", b"\xff\xfe"])
 def test_what_is_no_json_is_refused(text):
-    with pytest.raises(ValueError, match="line 7: expected a complete JSON file"):
+    with refused("line 7"):
         parse_json(text, Any, "line 7")
 
 
 @pytest.mark.parametrize("settings", ["[" * 100_000, '{"a":' * 100_000])
 def test_a_deep_file_is_refused_by_name(settings):
-    with pytest.raises(ValueError, match=r"^deep: .*recursion limit"):
+    with refused("deep"):
         parse_json(table(settings=settings), Table, "deep")
 
 
 def test_a_huge_file_is_refused_before_it_is_read(tmp_path, monkeypatch):
     file = write_json(tmp_path / "table.json", TABLE)
     monkeypatch.setattr(strict, "MAX_BYTES", 10)
-    with pytest.raises(ValueError, match=r"table\.json: expected at most 10 bytes"):
+    with refused("table.json"):
         read_json(file, Table)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"expected a file .*none\.json, got none"):
+    with refused("expected a file none.json, got none", FileNotFoundError):
         read_json(tmp_path / "none.json", Table)
 
 
@@ -115,6 +116,6 @@ def test_what_could_not_be_read_is_not_written(tmp_path, value, kind):
 
 
 def test_a_long_value_is_cut_short_in_the_message():
-    with pytest.raises(ValueError, match="got '") as error:
+    with refused("f: rates.a") as error:
         parse_json(table(f'"{"x" * 10_000}"'), Table, "f")
     assert len(str(error.value)) < 200

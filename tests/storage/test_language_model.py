@@ -18,6 +18,7 @@ from tests.fixtures.gguf import (
     tiny_weights,
     write_llama,
 )
+from tests.refusals import refused
 from torchrl_sparse.storage.gguf import GGUF
 from torchrl_sparse.storage.language_model import read_language_model
 
@@ -63,21 +64,21 @@ def test_the_package_gguf_reads_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"architecture": "gemma"}, "general.architecture: expected 'llama', got 'gemma'"),
-        ({"pre": "llama-bpe"}, "tokenizer.ggml.pre: expected 'smollm', got 'llama-bpe'"),
-        ({"bos_token_id": 5}, "tokenizer.ggml.bos_token_id: expected 1, got 5"),
-        ({"head_count": None}, "llama.attention.head_count: expected int, got None"),
-        ({"head_count": 3}, "dim: expected a multiple of 2"),
-        ({"block_count": 1 << 30}, "layers"),
-        ({"embedding_length": 64}, "embed_tokens.weight: expected shape"),
-        ({"freq_base": 0.0}, "rope_base: expected a positive number, got 0.0"),
-        ({"tokens": ["a"] * 10}, "embed_tokens.weight: expected shape"),
-        ({"merges": ["no such"]}, "tokenizer.ggml: expected byte pairs"),
+        ({"architecture": "gemma"}, "other.gguf: general.architecture"),
+        ({"pre": "llama-bpe"}, "other.gguf: tokenizer.ggml.pre"),
+        ({"bos_token_id": 5}, "other.gguf: tokenizer.ggml.bos_token_id"),
+        ({"head_count": None}, "other.gguf: llama.attention.head_count"),
+        ({"head_count": 3}, "other.gguf: dim"),
+        ({"block_count": 1 << 30}, "other.gguf: layers"),
+        ({"embedding_length": 64}, "other.gguf: embed_tokens.weight"),
+        ({"freq_base": 0.0}, "other.gguf: rope_base"),
+        ({"tokens": ["a"] * 10}, "other.gguf: embed_tokens.weight"),
+        ({"merges": ["no such"]}, "other.gguf: tokenizer.ggml"),
     ],
 )
 def test_other_models_are_named(tmp_path, changes, message):
     file = write_llama(tmp_path / "other.gguf", **changes)
-    with pytest.raises(ValueError, match=message) as caught:
+    with refused(message) as caught:
         read_language_model(file)
     assert str(caught.value).startswith(str(file))
     assert "\n" not in str(caught.value)
@@ -87,7 +88,7 @@ def test_other_models_are_named(tmp_path, changes, message):
 def test_a_file_that_is_cut_off_is_one_line(file, share):
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match=r"tiny.gguf: .*expected .*, got") as caught:
+    with refused("tiny.gguf") as caught:
         read_language_model(file)
     assert "\n" not in str(caught.value)
 
@@ -97,23 +98,19 @@ def test_a_damaged_header_is_one_line_and_takes_no_memory(file, at):
     content = bytearray(file.read_bytes())
     content[at : at + 8] = b"\xff" * 8
     file.write_bytes(bytes(content))
-    with pytest.raises(ValueError, match=r"tiny.gguf: ") as caught:
+    with refused("tiny.gguf") as caught:
         read_language_model(file)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_a_foreign_one_and_an_unknown_type_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"expected a file .*none.gguf"):
+    with refused("expected a file none.gguf, got none", FileNotFoundError):
         read_language_model(tmp_path / "none.gguf")
     (tmp_path / "a.gguf").write_bytes(b"PK\x03\x04" + bytes(100))
-    with pytest.raises(
-        ValueError, match=r"a.gguf: expected a GGUF file, which begins with b'GGUF', got b'PK"
-    ):
+    with refused("a.gguf"):
         read_language_model(tmp_path / "a.gguf")
     (tmp_path / "a.gguf").write_bytes(gguf_bytes({}, {"w": (12, (1, 256), bytes(144))}))
-    with pytest.raises(
-        ValueError, match=r"w: expected one of the types F32 0, F16 1, Q4_1 3, Q8_0 8, got 12"
-    ):
+    with refused("a.gguf: w"):
         GGUF(tmp_path / "a.gguf").tensor("w")
 
 

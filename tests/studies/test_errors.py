@@ -6,6 +6,7 @@ from tensordict import TensorDict
 
 from recipes.studies.offline_errors.errors import draw_answers, offline_errors
 from tests.fixtures.diffusion import SIZES, make_network
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
 
 __all__ = ["make_network"]
@@ -52,7 +53,7 @@ def test_the_mean_of_two_ways_has_the_smaller_error_and_the_worse_score():
 
 
 def test_one_draw_is_too_few():
-    with pytest.raises(ValueError, match="draws: expected at least 2, got 1 of the method and 2 of dense"):
+    with refused("draws"):
         offline_errors(torch.zeros(1, 1, 1), torch.zeros(1, 1), torch.zeros(1, 2, 1))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from recipes.studies.search_schedule.evolution import ChainSpace, Evolution, PrunedChain, evolve
+from tests.refusals import refused
 from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
 
 WEIGHTS = [5.0, 0.1, 10.0, 4.0, 0.2, 9.0]
@@ -80,15 +81,15 @@ def test_a_search_that_goes_on_asks_nothing_twice_and_ends_as_if_it_had_not_stop
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"budget": 1.0}, "budget: expected more than 1 step, the first, which prunes nothing, got 1.0"),
-        ({"lengths": (1,)}, "lengths: expected 2 to 100 steps, got 1"),
-        ({"lengths": (101,)}, "lengths: expected 2 to 100 steps, got 101"),
-        ({"lengths": ()}, "lengths: expected at least one, got none"),
-        ({"weights": [1.0, 0.0, 1.0]}, "weights: expected positive numbers, got"),
+        ({"budget": 1.0}, "budget"),
+        ({"lengths": (1,)}, "lengths"),
+        ({"lengths": (101,)}, "lengths"),
+        ({"lengths": ()}, "lengths"),
+        ({"weights": [1.0, 0.0, 1.0]}, "weights"),
     ],
 )
 def test_what_is_no_space_is_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         ChainSpace(**{"weights": WEIGHTS, "budget": 2.0, "lengths": (3,), **changes})
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from recipes.studies.looking.oracle import Climber, oracle, swap_cells
+from tests.refusals import refused
 from tests.studies.test_looking import STEPS, BySign, make_network, policy, queries
 from torchrl_sparse import keys
 
@@ -88,5 +89,5 @@ def test_on_the_noise_that_it_climbs_on_no_mask_gets_worse(policy, queries):
     assert mean == pytest.approx(found.error["query"] - found.error["all"], abs=1e-6)
     again = oracle(policy, queries, attempts=20, draws=2, n_action_steps=4)
     assert again == found
-    with pytest.raises(ValueError, match="queries: expected those of two episodes at least, got 1"):
+    with refused("queries"):
         oracle(policy, queries[:4], attempts=1)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from tests.refusals import refused
 from tests.tokens.helpers import CONFIG, SPEC, later, patch, query
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -29,7 +30,7 @@ def test_patches_are_cut_row_by_row_and_camera_by_camera():
 
 
 def test_frames_that_patches_do_not_divide_are_named():
-    with pytest.raises(ValueError, match="a size that 4 x 4 patches divide, got 30 x 56"):
+    with refused("frames"):
         patches(torch.zeros(1, 2, 3, 30, 56, dtype=torch.uint8), (4, 4))
 
 
@@ -113,7 +114,7 @@ def test_of_two_arms_the_slower_decides():
 
 
 def test_looking_back_takes_a_query_and_the_speed():
-    with pytest.raises(ValueError, match="look_back: expected at least 1 query, got 0"):
+    with refused("look_back"):
         SpecPrune(look_back=0)
     td = query()
     unlike(td)

@@ -1,8 +1,8 @@
 """Choosing tokens, against loops that do the same one by one."""
 
-import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.tokens.selection import (
@@ -54,12 +54,10 @@ def test_layers_keep_their_relative_depth():
 
 def test_budgets_and_shares_that_cannot_be_are_named():
     check_budget("budget", 16, SPEC)
-    with pytest.raises(
-        ValueError, match="budget: expected more than 0 and at most the model's 16 tokens per camera, got 17"
-    ):
+    with refused("budget"):
         check_budget("budget", 17, SPEC)
-    with pytest.raises(ValueError, match="got 0"):
+    with refused("budget"):
         check_budget("budget", 0, SPEC)
     for share in (0.0, 1.1, float("nan")):
-        with pytest.raises(ValueError, match="share: expected more than 0 and at most 1"):
+        with refused("share"):
             check_share("share", share)

@@ -2,6 +2,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.training.curves import plot_pruner_curves, read_scalars
 
 
@@ -35,7 +36,7 @@ def test_what_a_resumed_training_logged_twice_counts_once(folder):
 
 def test_missing_curves_and_folders_are_named(folder, tmp_path):
     (folder / "scalars" / "train" / "rate_CA.csv").unlink()
-    with pytest.raises(ValueError, match=r"missing \['train/rate_CA'\]"):
+    with refused("curves"):
         plot_pruner_curves(read_scalars(folder), folder / "curves.png", rate=0.9)
-    with pytest.raises(FileNotFoundError, match="nowhere"):
+    with refused("expected a folder scalars, got none", FileNotFoundError):
         read_scalars(tmp_path / "nowhere")

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.refusals import refused
 from torchrl_sparse.training.curves import read_scalars
 from torchrl_sparse.training.loop import train
 from torchrl_sparse.training.trainer import Trainer
@@ -111,9 +112,7 @@ def test_a_checkpoint_from_before_it_held_unlogged_steps_is_resumed(tmp_path):
 
 def test_a_checkpoint_of_another_training_is_refused(run):
     run(Regression())
-    with pytest.raises(
-        ValueError, match=r"checkpoint.pt: made with another config: scale is 2 here and 3 there; choose"
-    ):
+    with refused("checkpoint.pt"):
         run(Regression(total=7, scale=2))
 
 
@@ -123,7 +122,7 @@ def test_a_longer_training_extends_a_shorter_one_and_none_is_cut_short(run, tmp_
     assert run(longer)[-1] == longer.step == 8
     assert read_scalars(tmp_path / "log")["train/lr"][:, 0].tolist() == [2, 4, 6, 8]
     assert longer.lr == 0
-    with pytest.raises(ValueError, match=r"checkpoint.pt: expected at most 7 steps, as asked for, got 8"):
+    with refused("checkpoint.pt"):
         run(Regression(total=7))
 
 
@@ -155,5 +154,5 @@ def test_a_csv_log_has_each_step_once_after_a_kill(run, tmp_path):
 def test_a_log_that_is_none_is_named(run, tmp_path, line):
     (tmp_path / "log" / "scalars").mkdir(parents=True)
     (tmp_path / "log" / "scalars" / "loss.csv").write_bytes(line)
-    with pytest.raises(ValueError, match=r"loss.csv: expected lines of step and value, got b'"):
+    with refused("loss.csv"):
         run(Regression())

@@ -6,6 +6,7 @@ from typing import Literal
 
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 from torchrl_sparse.evaluation.results.schema import load_results
@@ -50,8 +51,9 @@ def test_numbers_and_booleans_that_are_such_are_read():
 )
 def test_another_kind_is_refused_by_name(name, value, got):
     """pydantic, however strict, takes ``true`` and ``1.0`` for a `Literal` of 1."""
-    with pytest.raises(ValueError, match=rf"^f: {name}(\.1)?: expected .*, got {got}$"):
+    with refused("f: many.1" if name == "many" else f"f: {name}") as error:
         parse_json(text(**{name: value}), Mixed, "f")
+    assert str(error.value).endswith(f"got {got}")
 
 
 @pytest.mark.parametrize(
@@ -68,12 +70,12 @@ def test_a_version_that_is_true_is_no_version(tmp_path, file, load, entry):
     for wrong in ("true", "2.0"):
         path = tmp_path / "damaged.json"
         path.write_text(content.replace(entry, f"{entry.rpartition(' ')[0]} {wrong}"))
-        with pytest.raises(ValueError, match=rf"damaged.json: {entry.split(chr(34))[1]}: expected "):
+        with refused(f"damaged.json: {entry.split(chr(34))[1]}"):
             load(path)
 
 
 def test_options_and_arguments_take_no_boolean_for_a_number():
-    with pytest.raises(ValueError, match=r"^version: expected 1, got True$"):
+    with refused("version"):
         check_plain(True, Literal[1], "version")
-    with pytest.raises(ValueError, match="interval: expected"):
+    with refused("interval"):
         Uniform(True)

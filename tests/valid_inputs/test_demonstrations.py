@@ -10,6 +10,7 @@ import torch
 
 from tests.data.published_demos import OSC as OSC_14, env_args_14, env_args_15, record, write
 from tests.fixtures.demonstrations import OSC, absolute_env_args, hands
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.data.absolute import convert_demos
 from torchrl_sparse.data.demos import read_initial_state
@@ -69,7 +70,7 @@ def test_deltas_beyond_the_controllers_input_are_clipped_as_robosuite_does_and_c
         *(converted_actions(tmp_path / f"{name}.h5") for name in ("strong", "clipped")), strict=True
     ):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match=r"strong\.hdf5: expected absolute poses, got deltas"):
+    with refused("strong.hdf5"):
         read_demos(tmp_path / "strong.hdf5", HAND)
 
 
@@ -85,23 +86,23 @@ def changed_kwargs(**changes):
 
 FLAT_OF_15 = {**env_args_14(LIFT, control_delta=False), "env_version": "1.5.1"}
 REFUSED = {
-    "another rate": (changed_kwargs(control_freq=10), r"env_kwargs\.control_freq: expected 20, got 10"),
-    "softer": (changed_15(kp=50), r"right\.kp: expected 150 or .*, got 50"),
-    "interpolated": (changed_15(interpolation="linear"), r"right\.interpolation: expected None, got 'linear'"),
-    "limited": (changed_15(position_limits=[[0] * 3, [1] * 3]), r"right\.position_limits: expected None"),
-    "coupled": (changed_15(uncouple_pos_ori=False), r"right\.uncouple_pos_ori: expected True, got False"),
-    "towards the last goal": (changed_15(goal_update_mode="desired"), r"goal_update_mode: expected 'achieved', got 'desired'"),
-    "positions alone": (changed_15(type="OSC_POSITION"), r"right\.type: expected 'OSC_POSE', got 'OSC_POSITION'"),
-    "whole body": (changed_kwargs(controller_configs={"type": "WHOLE_BODY_IK", "body_parts": {}}), r"type: expected 'BASIC'"),
-    "another table": (changed_kwargs(table_full_size=[1, 1, 0.05]), r"env_kwargs\.table_full_size: expected one of"),
-    "another gripper": (changed_kwargs(gripper_types="WipingGripper"), r"gripper_types: expected .*, got 'WipingGripper'"),
-    "a range of nothing": (changed_15(output_max=-0.05), r"output_min: expected less than output_max"),
-    "a range of words": (changed_15(input_max="1"), r"input_max: expected a number or six, got '1'"),
-    "what 1.5 does not read": (FLAT_OF_15, r"control_delta: expected true or input_type 'absolute' with it, got false"),
-    "another simulator": ({"env_name": "Stack", "type": 4}, r"env_args\.type: expected 1, got 4"),
-    "another task": ({**changed_15(), "env_name": "Stack_D1"}, r"env_args\.env_name: expected a task of robosuite"),
-    "a later version": ({**changed_15(), "env_version": "2.0.0"}, r"env_version: expected robosuite 1\.2 to 1\.5"),
-    "no description": ("none", r"expected an attribute env_args of 'data'"),
+    "another rate": (changed_kwargs(control_freq=10), "demos.hdf5, env_args.env_kwargs.control_freq"),
+    "softer": (changed_15(kp=50), "controller_configs.body_parts.right.kp"),
+    "interpolated": (changed_15(interpolation="linear"), "body_parts.right.interpolation"),
+    "limited": (changed_15(position_limits=[[0] * 3, [1] * 3]), "body_parts.right.position_limits"),
+    "coupled": (changed_15(uncouple_pos_ori=False), "body_parts.right.uncouple_pos_ori"),
+    "towards the last goal": (changed_15(goal_update_mode="desired"), "body_parts.right.goal_update_mode"),
+    "positions alone": (changed_15(type="OSC_POSITION"), "controller_configs.body_parts.right.type"),
+    "whole body": (changed_kwargs(controller_configs={"type": "WHOLE_BODY_IK", "body_parts": {}}), "controller_configs.type"),
+    "another table": (changed_kwargs(table_full_size=[1, 1, 0.05]), "demos.hdf5, env_args.env_kwargs.table_full_size"),
+    "another gripper": (changed_kwargs(gripper_types="WipingGripper"), "demos.hdf5, env_args.env_kwargs.gripper_types"),
+    "a range of nothing": (changed_15(output_max=-0.05), "env_kwargs.controller_configs.output_min"),
+    "a range of words": (changed_15(input_max="1"), "env_args.env_kwargs.controller_configs.input_max"),
+    "what 1.5 does not read": (FLAT_OF_15, "env_kwargs.controller_configs.control_delta"),
+    "another simulator": ({"env_name": "Stack", "type": 4}, "demos.hdf5, env_args.type"),
+    "another task": ({**changed_15(), "env_name": "Stack_D1"}, "demos.hdf5, env_args.env_name"),
+    "a later version": ({**changed_15(), "env_version": "2.0.0"}, "demos.hdf5, env_args.env_version"),
+    "no description": ("none", "demos.hdf5"),
 }  # fmt: skip
 
 
@@ -111,7 +112,7 @@ def test_what_changes_the_meaning_of_an_action_or_a_step_is_refused_by_name(tmp_
     gives other motions than this library's environments."""
     env_args, message = REFUSED[name]
     path = poses(tmp_path / "demos.hdf5", env_args)
-    with pytest.raises(ValueError, match=message) as refusal:
+    with refused(message) as refusal:
         convert_demos(path, tmp_path / "out.h5")
     assert str(refusal.value).startswith(str(path))
     with pytest.raises(ValueError, match=r"demos\.hdf5"):
@@ -125,7 +126,7 @@ def test_states_that_are_another_time_apart_than_the_file_says_are_refused(recor
     for demo in slow:
         demo["states"][:, 0] *= 2
     path = write(tmp_path / "demos.hdf5", slow, env_args_15(LIFT))
-    with pytest.raises(ValueError, match=r"demo_0, states: expected 0\.05 s between them, got 0\.100 s"):
+    with refused("demos.hdf5, demo_0, states"):
         convert_demos(path, tmp_path / "out.h5")
 
 
@@ -166,7 +167,7 @@ def test_ranges_of_the_controller_are_honoured(recorded, tmp_path):
 def test_poses_that_the_recorded_hand_could_not_follow_are_refused(tmp_path, change, message):
     """A commanded pose lies ahead of the hand by what a step moves it, and not elsewhere."""
     path = poses(tmp_path / "demos.h5", change=change)
-    with pytest.raises(ValueError, match=rf"demo_0, actions: expected absolute poses .*{message}"):
+    with refused("demos.h5, demo_0, actions"):
         read_demos(path, HAND)
 
 
@@ -190,9 +191,7 @@ def test_a_model_of_robosuite_14_is_named(tmp_path):
             np.zeros((6, 32)),
             '<mujoco><geom name="gripper0_hand_visual"/></mujoco>',
         )
-    with pytest.raises(
-        ValueError, match=r"demos\.h5, demo_0, model_file: .* got one of robosuite 1\.4 or earlier"
-    ):
+    with refused("demos.h5, demo_0, model_file"):
         read_initial_state(path, 0)
 
 

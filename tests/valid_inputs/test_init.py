@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy, Normalizer, TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.vla.adapters import add_adapters
@@ -40,19 +41,19 @@ def saved(tmp_path_factory):
         (
             "states",
             {"sizes": {"n_layer": 2}},
-            "network.n_layer: expected 1, as of the policy in .*states, got 2",
+            "network.n_layer",
         ),
-        ("states", {"sizes": {"horizon": 10}}, "network.horizon: expected 4, as of the policy"),
-        ("states", {"state_mode": "global"}, "state_normalization: expected range, as of the policy"),
-        ("image", {"state_mode": "range"}, "state_normalization: expected global, as of the policy"),
-        ("states", {"width": 64}, "vision.width: expected None, as of the policy in .*states, got 64"),
-        ("image", {"width": 64}, "vision.width: expected 16, as of the policy"),
-        ("image", {"crop": 0.5}, "vision.crop: expected 0.875, as of the policy"),
+        ("states", {"sizes": {"horizon": 10}}, "network.horizon"),
+        ("states", {"state_mode": "global"}, "state_normalization"),
+        ("image", {"state_mode": "range"}, "state_normalization"),
+        ("states", {"width": 64}, "vision.width"),
+        ("image", {"width": 64}, "vision.width"),
+        ("image", {"crop": 0.5}, "vision.crop"),
     ],
 )
 def test_what_the_policy_has_not_is_refused(saved, name, asked, message):
     """An option of the command line that is not read is refused unless it says what the policy has."""
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         begun_policy(saved / name, **({"sizes": OPEN} | asked))
 
 
@@ -78,13 +79,13 @@ def test_dropout_is_what_is_asked_for(saved):
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"size": "small"}, "size: expected null, since sizes are those of the policy in mine, got small"),
-        ({"rank": 16}, "rank: expected 2, as of the policy in mine, got 16"),
+        ({"size": "small"}, "size"),
+        ({"rank": 16}, "rank"),
         (
             {"changes": {"chunk_size": 8}},
-            "network: .*policy in mine, got others: chunk_size is 8 here and 2 there",
+            "network",
         ),
-        ({"changes": {"llm": {"layers": 9}}}, "network: .* got others: llm.layers is 9 here and"),
+        ({"changes": {"llm": {"layers": 9}}}, "network"),
     ],
 )
 def test_sizes_that_a_vla_has_not_are_refused(asked, message):
@@ -94,5 +95,5 @@ def test_sizes_that_a_vla_has_not_are_refused(asked, message):
     nothing = {"size": None, "rank": None, "changes": {}}
     own = {"rank": 2, "changes": {"chunk_size": config.chunk_size, "llm": {"layers": config.llm.layers}}}
     check_sizes(policy, "mine", **nothing | own)
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         check_sizes(policy, "mine", **nothing | asked)

@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.fixtures.gguf import METADATA, gguf_bytes, llama_tensors, tiny_weights
+from tests.refusals import refused
 from tests.storage.published import openvla as published
 from tests.storage.published.test_openvla_oft import edit, published_crop
 from torchrl_sparse import keys
@@ -137,25 +138,23 @@ def test_two_arms_are_refused(weights, tmp_path):
         for name, shape in (("weight", (width,)), ("bias", ()))
     }
     published.write(tmp_path, weights[0], head, weights[2] | {"module.fc1.weight": torch.zeros(width, 14)})
-    with pytest.raises(
-        CheckpointError, match=r"expected a policy of LIBERO's 8 numbers .* and 7 .*, got one of 14 and 14"
-    ):
+    with refused("test_two_arms_are_refused0", CheckpointError):
         load(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"cameras": 3}, "cameras: expected a whole number from 1 to 2, got 3"),
-        ({"heads": (16, 32)}, "heads: expected those of DINOv2, SigLIP and the decoder"),
-        ({"normalization": "normal"}, "normalization: expected one of"),
-        ({"normalization": "bounds"}, "dataset_statistics.json: expected min and max"),
-        ({"chunk_size": 0}, "chunk_size: expected a whole number"),
+        ({"cameras": 3}, "cameras"),
+        ({"heads": (16, 32)}, "heads"),
+        ({"normalization": "normal"}, "test_an_argument_that_a_folder2: normalization"),
+        ({"normalization": "bounds"}, "dataset_statistics.json"),
+        ({"chunk_size": 0}, "test_an_argument_that_a_folder4: chunk_size"),
     ],
 )
 def test_an_argument_that_a_folder_cannot_have_is_named(folder, options, message):
     """None of them is taken for another value without a word."""
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         load(folder, **options)
 
 
@@ -163,9 +162,9 @@ def test_arguments_of_the_other_layout_are_not_passed_over(folder, tmp_path):
     """A folder of ours says everything itself, and a published one is of one architecture."""
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny()))
     policy.save_pretrained(tmp_path / "ours")
-    with pytest.raises(ValueError, match=r"chunk_size: expected none for .*ours"):
+    with refused("chunk_size"):
         VLAPolicy.from_pretrained(tmp_path / "ours", chunk_size=5)
-    with pytest.raises(ValueError, match="config: expected none for"):
+    with refused("config"):
         VLAPolicy.from_pretrained(folder, config=VLAConfig.tiny())
 
 
@@ -176,5 +175,5 @@ def test_a_language_model_that_turns_a_part_of_each_head_is_named(tmp_path, name
         tensors = llama_tensors(tiny_weights())
         (tmp_path / f"{size}.gguf").write_bytes(gguf_bytes(METADATA | {name: size}, tensors))
     assert read_language_model(tmp_path / "8.gguf").sizes["kv_heads"] == 2
-    with pytest.raises(ValueError, match=rf"4.gguf: {name}: expected 8, the size of a head, got 4"):
+    with refused(f"4.gguf: {name}"):
         read_language_model(tmp_path / "4.gguf")

@@ -11,6 +11,7 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import step_mdp
 
 from tests.counting import EXECUTORS, SEEDS, counting_policy, make_count_env
+from tests.refusals import refused
 from torchrl_sparse import ActionAwareController, ChunkExecutor, keys
 from torchrl_sparse.carried import dense
 
@@ -41,7 +42,7 @@ def test_the_ordinary_way_to_collect_plays_whole_chunks(env):
 
 def test_an_environment_that_drops_the_state_is_an_error(env):
     """Right: an error that says what to add; `is_init` False without an age is never right."""
-    with pytest.raises(ValueError, match=DROPPED.format("age", 2)):
+    with refused("('control', 'age')"):
         env.rollout(3, ChunkExecutor(counting_policy(4), 4), break_when_any_done=False)
 
 
@@ -51,7 +52,7 @@ def test_zeros_in_the_place_of_the_state_are_an_error():
     td = step_mdp(env.step(actor(env.reset())))
     for key in (keys.AGE, keys.QUERIED, keys.CHUNK):
         td[key] = torch.zeros_like(td[key])
-    with pytest.raises(ValueError, match=r"\('control', 'age'\).* 1 of 1 rows"):
+    with refused("('control', 'age')"):
         actor(td)
 
 
@@ -60,7 +61,7 @@ def test_what_a_controller_carries_is_missed_too():
     env = make_count_env([0])
     actor = ChunkExecutor(counting_policy(4), 4, ActionAwareController())
     td = step_mdp(env.step(actor(env.reset()))).exclude(keys.FINE)
-    with pytest.raises(ValueError, match=r"\('control', 'fine'\).* 1 of 1 rows"):
+    with refused("('control', 'fine')"):
         actor(td)
 
 
@@ -91,7 +92,7 @@ def test_a_loop_that_keeps_the_specs_keys_alone_keeps_the_state():
         played.append(td[keys.ACTION].item())
         td = step_mdp(td, keep_other=False)
     assert played == [0, 1, 2, 3, 40, 41]
-    with pytest.raises(ValueError, match=DROPPED.format("age", 1).replace("2 rows", "1 rows")):
+    with refused("('control', 'age')"):
         actor(step_mdp(bare.step(actor(bare.reset())), keep_other=False))
 
 

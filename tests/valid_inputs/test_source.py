@@ -17,6 +17,7 @@ from recipes.studies.search_schedule.schedules import Judge
 from tests.data.published_demos import env_args_14, env_args_15
 from tests.evaluation.accelerate.small import GRID, ask, fixed_times
 from tests.recipe_modules import RECIPES, load_recipe
+from tests.refusals import refused
 from tests.training.runs import train_unbroken
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, TransformerForDiffusion, keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
@@ -253,10 +254,9 @@ def test_windows_of_a_policy_that_is_trained_on_end_where_its_chunks_do(files, t
 def test_noise_levels_of_another_training_are_refused(files):
     """A timestep means a noise level only together with the number of training steps."""
     policy = own_policy("Lift", files["Lift", "1.5"])
-    message = f"sampler: expected {{'num_train_timesteps': {TRAINED}, .*, got {{'num_train_timesteps': 100"
-    with pytest.raises(ValueError, match=message):
+    with refused("sampler"):
         policy.sampler = Sampler("ddim", 4)
-    with pytest.raises(ValueError, match=message):
+    with refused("sampler"):
         policy.with_plan(None, Sampler("ddim", 4))
     assert policy.num_inference_steps == 4
 
@@ -267,5 +267,5 @@ def test_a_policy_of_a_task_is_trained_on_for_a_variant_and_then_says_so(files):
     assert continued_source("can_two_ways", policy) == {}
     policy.source = {"task": "can_lowdim", "n_action_steps": 3}
     assert continued_source("can_two_ways", policy) == {"task": "can_two_ways", "n_action_steps": 3}
-    with pytest.raises(ValueError, match="expected one of 19 observed numbers and 10 of an action, for Lift"):
+    with refused("policy"):
         continued_source("lift", policy)

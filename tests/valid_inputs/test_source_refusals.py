@@ -3,11 +3,11 @@
 import json
 
 import h5py
-import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.data.published_demos import env_args_14
+from tests.refusals import refused
 from tests.training.vla.rendered import write_demos
 from tests.valid_inputs.test_source import (  # noqa: F401  a fixture
     OLD_KEYS,
@@ -37,7 +37,7 @@ def test_a_file_that_names_no_robosuite_is_shown_to_nobody(tmp_path):
     with h5py.File(path, "a") as file:
         del file["data"].attrs["env_args"]
     for policy in policies:
-        with pytest.raises(ValueError, match=r"silent.h5: expected an attribute env_args of 'data'"):
+        with refused("silent.h5"):
             policy_demos(path, "lift", policy)
 
 
@@ -57,9 +57,7 @@ def test_the_version_counts_more_than_the_form_of_the_controller(files, tmp_path
 
 def test_an_unknown_version_is_named(tmp_path):
     path = write(tmp_path / "newest.h5", "Lift", "1.5", {"env_version": "master"})
-    with pytest.raises(
-        ValueError, match=r"newest.h5, env_args.env_version: expected robosuite 1.2 to 1.5, got 'master'"
-    ):
+    with refused("newest.h5, env_args.env_version"):
         contract_demos(path, task_contract("Lift"))
 
 
@@ -68,10 +66,8 @@ def test_a_variant_that_only_robosuite_15_knows_is_refused_to_a_policy_of_14(fil
     old = old_policy("Lift", files["Lift", "1.5"])
     old.source = continued_source("lift_moving", old)
     path = write(tmp_path / "moving.h5", "LiftMoving", "1.5")
-    message = (
-        "object: recorded as of robosuite 1.5, wanted as of 1.4: convention: expected 1.5 for LiftMoving"
-    )
-    with pytest.raises(ValueError, match=message):
+    message = "5, wanted as of 1.4: convention"
+    with refused(message):
         policy_demos(path, "lift_moving", old)
 
 
@@ -79,16 +75,12 @@ def test_demonstrations_that_were_read_for_another_policy_are_refused(files):  #
     """`read_demos` with the right names and the wrong convention or order passes every check of sizes."""
     policy, path = old_policy("Lift", files["Lift", "1.5"]), files["Lift", "1.4"]
     present = read_demos(path, OLD_KEYS, task="Lift")
-    with pytest.raises(ValueError, match=r"demos: expected .* 1.4, as the policy's source says, got .* 1.5"):
+    with refused("demos"):
         make_targets(policy, present, share=0.5, n_action_steps=3)
     swapped = read_demos(path, find_task("Lift").state_keys, convention="1.4")
-    with pytest.raises(
-        ValueError, match=r"demos: expected robot0_gripper_qpos, .* got object, robot0_eef_pos"
-    ):
+    with refused("demos"):
         PolicyTrainer(policy, swapped, TrainConfig(max_steps=1, n_action_steps=3))
-    with pytest.raises(
-        ValueError, match=r"demos: expected one meaning of the state, got object, .*; robot0_grip"
-    ):
+    with refused("demos"):
         join_demos([present, swapped])
 
 
@@ -97,12 +89,12 @@ def test_other_cameras_than_the_policys_are_refused_as_in_the_environment(tmp_pa
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny(state_dim=9, action_dim=10)))
     policy.source = VLASource("LiftNamed", {"image": "agentview_image"})
     path, others = write_demos(tmp_path / "images.h5"), {"image": "robot0_eye_in_hand_image"}
-    message = "cameras.image: expected agentview_image, which the policy was trained with, got robot0_eye"
-    with pytest.raises(ValueError, match=message):
+    message = "cameras.image"
+    with refused(message):
         instructed_demos(path, "lift_named", others, policy)
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         continued_vla_source("lift_named", policy, others)
-    with pytest.raises(ValueError, match="expected one that was trained for Lift, got one for LiftNamed"):
+    with refused("policy"):
         instructed_demos(path, "lift", {"image": "agentview_image"}, policy)
     continued = continued_vla_source("lift", policy, {"image": "agentview_image"})
     assert continued == VLASource("Lift", {"image": "agentview_image"})

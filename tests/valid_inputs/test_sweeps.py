@@ -10,6 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from tests.cli.test_sweeps import finish
 from tests.recipe_modules import load_recipe
+from tests.refusals import refused
 from torchrl_sparse.cli.sweep_files import parameter_sets, read_sweep, trial_command
 from torchrl_sparse.cli.sweeps import LocalSweep, Trial
 from torchrl_sparse.cli.trials import check_served, check_trials
@@ -109,42 +110,42 @@ def test_merged_entries_give_way_to_own_and_earlier_ones(tmp_path, entry, merged
     [
         (
             {"out": {"value": "${oc.env:HOME}/a"}},
-            r"out: expected a value that .*\$\{...\}.*, got '\$\{oc.env:HOME",
+            "sweep.yaml: out",
         ),
-        ({"train": {"parameters": {"lr": {"values": [1, "${lr}"]}}}}, r"train.lr: expected a value that"),
-        ({"sampler": {"value": {"true": 1}}}, r"sampler: expected a value that .* got \{'true': 1\}"),
+        ({"train": {"parameters": {"lr": {"values": [1, "${lr}"]}}}}, "sweep.yaml: train.lr"),
+        ({"sampler": {"value": {"true": 1}}}, "sweep.yaml: sampler"),
         (
             {"train": {"value": {"lr": 1}}, "train.lr": {"values": [1, 2]}},
-            "parameters: expected each option once, got train.lr twice",
+            "sweep.yaml: parameters",
         ),
     ],
 )
 def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, message):
     """A reference would stand for something else; of two parameters that set one option the last would count."""
-    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+    with refused(message):
         read_sweep(write(parameters))
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("seed: {values: [1]}\n  seed: {values: [2]}", "line 3: seed: expected one entry of this name, got"),
-        ("seed: {value: 1, value: 2}", "line 2: value: expected one entry of this name, got another"),
-        ("lr: {value: 1e400}", "parameters.lr.value: expected a finite number, got inf"),
-        ("lr: {values: [1, .nan]}", "parameters.lr.values.1: expected a finite number, got nan"),
-        ("on: {value: 1}", "parameters.True: expected a text as a name, got True"),
-        ("lr: {value: !!timestamp 2026-01-01}", "parameters.lr.value: expected a text, number, list or mapp"),
-        ("lr: {value: !!int ''}", "expected YAML, got "),
-        ("lr: {value: &a [*a]}", "expected YAML, got one that is too deep"),
-        ("lr: {value: &a {<<: *a}}", "expected YAML, got one that is too deep"),
-        ("lr: {<<: 3}", "line 2: <<: expected a mapping or a list of them"),
+        ("seed: {values: [1]}\n  seed: {values: [2]}", "sweep.yaml: line 3: seed"),
+        ("seed: {value: 1, value: 2}", "sweep.yaml: line 2: value"),
+        ("lr: {value: 1e400}", "sweep.yaml: parameters.lr.value"),
+        ("lr: {values: [1, .nan]}", "sweep.yaml: parameters.lr.values.1"),
+        ("on: {value: 1}", "sweep.yaml: parameters.True"),
+        ("lr: {value: !!timestamp 2026-01-01}", "sweep.yaml: parameters.lr.value"),
+        ("lr: {value: !!int ''}", "sweep.yaml"),
+        ("lr: {value: &a [*a]}", "sweep.yaml"),
+        ("lr: {value: &a {<<: *a}}", "sweep.yaml"),
+        ("lr: {<<: 3}", "sweep.yaml: line 2: <<"),
     ],
 )
 def test_what_a_file_says_twice_or_cannot_mean_is_refused(tmp_path, text, message):
     """YAML: the names of a mapping are unique. PyYAML keeps the last without a word."""
     path = tmp_path / "sweep.yaml"
     path.write_text(f"parameters:\n  {text}\n")
-    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+    with refused(message):
         read_sweep(path)
 
 
@@ -171,26 +172,22 @@ def test_every_trial_is_read_before_the_first(write):
     grid = write({"num_updates": {"values": [10, 5]}, "horizon": {"values": [None, 60]}})
     check_trials(grid, read_sweep(grid))
     late = write({"num_updates": {"values": [10, 5, 0]}})
-    with pytest.raises(ValueError, match=r"sweep.yaml: trial num_updates=0: num_updates: expected greater"):
+    with refused("sweep.yaml: trial num_updates=0: num_updates"):
         check_trials(late, read_sweep(late))
     unknown = write({"num_upates": {"values": [10]}})
-    with pytest.raises(
-        ValueError, match=r"trial num_upates=10: num_upates: expected an option of this recipe"
-    ):
+    with refused("sweep.yaml: trial num_upates=10: num_upates"):
         check_trials(unknown, read_sweep(unknown))
     drawn = write(
         {"episodes": {"distribution": "q_uniform", "min": -16, "max": 64, "q": 16}}, method="random"
     )
-    with pytest.raises(
-        ValueError, match=r"trial episodes=-16: episodes: expected greater than or equal to 1"
-    ):
+    with refused("sweep.yaml: trial episodes=-16: episodes"):
         check_trials(drawn, read_sweep(drawn))
 
 
 def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
-    with pytest.raises(ValueError, match=r"sweep.yaml: early_terminate: expected no early_terminate"):
+    with refused("sweep.yaml: early_terminate"):
         read_sweep(write({"seed": {"values": [1]}}, early_terminate={"type": "hyperband", "min_iter": 3}))
-    with pytest.raises(ValueError, match=r"sweep.yaml: controller: expected no controller"):
+    with refused("sweep.yaml: controller"):
         read_sweep(write({"seed": {"values": [1]}}, controller={"type": "local"}))
     capped = LocalSweep(read_sweep(write({"seed": {"values": [1, 2, 3]}}, run_cap=2)), tmp_path / "out")
     while trial := capped.next_trial():
@@ -201,24 +198,24 @@ def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ({"command": ["python", "${program}"]}, r"command: expected \$\{program\} and \$\{args_no_hyphens\}"),
+        ({"command": ["python", "${program}"]}, "sweep.yaml: command"),
         (
             {"command": ["python", "benchmark.py", "${args_no_hyphens}"]},
-            r"command: expected \$\{program\} and",
+            "sweep.yaml: command",
         ),
-        ({"command": [*COMMAND, "seed=3"]}, "command: expected no parameter in it, got seed"),
-        ({"command": [*COMMAND, "++split=test"]}, "split: expected development, got test: a sweep tunes"),
+        ({"command": [*COMMAND, "seed=3"]}, "sweep.yaml: command"),
+        ({"command": [*COMMAND, "++split=test"]}, "sweep.yaml: split"),
         (
             {"method": "bayes", "metric": {"name": "tested/success"}},
-            "metric.goal: expected maximize or minimize",
+            "sweep.yaml: metric.goal",
         ),
-        ({"metric": {**METRIC, "target": 0.5}}, "metric.target: expected none"),
-        ({"metric": 3}, "metric: expected a name and a goal, got 3"),
+        ({"metric": {**METRIC, "target": 0.5}}, "sweep.yaml: metric.target"),
+        ({"metric": 3}, "sweep.yaml: metric"),
     ],
 )
 def test_a_sweep_that_would_not_do_what_it_says_is_refused(write, entries, message):
     """Parameters that reach no trial, values that stand twice, held-out seeds, a metric that would be minimised."""
-    with pytest.raises(ValueError, match=f"sweep.yaml: {message}"):
+    with refused(message):
         read_sweep(write({"seed": {"values": [1]}}, **entries))
 
 
@@ -228,9 +225,7 @@ def test_a_search_by_a_metric_that_no_trial_reports_is_refused(write, tmp_path):
         read_sweep(write({"seed": {"min": 1, "max": 9}}, **entries)), tmp_path / "out", count=2
     )
     finish(sweep, sweep.next_trial())
-    with pytest.raises(
-        ValueError, match=r"metric.name: expected one of .*tested/success.*got 'tested/succes'"
-    ):
+    with refused("metric.name"):
         sweep.next_trial()
 
 
@@ -249,14 +244,10 @@ def test_a_file_without_a_command_gets_what_recipes_need(write, monkeypatch):
 def test_what_the_servers_agent_cannot_say_is_refused_online(write):
     for value in (None, {"a": 1}, "true", "a=b", ["dense", None]):
         path = write({"horizon": {"values": [value, 60]}})
-        with pytest.raises(
-            ValueError, match=r"sweep.yaml: horizon: expected numbers, plain words .*mode=online"
-        ):
+        with refused("sweep.yaml: horizon"):
             check_served(path, read_sweep(path), "torchrl_sparse")
     path = write({"horizon": {"values": [60]}}, project="mine")
-    with pytest.raises(
-        ValueError, match=r"project: expected that of .*sweep.yaml, 'mine', got 'torchrl_sparse'"
-    ):
+    with refused("project"):
         check_served(path, read_sweep(path), "torchrl_sparse")
 
 

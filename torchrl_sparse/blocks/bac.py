@@ -26,6 +26,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, block_name
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+from torchrl_sparse.errors import InputError
 
 __all__ = [
     "BAC",
@@ -71,17 +72,17 @@ def acs(similarity: Tensor, num_updates: int, objective: Objective = "anchor") -
         (0, 3)
     """
     if similarity.ndim != 2 or similarity.shape[0] != similarity.shape[1]:
-        raise ValueError(f"similarity: expected a square matrix [K, K], got shape {list(similarity.shape)}")
+        raise InputError(f"similarity: expected a square matrix [K, K], got shape {list(similarity.shape)}")
     if not similarity.isfinite().all():
-        raise ValueError("similarity: expected finite values, got NaN or infinity")
+        raise InputError("similarity: expected finite values, got NaN or infinity")
     if not 1 <= num_updates <= len(similarity):
-        raise ValueError(f"num_updates: expected 1..{len(similarity)} (K), got {num_updates}")
+        raise InputError(f"num_updates: expected 1..{len(similarity)} (K), got {num_updates}")
     if objective == "anchor":
         return _anchored(similarity.double(), num_updates)
     if objective == "consecutive":
         change = similarity.diagonal(offset=1).argsort(stable=True)[: num_updates - 1] + 1
         return (0, *sorted(change.tolist()))
-    raise ValueError(f'objective: expected "anchor" or "consecutive", got {objective!r}')
+    raise InputError(f'objective: expected "anchor" or "consecutive", got {objective!r}')
 
 
 def _anchored(similarity: Tensor, num_updates: int) -> tuple[int, ...]:
@@ -109,9 +110,9 @@ def upstream_blocks(errors: Tensor | Sequence[float], top_k: int) -> tuple[int, 
     """
     errors = torch.as_tensor(errors)
     if errors.ndim != 1 or not errors.isfinite().all():
-        raise ValueError(f"errors: expected finite scores [3L], got {errors.tolist()}")
+        raise InputError(f"errors: expected finite scores [3L], got {errors.tolist()}")
     if not 0 <= top_k <= len(errors):
-        raise ValueError(f"top_k: expected 0..{len(errors)} (3L blocks), got {top_k}")
+        raise InputError(f"top_k: expected 0..{len(errors)} (3L blocks), got {top_k}")
     return tuple(sorted(errors.argsort(descending=True, stable=True)[:top_k].tolist()))
 
 
@@ -142,7 +143,7 @@ def bubbling_union(
         ((0, 1, 3), (0, 2), (0, 3))
     """
     if len(schedules) != len(errors) or len(schedules) % len(BLOCK_TYPES):
-        raise ValueError(
+        raise InputError(
             f"errors: expected one score per schedule (3L), got {len(errors)} for {len(schedules)} schedules"
         )
     merged = [set(steps) for steps in schedules]
@@ -243,7 +244,7 @@ class BAC(SchedulePlanner):
     def __init__(self, schedule: CacheSchedule) -> None:
         super().__init__(schedule)
         if self.schedule.method not in SCHEDULES:
-            raise ValueError(
+            raise InputError(
                 f"BAC: expected a schedule of {sorted(SCHEDULES)}, got one of {self.schedule.method!r}"
             )
 

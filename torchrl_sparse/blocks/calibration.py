@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -92,11 +93,11 @@ def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor,
         (torch.Size([3, 8, 8]), torch.Size([3]))
     """
     if network.training:
-        raise ValueError(
+        raise InputError(
             "network: expected eval mode, got training mode (dropout would be part of the features)"
         )
     if len(cond) == 0:
-        raise ValueError("cond: expected at least one sample, got none")
+        raise InputError("cond: expected at least one sample, got none")
     similarity, errors = 0, 0
     for sample in range(len(cond)):  # One at a time bounds the memory to the features of one query.
         recorder = FeatureRecorder()

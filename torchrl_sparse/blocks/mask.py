@@ -27,6 +27,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import BLOCK_TYPES, TransformerForDiffusion
 
 __all__ = [
@@ -71,7 +72,7 @@ def block_name(column: int) -> str:
     return f"layers.{layer}.{BLOCK_TYPES[kind]}"
 
 
-class MaskError(ValueError):
+class MaskError(InputError):
     """A tensor that is no prune mask: its message names what was expected and what came."""
 
 
@@ -123,7 +124,7 @@ def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[in
 def check_reuse(reuse: str) -> None:
     """Raise ValueError unless ``reuse`` names a reuse rule."""
     if reuse not in REUSE_RULES:
-        raise ValueError(f"reuse: expected one of {list(REUSE_RULES)}, got {reuse!r}")
+        raise InputError(f"reuse: expected one of {list(REUSE_RULES)}, got {reuse!r}")
 
 
 def num_buffers(reuse: Reuse, num_blocks: int) -> int:

@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, MaskError, Reuse, check_form, check_reuse, validate_mask
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.keys import COND, PRUNE_MASK, read
 from torchrl_sparse.networks.fingerprint import is_same_policy
 
@@ -53,7 +54,7 @@ class PlanSpec:
         >>> PlanSpec(100, 8, "a policy").check_is(PlanSpec(100, 8, "another"), "BAC")
         Traceback (most recent call last):
         ...
-        ValueError: BAC: made for policy fingerprint 'a policy', got 'another'
+        torchrl_sparse.errors.InputError: BAC: made for policy fingerprint 'a policy', got 'another'
         """
         for name in (field.name for field in fields(self)):
             made_for, got = getattr(self, name), getattr(asked, name)
@@ -63,7 +64,7 @@ class PlanSpec:
                     label = "policy fingerprint"
                 elif name != "num_layers":
                     remedy = "; assign plan = None, then the sampler, then a plan that was made for it"
-                raise ValueError(f"{who}: made for {label} {made_for!r}, got {got!r}{remedy}")
+                raise InputError(f"{who}: made for {label} {made_for!r}, got {got!r}{remedy}")
 
 
 class Planner(TensorDictModuleBase):
@@ -167,7 +168,7 @@ class Planner(TensorDictModuleBase):
         try:
             check_form(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
         except MaskError as error:
-            raise ValueError(f"{type(self).__name__}.masks: {error}") from error
+            raise InputError(f"{type(self).__name__}.masks: {error}") from error
         return tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
 
 
@@ -203,7 +204,7 @@ class StaticPlanner(Planner):
         try:
             validate_mask(mask, spec.num_inference_steps, spec.num_layers, batch=())
         except ValueError as error:
-            raise ValueError(f"{type(self).__name__}.mask: {error}") from error
+            raise InputError(f"{type(self).__name__}.mask: {error}") from error
         self._mask = mask
 
     @property

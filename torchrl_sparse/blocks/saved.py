@@ -14,6 +14,7 @@ from typing import Any, Literal
 from torchrl_sparse.blocks import schedule
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec, StaticPlanner
 from torchrl_sparse.blocks.sag import planner as sag
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.json import read_json
 
 __all__ = ["PLANNERS", "load_planner", "save_beside", "saved_planners"]
@@ -47,18 +48,18 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
     file = path / "config.json" if path.is_dir() else path
     found = read_json(file, dict[str, Any]).get("format")
     if found in _REMOVED:
-        raise ValueError(
+        raise InputError(
             f"{file}: format: {found!r} reuses features of earlier policy calls, which this version cannot run; "
             f"expected one of {list(PLANNERS)}"
         )
     if not isinstance(found, str) or found not in PLANNERS:
-        raise ValueError(f"{file}: format: expected one of {list(PLANNERS)}, got {found!r}")
+        raise InputError(f"{file}: format: expected one of {list(PLANNERS)}, got {found!r}")
     planner = PLANNERS[found].from_pretrained(path)
     if spec is not None:
         try:
             planner.bind(spec)
         except ValueError as error:
-            raise ValueError(f"{file}: {error}") from error
+            raise InputError(f"{file}: {error}") from error
     return planner
 
 
@@ -113,7 +114,7 @@ def _storable(planner: Planner) -> Any:
     if type(planner) in PLANNERS.values():
         return planner
     if not isinstance(planner, StaticPlanner):
-        raise ValueError(
+        raise InputError(
             f"plan: expected a planner of a class in PLANNERS or a StaticPlanner, to save it, got {type(planner).__name__}"
         )
     spec = planner.spec

@@ -43,6 +43,7 @@ from torchrl_sparse.blocks.mask import (
     validate_mask,
 )
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
 from torchrl_sparse.networks.diffusion.transformer import MAX_LAYERS
@@ -74,7 +75,7 @@ class _ScheduleFile:
         steps = self.computed_steps
         names = [block_name(column) for column in range(len(steps))]
         if missing := [name for name in names if name not in steps]:
-            raise ValueError(f"computed_steps: expected {', '.join(names)}; missing {missing}")
+            raise InputError(f"computed_steps: expected {', '.join(names)}; missing {missing}")
         return CacheSchedule(
             self.method,
             self.policy,
@@ -123,14 +124,14 @@ class CacheSchedule:
     def __post_init__(self) -> None:
         for name in ("method", "policy"):
             if not getattr(self, name):
-                raise ValueError(f"{name}: expected a non-empty string, got {getattr(self, name)!r}")
+                raise InputError(f"{name}: expected a non-empty string, got {getattr(self, name)!r}")
         check_size("num_inference_steps", self.num_inference_steps, MAX_TRAIN_TIMESTEPS)
         check_size("num_layers", self.num_layers, MAX_LAYERS)
         SamplerName.parse(self.sampler)
         check_reuse(self.reuse)
         expected = len(BLOCK_TYPES) * self.num_layers
         if len(self.computed_steps) != expected:
-            raise ValueError(
+            raise InputError(
                 f"computed_steps: expected {expected} blocks (3 * num_layers), got {len(self.computed_steps)}"
             )
         for column, steps in enumerate(self.computed_steps):
@@ -191,7 +192,7 @@ class CacheSchedule:
         try:
             return stored.schedule()
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+            raise InputError(f"{path}: {error}") from error
 
     def _to_json(self) -> str:
         """Return JSON with one line per block, which the standard library's indentation cannot do."""
@@ -224,7 +225,7 @@ class SchedulePlanner(StaticPlanner):
         >>> SchedulePlanner(schedule).bind(PlanSpec(num_inference_steps=4, num_layers=1, policy="another"))
         Traceback (most recent call last):
         ...
-        ValueError: SchedulePlanner: made for policy fingerprint 'a policy', got 'another'
+        torchrl_sparse.errors.InputError: SchedulePlanner: made for policy fingerprint 'a policy', got 'another'
     """
 
     def __init__(self, schedule: CacheSchedule) -> None:
@@ -248,7 +249,7 @@ class SchedulePlanner(StaticPlanner):
 def _check_steps(name: str, steps: Sequence[int], num_steps: int) -> None:
     within = all(0 <= step < num_steps for step in steps)
     if not steps or steps[0] != 0 or not within or any(a >= b for a, b in pairwise(steps)):
-        raise ValueError(
+        raise InputError(
             f"computed_steps of {name}: expected increasing whole numbers in 0..{num_steps - 1} "
             f"that start with 0, got {list(steps)}"
         )

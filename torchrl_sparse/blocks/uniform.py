@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.planner import PlanSpec, StaticPlanner
+from torchrl_sparse.errors import InputError
 
 __all__ = ["Uniform", "uniform_mask"]
 
@@ -51,7 +52,7 @@ class Uniform(StaticPlanner):
 
     def __init__(self, interval: int, *, last: bool = False) -> None:
         if type(interval) is not int or interval < 1:
-            raise ValueError(f"interval: expected a whole number >= 1, got {interval!r}")
+            raise InputError(f"interval: expected a whole number >= 1, got {interval!r}")
         super().__init__()
         self.interval, self.last = interval, last
 

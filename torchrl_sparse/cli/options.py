@@ -1,7 +1,6 @@
 """The values that the options of all recipes may have. A word has one meaning in all of them, so this is one table.
 
-A recipe's yaml has the defaults and says what each option does. Checks that need more than the option alone, such as whether
-there is a task of that name, are made where the option is used, before anything is written.
+A recipe's yaml has the defaults and says what each option does. Whether there is a task of a name is checked where it is used.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import Annotated, Any, Literal
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, Field
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.devices import check_device
 from torchrl_sparse.storage.json import check_plain
 
@@ -24,7 +24,7 @@ __all__ = ["OPEN_SECTIONS", "OPTIONS", "check_names", "check_options"]
 def _path_or_paths(value: Any) -> Any:
     paths = [value] if isinstance(value, str) else value
     if not (isinstance(paths, list) and paths and all(isinstance(path, str) for path in paths)):
-        raise ValueError(f"expected a path or a list of them, got {value!r}")
+        raise InputError(f"expected a path or a list of them, got {value!r}")
     return value
 
 
@@ -243,12 +243,12 @@ def check_options(recipe: str, options: Mapping[str, Any], table: Mapping[str, A
     >>> check_options("benchmark", {"task": "lift", "episodes": 0})
     Traceback (most recent call last):
     ...
-    ValueError: episodes: expected greater than or equal to 1, got 0
+    torchrl_sparse.errors.InputError: episodes: expected greater than or equal to 1, got 0
     """
     for key, value in _leaves(recipe, options):
         kind = _lookup(recipe, key, table)
         if kind is None:
-            raise ValueError(f"{key}: expected no such option, got {value!r}")
+            raise InputError(f"{key}: expected no such option, got {value!r}")
         check_plain(value, kind, key)
 
 
@@ -276,7 +276,7 @@ def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> Non
     >>> check_names(options, lambda name: None)
     Traceback (most recent call last):
     ...
-    ValueError: pairs: expected two of dense, bac, got ['dense', 'sag']
+    torchrl_sparse.errors.InputError: pairs: expected two of dense, bac, got ['dense', 'sag']
     """
     for name in options["methods"]:
         check(name)
@@ -284,11 +284,11 @@ def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> Non
         try:
             check(name)
         except ValueError as error:
-            raise ValueError(f"videos{str(error).removeprefix('methods')}") from error
+            raise InputError(f"videos{str(error).removeprefix('methods')}") from error
     methods = list(dict.fromkeys(["dense", *options["methods"]]))
     for pair in options["pairs"]:
         if not set(pair) <= set(methods):
-            raise ValueError(f"pairs: expected two of {', '.join(methods)}, got {list(pair)}")
+            raise InputError(f"pairs: expected two of {', '.join(methods)}, got {list(pair)}")
 
 
 def given(options: Mapping[str, Any]) -> dict[str, Any]:

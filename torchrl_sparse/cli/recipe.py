@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sparse.cli.options import OPTIONS, check_options
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.runtime.lock import lock_output
 from torchrl_sparse.runtime.names import closest
@@ -98,7 +99,7 @@ def check_command(program: Path, words: Sequence[str]) -> None:
             config = hydra.compose(options.stem, overrides=list(words))
         check_options(options.stem, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except (ValueError, HydraException, OmegaConfBaseException) as error:
-        raise ValueError(_one_line(error)) from error
+        raise InputError(_one_line(error)) from error
 
 
 def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: str) -> None:
@@ -114,7 +115,7 @@ def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: s
     for name in names:
         if config[name] != defaults[name]:
             expected = "null" if defaults[name] is None else defaults[name]
-            raise ValueError(f"{name}: expected {expected} {why}, got {config[name]}")
+            raise InputError(f"{name}: expected {expected} {why}, got {config[name]}")
 
 
 def _help(purpose: str, options: Path) -> str:

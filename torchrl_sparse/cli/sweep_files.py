@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.yaml import read_yaml
 
 __all__ = ["find_program", "hydra_word", "parameter_sets", "read_sweep", "sweep_engine", "trial_command"]
@@ -45,7 +46,7 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     """
     written = read_yaml(path)
     if not isinstance(written, dict):
-        raise ValueError(f"{path}: expected a wandb sweep, got {type(written).__name__}")
+        raise InputError(f"{path}: expected a wandb sweep, got {type(written).__name__}")
     config: dict[str, Any] = {"command": [*DEFAULT_COMMAND], **written}
     _check_entries(path, config)
     _check_parameters(path, config["parameters"])
@@ -56,11 +57,11 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     except ValueError as error:
         violations = [str(error)]
     if violations:
-        raise ValueError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
+        raise InputError(f"{path}: expected a wandb sweep, got {'; '.join(violations)}")
     split = config["parameters"].get("split", {})
     said = {str(word).lstrip("+") for word in config["command"]}
     if "split=test" in said or "test" in [split.get("value"), *split.get("values", [])]:
-        raise ValueError(f"{path}: split: expected development, got test: a sweep tunes")
+        raise InputError(f"{path}: split: expected development, got test: a sweep tunes")
     return config
 
 
@@ -69,13 +70,13 @@ def _check_entries(path: str | os.PathLike, config: Mapping[str, Any]) -> None:
     for name, value in config.items():
         if name not in _HONOURED:
             expected = _NOT_HONOURED.get(name, f"some of {', '.join(_HONOURED)}")
-            raise ValueError(f"{path}: {name}: expected {expected}, got {value!r}")
+            raise InputError(f"{path}: {name}: expected {expected}, got {value!r}")
     kinds = {"program": str, "method": str, "parameters": dict, "command": list}
     for name, kind in kinds.items():
         if not isinstance(config.get(name), kind):
-            raise ValueError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
+            raise InputError(f"{path}: {name}: expected a {kind.__name__}, got {config.get(name)!r}")
     if config["method"] not in _METHODS:
-        raise ValueError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
+        raise InputError(f"{path}: method: expected one of {', '.join(_METHODS)}, got {config['method']!r}")
 
 
 def _check_parameters(path: str | os.PathLike, parameters: Mapping[str, Any]) -> None:
@@ -87,10 +88,10 @@ def _check_parameters(path: str | os.PathLike, parameters: Mapping[str, Any]) ->
             found |= {f"{option}.{inner}" for inner in value} if isinstance(value, dict) else {option}
             if not _arrives(value):
                 expected = "a value that Hydra reads as it stands, without ${...} and other marks in names"
-                raise ValueError(f"{path}: {option}: expected {expected}, got {value!r}")
+                raise InputError(f"{path}: {option}: expected {expected}, got {value!r}")
         options += [option.lstrip("+") for option in found]
     if twice := sorted({option for option in options if options.count(option) > 1}):
-        raise ValueError(f"{path}: parameters: expected each option once, got {', '.join(twice)} twice")
+        raise InputError(f"{path}: parameters: expected each option once, got {', '.join(twice)} twice")
 
 
 def parameter_values(name: str, entry: Any) -> Iterator[tuple[str, Any]]:
@@ -125,18 +126,18 @@ def _check_command(path: str | os.PathLike, config: dict[str, Any]) -> None:
         config["command"] = [word for word in DEFAULT_COMMAND if word.partition("=")[0] not in parameters]
     named = {str(word).partition("=")[0].lstrip("+") for word in config["command"]}
     if twice := sorted(named & parameters.keys()):
-        raise ValueError(f"{path}: command: expected no parameter in it, got {', '.join(twice)}")
+        raise InputError(f"{path}: command: expected no parameter in it, got {', '.join(twice)}")
     for macro in ("${program}", "${args"):
         if not any(str(word).startswith(macro) for word in config["command"]):
             expected = "${program} and ${args_no_hyphens} among its words"
-            raise ValueError(f"{path}: command: expected {expected}, got {config['command']}")
+            raise InputError(f"{path}: command: expected {expected}, got {config['command']}")
     metric = config.get("metric", {})
     if not isinstance(metric, dict):
-        raise ValueError(f"{path}: metric: expected a name and a goal, got {metric!r}")
+        raise InputError(f"{path}: metric: expected a name and a goal, got {metric!r}")
     if config["method"] == "bayes" and "goal" not in metric:
-        raise ValueError(f"{path}: metric.goal: expected maximize or minimize, got {metric}")
+        raise InputError(f"{path}: metric.goal: expected maximize or minimize, got {metric}")
     if "target" in metric:
-        raise ValueError(f"{path}: metric.target: expected none: a sweep runs all its trials")
+        raise InputError(f"{path}: metric.target: expected none: a sweep runs all its trials")
 
 
 def parameter_sets(config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

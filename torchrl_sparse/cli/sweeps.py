@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_sparse.cli.sweep_files import sweep_engine, trial_command
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
 from torchrl_sparse.evaluation.results.tracking import tested_method, trial_metrics
 from torchrl_sparse.runtime.failure import RunFailed
@@ -78,13 +79,13 @@ class LocalSweep:
         self.config, self.out, self.count = dict(config), Path(out), min(caps, default=None)
         self.trials: list[Trial] = []
         if self.count is None and config["method"] != "grid":
-            raise ValueError(f"count: expected a number of trials for method {config['method']!r}, got None")
+            raise InputError(f"count: expected a number of trials for method {config['method']!r}, got None")
         if self._file.exists():
             found = read_json(self._file, SavedSweep)
             if not (differing := describe_differences(found.config, to_plain(self.config))):
                 self.trials = list(found.trials)
             elif any(trial.finished for trial in found.trials):
-                raise ValueError(
+                raise InputError(
                     f"{self._file}: holds another sweep: {differing}; choose another out or move it away"
                 )
 
@@ -133,7 +134,7 @@ class LocalSweep:
         engine, metrics = sweep_engine(), trial_metrics(load_results(self.results_file(trial)))
         wanted = (self.config.get("metric") or {}).get("name")
         if self.config["method"] == "bayes" and wanted not in metrics:
-            raise ValueError(f"metric.name: expected one of {', '.join(metrics)}, got {wanted!r}")
+            raise InputError(f"metric.name: expected one of {', '.join(metrics)}, got {wanted!r}")
         return engine.SweepRun(
             name=trial.id,
             config={name: {"value": value} for name, value in trial.parameters.items()},
@@ -187,7 +188,7 @@ def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
         ValueError: if there is no trial, or trials differ in their numbers of episodes.
     """
     if not trials:
-        raise ValueError("trials: expected at least one finished, got none")
+        raise InputError("trials: expected at least one finished, got none")
     first = trials[0][1]
     names = [tested_method(results) for _, results in trials]
     if len({DENSE, *names}) <= len(names):

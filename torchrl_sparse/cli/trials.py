@@ -17,6 +17,7 @@ from torchrl_sparse.cli.sweep_files import (
     trial_command,
 )
 from torchrl_sparse.cli.sweeps import Trial
+from torchrl_sparse.errors import InputError
 
 __all__ = ["check_served", "check_trials"]
 
@@ -38,7 +39,7 @@ def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> Non
         try:
             check_command(program, words[words.index(str(program)) + 1 :])
         except ValueError as error:
-            raise ValueError(f"{file}: trial {Trial('', dict(parameters)).label}: {error}") from error
+            raise InputError(f"{file}: trial {Trial('', dict(parameters)).label}: {error}") from error
 
 
 def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
@@ -46,12 +47,12 @@ def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
     for name, entry in settings["parameters"].items():
         for option, value in parameter_values(name, entry):
             if option != name or _agent_changes(value):
-                raise ValueError(
+                raise InputError(
                     f"{file}: {option}: expected numbers, plain words or lists of them with mode=online, whose agent writes "
                     f"null, mappings and texts such as 'true' or 'a=b' as Hydra does not read them, got {value!r}"
                 )
     if settings.get("project", project) != project:
-        raise ValueError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
+        raise InputError(f"project: expected that of {file}, {settings['project']!r}, got {project!r}")
 
 
 def _agent_changes(value: Any) -> bool:

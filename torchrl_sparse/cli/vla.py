@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.json import read_json
 from torchrl_sparse.storage.published.openvla_oft import is_openvla_oft
@@ -40,7 +41,7 @@ def load_vla(config: DictConfig, data_set: str | None) -> VLAPolicy:
     """
     options = {"heads": config.heads} | OmegaConf.to_container(config.published)
     if unknown := options.keys() - {*_UNSAID}:
-        raise ValueError(
+        raise InputError(
             f"published: expected some of {', '.join(_UNSAID)}, got {', '.join(sorted(unknown))}"
         )
     given = {name: value for name, value in options.items() if value is not None}

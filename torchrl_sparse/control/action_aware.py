@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.carried import COUNT, FLAG, Entry
 from torchrl_sparse.control.chunk_executor import action_at
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.json import parse_json
 
 _DELTA_DIM = 7  # three of translation, three of rotation, the gripper
@@ -47,11 +48,11 @@ class Thresholds:
         for name in ("translation", "rotation"):
             enter, leave = getattr(self, name), getattr(self, f"leave_{name}")
             if not 0 < enter <= leave:
-                raise ValueError(
+                raise InputError(
                     f"{name}: expected 0 < {name} <= leave_{name}, got {name}={enter} and leave_{name}={leave}"
                 )
         if self.leave_rise < 0:
-            raise ValueError(f"leave_rise: expected at least 0, got {self.leave_rise}")
+            raise InputError(f"leave_rise: expected at least 0, got {self.leave_rise}")
 
     def enters(self, twist: Tensor) -> Tensor:
         """Tell, bool [...], whether a motion [..., 6] enters fine mode."""
@@ -201,11 +202,11 @@ class ActionAwareController(TensorDictModuleBase):
     ):
         super().__init__()
         if on not in ("measured", "commanded"):
-            raise ValueError(f"on: expected 'measured' or 'commanded', got {on!r}")
+            raise InputError(f"on: expected 'measured' or 'commanded', got {on!r}")
         if warmup_steps < 1:
-            raise ValueError(f"warmup_steps: expected at least 1, got {warmup_steps}")
+            raise InputError(f"warmup_steps: expected at least 1, got {warmup_steps}")
         if on == "measured" and isinstance(thresholds, ReleaseThresholds):
-            raise ValueError("thresholds: expected Thresholds with on='measured', got ReleaseThresholds")
+            raise InputError("thresholds: expected Thresholds with on='measured', got ReleaseThresholds")
         self.on = on
         self.chunk_steps = chunk_steps
         self.budgets = (float(coarse), float(fine))
@@ -241,7 +242,7 @@ class ActionAwareController(TensorDictModuleBase):
         """Read the velocity of each arm, [*B, arms, 6]."""
         velocity = keys.read(tensordict, keys.EEF_VEL)
         if velocity.shape[-1] % 6:
-            raise ValueError(f"{keys.EEF_VEL}: expected 6 numbers per arm, got {velocity.shape[-1]}")
+            raise InputError(f"{keys.EEF_VEL}: expected 6 numbers per arm, got {velocity.shape[-1]}")
         return velocity.unflatten(-1, (-1, 6))
 
     @classmethod
@@ -257,7 +258,7 @@ class ActionAwareController(TensorDictModuleBase):
             >>> ActionAwareController.from_options(fin=36.0)
             Traceback (most recent call last):
             ...
-            ValueError: controller: fin: expected no such key, got 36.0
+            torchrl_sparse.errors.InputError: controller: fin: expected no such key, got 36.0
         """
         found = vars(parse_json(json.dumps(options), ControllerOptions, "controller"))
         return cls(found.pop("motion"), **found)
@@ -268,7 +269,7 @@ class ActionAwareController(TensorDictModuleBase):
         """
         chunk = keys.recall(tensordict, keys.CHUNK, (1, _DELTA_DIM), 0.0)
         if chunk.shape[-1] % _DELTA_DIM:
-            raise ValueError(
+            raise InputError(
                 f"{keys.CHUNK}: on='commanded' expects delta actions, {_DELTA_DIM} numbers per arm, got "
                 f"{chunk.shape[-1]}; use on='measured'"
             )

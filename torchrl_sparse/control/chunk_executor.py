@@ -24,6 +24,7 @@ from torchrl_sparse.carried import (
     refuse,
 )
 from torchrl_sparse.control.plain import PlainLoop
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.noise import NOISE_STREAM
 
 if TYPE_CHECKING:
@@ -79,11 +80,11 @@ class ChunkExecutor(TensorDictModuleBase):
     ):
         super().__init__()
         if num_samples < 1 or (num_samples > 1) != (selector is not None):
-            raise ValueError(
+            raise InputError(
                 f"num_samples: expected 1, or more with a selector, got {num_samples} and selector {selector}"
             )
         if n_action_steps < 1:
-            raise ValueError(f"n_action_steps: expected at least 1, got {n_action_steps}")
+            raise InputError(f"n_action_steps: expected at least 1, got {n_action_steps}")
         self.policy = policy
         self.n_action_steps = n_action_steps
         self.controller, self.num_samples, self.selector = controller, num_samples, selector
@@ -227,7 +228,7 @@ class ChunkExecutor(TensorDictModuleBase):
         answer = self._ask(self._request(tensordict).reshape(-1)[index])
         length = answer.get(keys.CHUNK).shape[-2]
         if length < self.n_action_steps:
-            raise ValueError(
+            raise InputError(
                 f"{keys.CHUNK}: expected at least n_action_steps={self.n_action_steps} actions, got {length}"
             )
         for key in (*self.policy.out_keys, *([keys.CHOSEN] if self.selector is not None else ())):

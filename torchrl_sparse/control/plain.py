@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 
 __all__ = ["PlainLoop"]
 
@@ -29,7 +30,7 @@ class PlainLoop:
         self._executor = executor
         policy: Any = executor.policy
         if keys.HISTORY_STATE not in policy.in_keys or not hasattr(policy, "n_obs_steps"):
-            raise ValueError(
+            raise InputError(
                 f"policy: expected one that reads {keys.HISTORY_STATE}, got {type(policy).__name__}"
             )
         self._policy, self._seed, self._step = policy, seed, 0
@@ -43,7 +44,7 @@ class PlainLoop:
         """Return the action of this step; see `ChunkExecutor.act`."""
         if observation.keys() != self._past.keys() | self._now:
             expected, got = sorted(self._past.keys() | self._now), sorted(observation)
-            raise ValueError(
+            raise InputError(
                 f"observation: expected {', '.join(expected)}, got {', '.join(got) or 'nothing'}"
             )
         # everything is checked before anything is kept, so that a refused observation can be handed over again mended
@@ -75,11 +76,11 @@ class PlainLoop:
 def _numbers(name: str, value: np.ndarray, size: int | None) -> Tensor:
     expected = f"{name}: expected {'' if size is None else f'{size} '}finite numbers in one row"
     if value.dtype.kind not in "fiu":
-        raise ValueError(f"{expected}, got dtype {value.dtype}")
+        raise InputError(f"{expected}, got dtype {value.dtype}")
     if value.ndim != 1 or size not in (None, len(value)):
-        raise ValueError(f"{expected}, got shape {value.shape}")
+        raise InputError(f"{expected}, got shape {value.shape}")
     if not np.isfinite(value).all():
-        raise ValueError(f"{expected}, got {value.tolist()}")
+        raise InputError(f"{expected}, got {value.tolist()}")
     return torch.from_numpy(value.astype(np.float32))
 
 
@@ -87,9 +88,9 @@ def _image(name: str, value: np.ndarray, size: tuple[int, int]) -> Tensor:
     """Return u8 [3, h, w] of an image in that layout or, as cameras give it, in [h, w, 3]."""
     expected = f"{name}: expected uint8 of shape {(*size, 3)} or {(3, *size)}"
     if value.dtype != np.uint8:
-        raise ValueError(f"{expected}, got dtype {value.dtype}")
+        raise InputError(f"{expected}, got dtype {value.dtype}")
     if value.shape == (*size, 3):
         value = value.transpose(2, 0, 1)
     if value.shape != (3, *size):
-        raise ValueError(f"{expected}, got shape {value.shape}")
+        raise InputError(f"{expected}, got shape {value.shape}")
     return torch.from_numpy(value.copy())

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.carried import COUNT, Entry
 from torchrl_sparse.control.chunk_executor import ChunkExecutor, action_at
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 from torchrl_sparse.rotations import quaternion_to_rot6d
 
@@ -71,7 +72,7 @@ class RealtimeExecutor(ChunkExecutor):
     ):
         super().__init__(policy, n_action_steps, controller, num_samples=num_samples, selector=selector)
         if latency is not None and not (math.isfinite(latency) and latency >= 0):
-            raise ValueError(f"latency: expected None or seconds >= 0, got {latency}")
+            raise InputError(f"latency: expected None or seconds >= 0, got {latency}")
         self.hold = hold
         self.latency = latency
         self.control_freq = control_freq

@@ -23,6 +23,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 
 __all__ = ["RollForward", "StateModel"]
@@ -60,7 +61,7 @@ class StateModel(nn.Module):
         """
         long_enough = [episode for episode in episodes if len(episode[0]) > 2]
         if not long_enough:
-            raise ValueError("episodes: expected one of 3 steps or more, got none")
+            raise InputError("episodes: expected one of 3 steps or more, got none")
         inputs = torch.cat([_inputs(state[:-2], state[1:-1], action[1:-1]) for state, action in long_enough])
         change = torch.cat([state[2:].double() - state[1:-1].double() for state, _ in long_enough])
         scale = inputs.std(dim=0)
@@ -95,7 +96,7 @@ class StateModel(nn.Module):
             rolled.append((history[:, -1] - after).abs())
             stale.append((state[1 : count + 1] - after).abs())
         if not rolled:
-            raise ValueError(f"episodes: expected one of more than {steps + 1} steps, got none")
+            raise InputError(f"episodes: expected one of more than {steps + 1} steps, got none")
         return torch.cat(rolled).mean(dim=0), torch.cat(stale).mean(dim=0)
 
     def roll(self, history: Tensor, action: Tensor) -> Tensor:
@@ -132,7 +133,7 @@ class RollForward(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase, model: StateModel):
         super().__init__()
         if keys.HISTORY_STATE not in policy.in_keys:
-            raise ValueError(
+            raise InputError(
                 f"policy: expected one that reads {keys.HISTORY_STATE}, got one of {policy.in_keys}"
             )
         self.policy, self.model = policy, model
@@ -152,7 +153,7 @@ class RollForward(TensorDictModuleBase):
             return self.policy(tensordict)
         history = keys.read(tensordict, keys.HISTORY_STATE)
         if history.shape[-2] < 2:
-            raise ValueError(
+            raise InputError(
                 f"{keys.HISTORY_STATE}: expected 2 observation steps or more, got {history.shape[-2]}"
             )
         old = keys.read(tensordict, keys.LAST_CHUNK)

@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 
 __all__ = ["CoherentChunk", "backward_coherence", "disagreement"]
 
@@ -73,9 +74,9 @@ class CoherentChunk(TensorDictModuleBase):
     def __init__(self, backward: float = 1.0, agreement: float = 0.0, decay: float = 0.5) -> None:
         super().__init__()
         if not (backward >= 0 and agreement >= 0):
-            raise ValueError(f"backward, agreement: expected weights >= 0, got {backward}, {agreement}")
+            raise InputError(f"backward, agreement: expected weights >= 0, got {backward}, {agreement}")
         if not 0 < decay <= 1:
-            raise ValueError(f"decay: expected a number in (0, 1], got {decay}")
+            raise InputError(f"decay: expected a number in (0, 1], got {decay}")
         self.backward, self.agreement, self.decay = backward, agreement, decay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

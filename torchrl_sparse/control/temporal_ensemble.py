@@ -25,6 +25,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import Entry
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.warm_start import shift_chunk
 
 __all__ = ["TemporalEnsemble"]
@@ -59,7 +60,7 @@ class TemporalEnsemble(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase, coeff: float = 0.01):
         super().__init__()
         if not math.isfinite(coeff):
-            raise ValueError(f"coeff: expected a finite number, got {coeff}")
+            raise InputError(f"coeff: expected a finite number, got {coeff}")
         self.policy, self.coeff = policy, coeff
         self.in_keys = list(dict.fromkeys([*policy.in_keys, keys.LAST_CHUNK, keys.ELAPSED, keys.ENSEMBLED]))
         self.out_keys = [*policy.out_keys, keys.ENSEMBLED]

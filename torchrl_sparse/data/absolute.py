@@ -46,6 +46,7 @@ from torchrl_sparse.data.recorded_poses import (
 )
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import POSE_DIM
 
 __all__ = ["AbsoluteActions", "convert_demos"]
@@ -174,7 +175,7 @@ class AbsoluteActions:
     def _check(self, states: np.ndarray, actions: np.ndarray) -> None:
         task, size = self.env.task, len(self.env.sim_env.sim.get_state().flatten())
         if states.shape[1] != size or actions.shape[1] != POSE_DIM * task.arms:
-            raise ValueError(
+            raise InputError(
                 f"expected {size} numbers of a state and {POSE_DIM * task.arms} of an action of {task.name}, "
                 f"got {states.shape[1]} and {actions.shape[1]}"
             )
@@ -189,7 +190,7 @@ class AbsoluteActions:
             return
         far, turn = steps_out_of_reach(actions, positions, quaternions)
         if (far <= REACH).all() and (turn <= TURN).all():
-            raise ValueError(
+            raise InputError(
                 "actions: expected deltas, as the file's controller takes them, got absolute poses; poses=true says so"
             )
 
@@ -250,7 +251,7 @@ def _saying(where: str | Path) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
 
 
 def _merge(source: Node, out: Path, names: Sequence[str], parts: Path, attributes: Mapping[str, Any]) -> int:

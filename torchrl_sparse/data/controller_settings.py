@@ -14,6 +14,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from torchrl_sparse.envs.simulator import CONTROL_FREQ
+from torchrl_sparse.errors import InputError
 
 __all__ = ["Choice", "arm_settings", "check_entries", "check_env_kwargs", "six_numbers"]
 
@@ -97,18 +98,18 @@ def check_entries(where: str, entries: Any, known: Mapping[str, Choice]) -> None
     >>> check_entries("env_kwargs", {"control_freq": 10}, {"control_freq": (20,)})
     Traceback (most recent call last):
     ...
-    ValueError: env_kwargs.control_freq: expected 20, got 10
+    torchrl_sparse.errors.InputError: env_kwargs.control_freq: expected 20, got 10
     """
     if not isinstance(entries, Mapping):
-        raise ValueError(f"{where}: expected entries by name, got {reprlib.repr(entries)}")
+        raise InputError(f"{where}: expected entries by name, got {reprlib.repr(entries)}")
     for name, value in entries.items():
         if name not in known:
-            raise ValueError(
+            raise InputError(
                 f"{where}.{name}: expected one of {', '.join(known)}, got an entry of which is not known what it changes"
             )
         choice = known[name]
         if choice is not None and not any(value == each and _kind(value) == _kind(each) for each in choice):
-            raise ValueError(
+            raise InputError(
                 f"{where}.{name}: expected {' or '.join(map(repr, choice))}, got {reprlib.repr(value)}"
             )
 
@@ -118,7 +119,7 @@ def check_env_kwargs(where: str, env_kwargs: Any) -> None:
     check_entries(where, env_kwargs, _ENV_KWARGS)
     for name in ("robots", "controller_configs"):
         if name not in env_kwargs:
-            raise ValueError(f"{where}.{name}: expected it, got {sorted(env_kwargs)[:20]}")
+            raise InputError(f"{where}.{name}: expected it, got {sorted(env_kwargs)[:20]}")
 
 
 def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
     """
     each = configs if isinstance(configs, list) and configs else [configs]
     if any(other != each[0] for other in each):
-        raise ValueError(f"{where}: expected the same controller for all arms, got different ones")
+        raise InputError(f"{where}: expected the same controller for all arms, got different ones")
     if is_old or (isinstance(each[0], Mapping) and "body_parts" not in each[0]):
         return _flat_settings(where, each[0], is_old)
     check_entries(where, each[0], _COMPOSITE)
@@ -145,7 +146,7 @@ def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
     )
     check_entries(where, arms, _BODY_PARTS)
     if "right" not in arms:
-        raise ValueError(f"{where}: expected an arm 'right', got {sorted(arms)[:5]}")
+        raise InputError(f"{where}: expected an arm 'right', got {sorted(arms)[:5]}")
     return _new_settings(f"{where}.right", arms["right"])
 
 
@@ -154,7 +155,7 @@ def six_numbers(where: str, value: Any) -> tuple[float, ...]:
     values = value if isinstance(value, list) else [value] * 6
     is_number = all(isinstance(each, (int, float)) and not isinstance(each, bool) for each in values)
     if len(values) != 6 or not is_number or not all(map(math.isfinite, values)):
-        raise ValueError(f"{where}: expected a number or six, got {reprlib.repr(value)}")
+        raise InputError(f"{where}: expected a number or six, got {reprlib.repr(value)}")
     return tuple(map(float, values))
 
 
@@ -171,7 +172,7 @@ def _new_settings(where: str, config: Any) -> dict[str, Any]:
     check_entries(where, config, _ARM_15)
     _check_type(where, config)
     if config.get("control_delta") is False and config.get("input_type") != "absolute":
-        raise ValueError(
+        raise InputError(
             f"{where}.control_delta: expected true or input_type 'absolute' with it, got false, which 1.5 does not read"
         )
     return {"input_type": "delta", "input_ref_frame": "base", **config}
@@ -179,7 +180,7 @@ def _new_settings(where: str, config: Any) -> dict[str, Any]:
 
 def _check_type(where: str, config: Mapping[str, Any]) -> None:
     if "type" not in config:
-        raise ValueError(f"{where}.type: expected OSC_POSE, got none")
+        raise InputError(f"{where}.type: expected OSC_POSE, got none")
 
 
 def _kind(value: Any) -> type:

@@ -30,6 +30,7 @@ from tensordict import TensorDictBase
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.contract import Contract, policy_contract, task_contract
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.diffusion import make_method
 from torchrl_sparse.networks.fingerprint import is_same_policy
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -63,9 +64,9 @@ class Driving:
 
     def __post_init__(self) -> None:
         if self.n_action_steps < 1:
-            raise ValueError(f"n_action_steps: expected at least 1, got {self.n_action_steps}")
+            raise InputError(f"n_action_steps: expected at least 1, got {self.n_action_steps}")
         if not 0 <= self.mixing <= 1:
-            raise ValueError(f"mixing: expected a probability, got {self.mixing}")
+            raise InputError(f"mixing: expected a probability, got {self.mixing}")
 
     def draw_steps(self, seed: int, longest: int) -> int:
         """Draw how many steps the policy drives in the episode of a seed, ``longest`` at most.
@@ -140,12 +141,12 @@ def load_driver(task: str, driving: Driving) -> Driver:
 
 def _check_policy(policy: DiffusionPolicy, driving: Driving) -> None:
     if not is_same_policy(driving.fingerprint, policy.fingerprint):
-        raise ValueError(
+        raise InputError(
             f"policy: expected the weights {driving.fingerprint} in {driving.policy}, got {policy.fingerprint}"
         )
     if policy.vision is not None:
-        raise ValueError(f"policy: expected one that observes states, got one with cameras, {driving.policy}")
+        raise InputError(f"policy: expected one that observes states, got one with cameras, {driving.policy}")
 
 
 def _refuse_calibration() -> Any:
-    raise ValueError("method: expected one that needs no calibration while demonstrations are collected")
+    raise InputError("method: expected one that needs no calibration while demonstrations are collected")

@@ -28,6 +28,7 @@ from torchrl_sparse.data.parts import check_same, claim_parts, parts_of
 from torchrl_sparse.envs.robosuite import InitialState
 from torchrl_sparse.envs.seeds import tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.backends import check_backend
 from torchrl_sparse.runtime.failure import RunFailed
 from torchrl_sparse.storage.json import parse_json
@@ -58,14 +59,14 @@ class Collection:
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
-            raise ValueError(f"episodes: expected at least 1, got {self.episodes}")
+            raise InputError(f"episodes: expected at least 1, got {self.episodes}")
         if self.seed < 0:
-            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+            raise InputError(f"seed: expected 0 or more, got {self.seed}")
         tuning_seeds(self.seed, self.episodes)  # what is trained on them is not tested on them
         task = find_task(self.task)
         task.load_expert()
         if self.quality not in (known := task.demonstrator.qualities):
-            raise ValueError(
+            raise InputError(
                 f"quality: expected one of {', '.join(known)} for {task.name}, got {self.quality!r}"
             )
 
@@ -218,11 +219,11 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
 def _read_model(demo: Node) -> str:
     """Read the MuJoCo model of a demonstration; "" where it is of another simulator."""
     if (model := demo.text("model_file")) is None:
-        raise ValueError(f"{demo.where}: expected an attribute model_file, the episode's model, got none")
+        raise InputError(f"{demo.where}: expected an attribute model_file, the episode's model, got none")
     if (
         "gripper0_" in model and "gripper0_right_" not in model
     ):  # 1.5 calls the gripper's parts by the side of its arm
-        raise ValueError(
+        raise InputError(
             f"{demo.where}, model_file: expected a model of robosuite 1.5, got one of robosuite 1.4 or earlier, "
             "whose parts have other names"
         )

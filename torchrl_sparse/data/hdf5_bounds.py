@@ -12,6 +12,7 @@ import zlib
 import h5py
 
 from torchrl_sparse.data.hdf5_nodes import Layout, Node
+from torchrl_sparse.errors import InputError
 
 __all__ = ["ARRAYS", "IMAGES", "Room", "most_demos"]
 
@@ -35,12 +36,12 @@ class Room:
 
     Examples:
         >>> with h5py.File("in memory", "w", driver="core", backing_store=False) as file:
-        ...     _ = file.create_dataset("actions", (10**9, 7), chunks=(1000, 7))
+        ...     _ = file.create_dataset("actions", (10**7, 7), chunks=(1000, 7))
         ...     demo = Node("demo_0", file)
         ...     Room(demo.file_size(), ARRAYS).enter(demo.find("actions"))
         Traceback (most recent call last):
         ...
-        ValueError: demo_0, actions: expected at most 67108864 bytes of a file of this size, got 56512000000
+        torchrl_sparse.errors.InputError: demo_0, actions: expected at most 67108864 bytes of a file of this size, got 565120000
     """
 
     def __init__(self, size: int, small: int) -> None:
@@ -55,12 +56,12 @@ class Room:
         """
         layout = array.layout()
         if layout.is_elsewhere or layout.shape is None or layout.dtype.kind not in "fiub":
-            raise ValueError(
+            raise InputError(
                 f"{array.where}: expected numbers in the file itself, got {layout.dtype} or a link"
             )
         cost = _cost(layout.shape, layout.chunks, max(itemsize, layout.dtype.itemsize))
         if cost > self._left:
-            raise ValueError(
+            raise InputError(
                 f"{array.where}: expected at most {self._left} bytes of a file of this size, got {cost}"
             )
         self._left -= cost
@@ -85,15 +86,15 @@ def _check_chunks(array: Node, whole: int) -> None:
     """Refuse chunks that unfold into more than they hold, ``whole`` bytes: HDF5 would make room for all of it."""
     compressions = [number for number in array.filters() if number not in _HARMLESS]
     if len(compressions) > 1:
-        raise ValueError(f"{array.where}: expected one compression at most, got {len(compressions)}")
+        raise InputError(f"{array.where}: expected one compression at most, got {len(compressions)}")
     if compressions != [h5py.h5z.FILTER_DEFLATE]:
         return
     for offset in array.chunks_above(_LARGE_CHUNK):
         try:
             unfolded = zlib.decompressobj().decompress(array.stored_chunk(offset), whole + _CHUNK)
         except zlib.error as error:
-            raise ValueError(f"{array.where}: cannot be read: {error}") from error
+            raise InputError(f"{array.where}: cannot be read: {error}") from error
         if len(unfolded) > whole:
-            raise ValueError(
+            raise InputError(
                 f"{array.where}: expected chunks of {whole} bytes, got one that unfolds into more"
             )

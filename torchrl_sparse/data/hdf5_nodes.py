@@ -13,6 +13,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["DAMAGE", "Layout", "Node", "naming"]
 
 DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError, AttributeError)
@@ -25,7 +27,7 @@ def naming(where: str) -> Iterator[None]:
     try:
         yield
     except DAMAGE as error:
-        raise ValueError(f"{where}: cannot be read: {' '.join(str(error).split())}") from error
+        raise InputError(f"{where}: cannot be read: {' '.join(str(error).split())}") from error
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Node:
                     return None
                 kind = item.id.links.get_info(part.encode()).type
             if kind != h5py.h5l.TYPE_HARD:
-                raise ValueError(f"{where}: expected {path!r} in the file itself, got a link to elsewhere")
+                raise InputError(f"{where}: expected {path!r} in the file itself, got a link to elsewhere")
             with naming(where):
                 item = item[part]
         return Node(where, item)
@@ -135,7 +137,7 @@ class Node:
         """
         found = self.find(path)
         if found is None or not found.is_group:
-            raise ValueError(
+            raise InputError(
                 f"{self.where}, {path}: expected a group, got {'another kind of entry' if found else 'none'}"
             )
         return found
@@ -162,11 +164,11 @@ class Node:
         if found is None and default is not None:
             return default
         if found is None:
-            raise ValueError(
+            raise InputError(
                 f"{self.where}: expected an attribute {name!r}, got {self.attribute_names()[:5]}"
             )
         if found[0] != () or found[1].kind not in "iu":
-            raise ValueError(
+            raise InputError(
                 f"{self.where}, {name}: expected a whole number, got {found[1]} {found[0] or ''}".rstrip()
             )
         return int(self._value(name))
@@ -180,7 +182,7 @@ class Node:
         if (found := self._attribute(name)) is None:
             return None
         if found[0] != () or h5py.check_string_dtype(found[1]) is None:
-            raise ValueError(
+            raise InputError(
                 f"{self.where}, {name}: expected a text, got {found[1]} {found[0] or ''}".rstrip()
             )
         text = self._value(name)
@@ -194,7 +196,7 @@ class Node:
         """
         found = self._attribute(name)
         if found is None or found[0] != () or found[1].kind != "b":
-            raise ValueError(
+            raise InputError(
                 f"{self.where}, {name}: expected true or false, got {found[1] if found else 'none'}"
             )
         return bool(self._value(name))

@@ -15,6 +15,7 @@ import numpy as np
 
 from torchrl_sparse.data.hdf5_bounds import ARRAYS, IMAGES, Room, most_demos
 from torchrl_sparse.data.hdf5_nodes import DAMAGE, Node
+from torchrl_sparse.errors import InputError
 
 __all__ = ["ArrayReader", "demo_group", "demo_names", "each_path", "open_demo", "open_demos"]
 
@@ -37,7 +38,7 @@ def open_demos(path: str | Path) -> Iterator[Node]:
         file = h5py.File(path, "r")
     except DAMAGE as error:
         said = " ".join(str(error).split())
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a complete HDF5 file, got one that h5py cannot open ({said}); {_first_loss(path)}"
         ) from error
     with file:
@@ -72,10 +73,10 @@ def demo_names(file: Node, filter_key: str | None = None) -> list[str]:
     there = demo_group(file).names()
     names = [name for name in there if _NAME.fullmatch(name)]
     if not names:
-        raise ValueError(f"{file.where}: expected groups data/demo_<number>, got {there[:5]}")
+        raise InputError(f"{file.where}: expected groups data/demo_<number>, got {there[:5]}")
     most = most_demos(file.file_size())
     if len(names) > most:
-        raise ValueError(
+        raise InputError(
             f"{file.where}: expected at most {most} demonstrations in a file of its size, got {len(names)}"
         )
     if filter_key is not None:
@@ -91,7 +92,7 @@ def demo_group(file: Node) -> Node:
     """
     data = file.find("data", where=file.where)
     if data is None or not data.is_group:
-        raise ValueError(f"{file.where}: expected a group 'data', got {file.names()[:5]}")
+        raise InputError(f"{file.where}: expected a group 'data', got {file.names()[:5]}")
     return data
 
 
@@ -125,12 +126,12 @@ class ArrayReader:
         array = _array(demo, name)
         shape = self._room.enter(array, np.dtype(np.float64).itemsize).shape or ()
         if len(shape) != 2 or shape[0] != length or not length:
-            raise ValueError(
+            raise InputError(
                 f"{array.where}: expected shape [{length} = num_samples > 0, n], got {list(shape)}"
             )
         value = array.read(dtype=np.float64)
         if not np.isfinite(value).all():
-            raise ValueError(f"{array.where}: expected finite numbers, got {value[~np.isfinite(value)][0]}")
+            raise InputError(f"{array.where}: expected finite numbers, got {value[~np.isfinite(value)][0]}")
         return value
 
     def images(self, demo: Node, name: str, length: int) -> np.ndarray:
@@ -143,7 +144,7 @@ class ArrayReader:
         layout = self._room.enter(array, 1)
         shape = layout.shape or ()
         if layout.dtype != np.uint8 or len(shape) != 4 or (shape[0], shape[3]) != (length, 3):
-            raise ValueError(
+            raise InputError(
                 f"{array.where}: expected uint8 [{length}, h, w, 3], got {layout.dtype} {list(shape)}"
             )
         return array.read()
@@ -152,7 +153,7 @@ class ArrayReader:
 def _array(demo: Node, name: str) -> Node:
     array = demo.find(name)
     if array is None or not array.is_array:
-        raise ValueError(f"{demo.where}: expected a dataset {name!r}, got {demo.array_names()[:20]}")
+        raise InputError(f"{demo.where}: expected a dataset {name!r}, got {demo.array_names()[:20]}")
     return array
 
 
@@ -160,18 +161,18 @@ def _filtered(file: Node, filter_key: str, names: list[str]) -> list[str]:
     masks, mask = file.find("mask"), file.find(f"mask/{filter_key}")
     if mask is None or not mask.is_array:
         there = ", ".join(masks.names()[:20]) if masks is not None and masks.is_group else ""
-        raise ValueError(f"{file.where}: expected a filter key mask/{filter_key}, got {there or 'none'}")
+        raise InputError(f"{file.where}: expected a filter key mask/{filter_key}, got {there or 'none'}")
     layout = mask.layout()
     shape = layout.shape or ()
     if len(shape) != 1 or not layout.is_text or shape[0] > len(names):
-        raise ValueError(f"{mask.where}: expected names of demonstrations, got {layout.dtype} {list(shape)}")
+        raise InputError(f"{mask.where}: expected names of demonstrations, got {layout.dtype} {list(shape)}")
     known, listed = {*names}, []
     for index in range(shape[0]):  # one by one: each may be of any length
         listed.append(mask.read_text(index))
         if listed[-1] not in known:
-            raise ValueError(f"{mask.where}: expected demonstrations of the file, got {listed[-1][:80]}")
+            raise InputError(f"{mask.where}: expected demonstrations of the file, got {listed[-1][:80]}")
     if not listed:
-        raise ValueError(f"{mask.where}: expected at least one demonstration, got none")
+        raise InputError(f"{mask.where}: expected at least one demonstration, got none")
     return listed
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_sparse.data.hdf5_bounds import IMAGES
 from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, open_demos
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["RecordedImages", "chosen_cameras", "read_images"]
@@ -81,7 +82,7 @@ def _of_one_size(episodes: Iterator[tuple[str, np.ndarray]]) -> Iterator[np.ndar
     for where, episode in episodes:
         frame = frame or episode.shape[1:]
         if episode.shape[1:] != frame:
-            raise ValueError(
+            raise InputError(
                 f"{where}: expected images {list(frame)} as before, got {list(episode.shape[1:])}"
             )
         yield episode

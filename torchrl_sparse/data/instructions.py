@@ -9,6 +9,7 @@ from typing import Any
 
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import demo_group, demo_names, each_path, open_demos
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.json import parse_json
 
 __all__ = ["read_instruction", "read_instructions"]
@@ -24,12 +25,12 @@ def read_instruction(demo: Node) -> str | None:
     try:
         words = parse_json(text, dict[str, Any], "ep_meta").get("lang")
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"{demo.where}, ep_meta: expected a json object, got {reprlib.repr(text)}"
         ) from error
     if words is None or isinstance(words, str):
         return words
-    raise ValueError(f"{demo.where}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
+    raise InputError(f"{demo.where}, ep_meta: expected a text as 'lang', got {reprlib.repr(words)}")
 
 
 def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
@@ -54,5 +55,5 @@ def _read_file(path: str | Path) -> list[str]:
 
 def _required(demo: Node) -> str:
     if not (words := read_instruction(demo)):
-        raise ValueError(f"{demo.where}: expected an instruction, ep_meta['lang'], got none")
+        raise InputError(f"{demo.where}: expected an instruction, ep_meta['lang'], got none")
     return words

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.json import describe_differences, read_json, write_json
 
 __all__ = ["check_same", "claim_parts", "parts_of"]
@@ -39,6 +40,6 @@ def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) 
     """Raise ValueError unless ``where`` was made with the settings asked for."""
     asked_of_it = {key: found[key] for key in asked if key in found}
     if differing := describe_differences(asked_of_it, asked):
-        raise ValueError(
+        raise InputError(
             f"{where}: made with other settings: {differing}; choose another out or move it away"
         )

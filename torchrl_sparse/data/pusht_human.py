@@ -22,6 +22,7 @@ from torchrl_sparse.data.hdf5_files import new_hdf5
 from torchrl_sparse.data.hdf5_writer import lay_out
 from torchrl_sparse.envs.pusht import KEYPOINTS, block_keypoints
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 
 __all__ = ["convert_pusht"]
 
@@ -88,7 +89,7 @@ def _observations(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     agent, block, angle = np.split(arrays["state"].astype(np.float64), [2, 4], axis=1)
     keypoints = np.stack([block_keypoints(*pose) for pose in zip(block, angle[:, 0], strict=True)])
     if (far := np.abs(keypoints - arrays["keypoint"]).max()) > _TOLERANCE:
-        raise ValueError(f"{path}, keypoint: expected them where 'state' puts them, got {far:.1f} pixels off")
+        raise InputError(f"{path}, keypoint: expected them where 'state' puts them, got {far:.1f} pixels off")
     return np.concatenate([keypoints.reshape(len(agent), -1), agent], axis=1)
 
 
@@ -96,7 +97,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a file of demonstrations, got none")
     if not is_zipfile(path):
-        raise ValueError(f"{path}: expected a complete npz file, got another or a part of one")
+        raise InputError(f"{path}: expected a complete npz file, got another or a part of one")
     names = (*_ROWS, "episode_ends")
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -105,9 +106,9 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             found = sorted(file)
     except _DAMAGES as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path}: expected a complete npz file, got a damaged one: {reason}") from error
+        raise InputError(f"{path}: expected a complete npz file, got a damaged one: {reason}") from error
     if missing:
-        raise ValueError(f"{path}: expected an array {min(missing)!r}, got {found}")
+        raise InputError(f"{path}: expected an array {min(missing)!r}, got {found}")
     _check(path, arrays)
     return arrays
 
@@ -116,12 +117,12 @@ def _check(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         kinds, words = ("iu", "whole numbers") if name == "episode_ends" else ("iuf", "numbers")
         if array.dtype.kind not in kinds:
-            raise ValueError(f"{path}, {name}: expected {words}, got {array.dtype}")
+            raise InputError(f"{path}, {name}: expected {words}, got {array.dtype}")
     ends = arrays["episode_ends"]
     if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) < 1).any():
-        raise ValueError(f"{path}, episode_ends: expected increasing rows above 0, got {ends.tolist()}")
+        raise InputError(f"{path}, episode_ends: expected increasing rows above 0, got {ends.tolist()}")
     for name, shape in _ROWS.items():
         if arrays[name].shape != (expected := (int(ends[-1]), *shape)):
-            raise ValueError(f"{path}, {name}: expected shape {expected}, got {arrays[name].shape}")
+            raise InputError(f"{path}, {name}: expected shape {expected}, got {arrays[name].shape}")
         if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{path}, {name}: expected finite numbers, got others")
+            raise InputError(f"{path}, {name}: expected finite numbers, got others")

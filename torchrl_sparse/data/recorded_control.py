@@ -20,6 +20,7 @@ from torchrl_sparse.data.controller_settings import (
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import demo_group
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import POSE_DIM
 from torchrl_sparse.storage.convention import Convention
 from torchrl_sparse.storage.json import parse_json
@@ -80,9 +81,9 @@ def check_recorded_task(file: Node, task: str | None, *, poses: bool) -> str:
     args = _env_args(file)
     recorded = args["env_name"]
     if task is not None and recorded != task:
-        raise ValueError(f"{file.where}: expected demonstrations of {task}, got ones of {recorded}")
+        raise InputError(f"{file.where}: expected demonstrations of {task}, got ones of {recorded}")
     if recorded not in TASKS:
-        raise ValueError(
+        raise InputError(
             f"{file.where}, env_args.env_name: expected one of {', '.join(TASKS)}, got {recorded!r}"
         )
     if not poses:
@@ -107,7 +108,7 @@ def read_control(file: Node, *, poses: bool = False) -> RecordedControl:
     task = TASKS.get(args["env_name"])
     if not isinstance(task, RobosuiteTask):
         known = ", ".join(name for name, task in TASKS.items() if isinstance(task, RobosuiteTask))
-        raise ValueError(
+        raise InputError(
             f"{where}.env_name: expected a task of robosuite ({known}), got {args['env_name']!r}"
         )
     kwargs = args.get("env_kwargs", {})
@@ -115,7 +116,7 @@ def read_control(file: Node, *, poses: bool = False) -> RecordedControl:
     robots = kwargs["robots"]
     if (robots if isinstance(robots, list) else [robots]) != ["Panda"] * task.arms:
         got = ", ".join(map(str, robots)) if isinstance(robots, list) else reprlib.repr(robots)
-        raise ValueError(f"{where}.env_kwargs.robots: expected {task.arms} times Panda, got {got}")
+        raise InputError(f"{where}.env_kwargs.robots: expected {task.arms} times Panda, got {got}")
     configs = kwargs["controller_configs"]
     is_old = _is_old(f"{where}.env_version", args, configs)
     arm = arm_settings(f"{where}.env_kwargs.controller_configs", configs, is_old=is_old)
@@ -125,7 +126,7 @@ def read_control(file: Node, *, poses: bool = False) -> RecordedControl:
 def _control(where: str, task: str, arm: Mapping[str, Any], is_old: bool, poses: bool) -> RecordedControl:
     are_deltas = arm["input_type"] == "delta" and not poses
     if not are_deltas and not poses and arm["input_ref_frame"] != "world":
-        raise ValueError(
+        raise InputError(
             f"{where}: expected absolute poses in the frame 'world', got ones in the frame of the robot's base"
         )
     ranges = {
@@ -134,7 +135,7 @@ def _control(where: str, task: str, arm: Mapping[str, Any], is_old: bool, poses:
     }
     for low, high in (_RANGES[:2], _RANGES[2:]):
         if not all(a < b for a, b in zip(ranges[low], ranges[high], strict=True)):
-            raise ValueError(
+            raise InputError(
                 f"{where}.{low}: expected less than {high}, got {ranges[low]} and {ranges[high]}"
             )
     return RecordedControl(
@@ -150,18 +151,18 @@ def _env_args(file: Node) -> dict[str, Any]:
     """Return what an open file says of how its demonstrations were made; its ``env_name`` is a text."""
     text = demo_group(file).text("env_args")
     if text is None:
-        raise ValueError(
+        raise InputError(
             f"{file.where}: expected an attribute env_args of 'data', which says of which task and controller the "
             "demonstrations are, got none; robomimic and this library write it"
         )
     try:
         args = parse_json(text, dict[str, Any], "env_args")
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"{file.where}, env_args: expected robomimic's description of an environment, got {reprlib.repr(text)}"
         ) from error
     if not isinstance(args.get("env_name"), str):
-        raise ValueError(
+        raise InputError(
             f"{file.where}, env_args.env_name: expected the name of a task, got {reprlib.repr(args.get('env_name'))}"
         )
     return args
@@ -176,8 +177,8 @@ def _is_old(where: str, args: Mapping[str, Any], configs: Any) -> bool:
         return not is_composite
     numbers = re.match(r"1\.([2-5])(\.|$)", version) if isinstance(version, str) else None
     if numbers is None:
-        raise ValueError(f"{where}: expected robosuite 1.2 to 1.5, got {reprlib.repr(version)}")
+        raise InputError(f"{where}: expected robosuite 1.2 to 1.5, got {reprlib.repr(version)}")
     is_old = int(numbers[1]) < 5
     if is_old and is_composite:
-        raise ValueError(f"{where}: expected 1.5 with a composite controller, got {version!r}")
+        raise InputError(f"{where}: expected 1.5 with a composite controller, got {version!r}")
     return is_old

@@ -12,6 +12,7 @@ from torchrl_sparse.data.recorded_control import RecordedControl
 from torchrl_sparse.data.recorded_poses import check_poses
 from torchrl_sparse.envs.contract import OBJECTS, Contract
 from torchrl_sparse.envs.conventions import translate_objects
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import POSE_DIM, downward_quaternion, pose_to_absolute
 from torchrl_sparse.storage.convention import Convention
 
@@ -49,7 +50,7 @@ def read_episode(
             observed[OBJECTS] = _translated(demo.where, observed[OBJECTS], control, wanted.convention)
     driven = demo.count("driven", default=0)
     if not 0 <= driven <= length:
-        raise ValueError(f"{demo.where}, driven: expected 0 to {length} steps, got {driven}")
+        raise InputError(f"{demo.where}, driven: expected 0 to {length} steps, got {driven}")
     state = np.concatenate([observed[key] for key in wanted.state_keys], axis=1)
     return state.astype(np.float32), action.astype(np.float32), driven
 
@@ -63,18 +64,18 @@ def _canonical(where: str, key: str, observed: np.ndarray) -> np.ndarray:
     """Return an observation [T, n] as environments show it: of a quaternion and its negative, one rotation, always one."""
     for name, size in _HAND.items():
         if key.endswith(name) and observed.shape[1] != size:
-            raise ValueError(f"{where}, obs/{key}: expected {size} numbers, got {observed.shape[1]}")
+            raise InputError(f"{where}, obs/{key}: expected {size} numbers, got {observed.shape[1]}")
     return downward_quaternion(observed) if key.endswith("eef_quat_site") else observed
 
 
 def _absolute_poses(where: str, pose: np.ndarray, observed: _Arrays) -> np.ndarray:
     """Return absolute actions [T, 10 * arms] of recorded poses [T, 7 * arms], where the observed hands can follow them."""
     if pose.shape[1] == 0 or pose.shape[1] % POSE_DIM:
-        raise ValueError(f"{where}: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
+        raise InputError(f"{where}: expected {POSE_DIM} numbers per arm, got shape {pose.shape}")
     try:
         absolute = pose_to_absolute(pose)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
     hands = [observed.get(key) for key in _hand_keys(pose.shape[1])]
     check_poses(where, pose, hands[::2], hands[1::2])
     return absolute
@@ -86,4 +87,4 @@ def _translated(where: str, objects: np.ndarray, control: RecordedControl, wante
         return translate_objects(control.env_name, objects, observed=control.convention, wanted=wanted)
     except ValueError as error:
         told = f"recorded as of robosuite {control.convention}, wanted as of {wanted}"
-        raise ValueError(f"{where}, object: {told}: {error}") from error
+        raise InputError(f"{where}, object: {told}: {error}") from error

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import ArrayReader
 from torchrl_sparse.envs.simulator import CONTROL_FREQ
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import POSE_DIM
 
 __all__ = ["REACH", "TURN", "check_hands", "check_poses", "check_rate", "steps_out_of_reach"]
@@ -44,7 +45,7 @@ def check_poses(
     far, turn = steps_out_of_reach(actions, positions, quaternions)
     for values, limit, what, unit in ((far, REACH, "position", "m"), (turn, TURN, "rotation", "rad")):
         if len(steps := np.flatnonzero(values > limit)):
-            raise ValueError(
+            raise InputError(
                 f"{where}: expected absolute poses in the world's frame, each {what} within {limit:.1f} {unit} of the recorded "
                 f"hand's, got one {values[steps[0]]:.2f} {unit} off at step {steps[0]}"
             )
@@ -69,7 +70,7 @@ def check_rate(demo: Node, seconds: np.ndarray) -> None:
     """Refuse states that are another time apart than this library's environments pass in a step."""
     apart = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     if apart > 0 and abs(apart * CONTROL_FREQ - 1) > 0.1:
-        raise ValueError(
+        raise InputError(
             f"{demo.where}, states: expected {1 / CONTROL_FREQ} s between them, got {apart:.3f} s, another control_freq"
         )
 
@@ -80,6 +81,6 @@ def check_hands(demo: Node, arrays: Mapping[str, np.ndarray], length: int) -> No
         if key.endswith("eef_pos") and (recorded := demo.find(key)) is not None:
             far = np.linalg.norm(ArrayReader(demo).numbers(demo, key, length) - value, axis=1).max()
             if far > _TOLERANCE:
-                raise ValueError(
+                raise InputError(
                     f"{recorded.where}: expected the hand where the states put it, got {far:.4f} m off"
                 )

@@ -15,6 +15,7 @@ from torchrl_sparse.data.hdf5_nodes import Node
 from torchrl_sparse.data.hdf5_reader import ArrayReader, demo_group, demo_names, open_demo, open_demos
 from torchrl_sparse.data.recorded_control import read_control
 from torchrl_sparse.envs.robosuite import InitialState, RobosuiteEnv
+from torchrl_sparse.errors import InputError
 
 __all__ = ["render_demos"]
 
@@ -43,7 +44,7 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
             camera, it has images of one already, or ``out`` is ``path``.
     """
     if Path(path).resolve() == Path(out).resolve():
-        raise ValueError(f"out: expected another file than the demonstrations, got {out}")
+        raise InputError(f"out: expected another file than the demonstrations, got {out}")
     with open_demos(path) as source, new_hdf5(out) as file:
         env = RobosuiteEnv(read_control(source).env_name)
         for name in source.names():  # the demonstrations and their filter keys
@@ -64,7 +65,7 @@ def _present(demo: Node, cameras: Sequence[str]) -> set[str]:
     observed = demo.find("obs")
     present = {*(observed.names() if observed is not None and observed.is_group else ())}
     if again := [camera for camera in cameras if f"{camera}_image" in present]:
-        raise ValueError(
+        raise InputError(
             f"{demo.where}: cameras: expected ones that it has no images of, got {', '.join(again)}"
         )
     return present
@@ -74,13 +75,13 @@ def _restore(env: RobosuiteEnv, demo: Node, start: InitialState) -> None:
     """Put the environment at a demonstration's start."""
     size = len(env.sim_env.sim.get_state().flatten())
     if len(start.sim_state) != size:
-        raise ValueError(
+        raise InputError(
             f"{demo.where}, states: expected {size} numbers of {env.task.name}, got {len(start.sim_state)}"
         )
     try:
         env.reset(initial_state=start)
     except (ValueError, KeyError, AttributeError, ParseError) as error:
-        raise ValueError(
+        raise InputError(
             f"{demo.where}, model_file: expected a model of robosuite 1.5, got one that it cannot play "
             f"({' '.join(str(error).split())[:200]})"
         ) from error

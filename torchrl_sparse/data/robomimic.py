@@ -32,6 +32,7 @@ from torchrl_sparse.data.images import RecordedImages, read_images
 from torchrl_sparse.data.recorded_control import check_recorded_task, read_control
 from torchrl_sparse.data.recorded_episode import read_episode
 from torchrl_sparse.envs.contract import Contract
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.convention import Convention
 
 __all__ = ["Demonstrations", "join_demos", "read_demos"]
@@ -107,7 +108,9 @@ class Demonstrations:
             windows.append((begin[:, None] + torch.arange(horizon)).clamp(first, last))
         rows = torch.cat(windows) if windows else torch.empty(0, horizon, dtype=torch.int64)
         if not len(rows):
-            raise ValueError(f"no window of horizon {horizon} fits in the {len(windows)} episodes given")
+            raise InputError(
+                f"horizon: expected one that fits in one of {len(windows)} episodes, got {horizon}"
+            )
         return rows
 
     def windows(self, rows: Tensor, n_obs_steps: int) -> TensorDict:
@@ -165,7 +168,7 @@ def read_demos(
         (10, 200)
     """
     if not state_keys:
-        raise ValueError("state_keys: expected at least one observation key, got none")
+        raise InputError("state_keys: expected at least one observation key, got none")
     files, parts = [], []
     for path in each_path(paths):
         wanted = Contract(task, tuple(state_keys), convention, dict(cameras or {}))
@@ -187,7 +190,7 @@ def _read_numbers(
         task = check_recorded_task(file, wanted.task, poses=poses)
         control = read_control(file) if poses else None
         if control is not None and control.are_deltas:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected absolute poses, got deltas, as its controller says; "
                 "recipes/convert_demos.py converts them"
             )
@@ -195,7 +198,7 @@ def _read_numbers(
         episodes = [read_episode(reader, data, name, wanted, control) for name in names]
     widths = sorted({(state.shape[1], action.shape[1]) for state, action, _ in episodes})
     if len(widths) > 1:
-        raise ValueError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
+        raise InputError(f"{path}: expected one size of state and action in all demonstrations, got {widths}")
     states, actions, driven = zip(*episodes, strict=True)
     starts = torch.tensor([0, *map(len, actions)]).cumsum(0)
     state, action = (torch.from_numpy(np.concatenate(part)) for part in (states, actions))
@@ -213,14 +216,14 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
         {str({key: part.data[key].shape[1:] for key in part.data.keys(True, True)}) for part in parts}
     )
     if len(shapes) != 1:
-        raise ValueError(
+        raise InputError(
             f"demos: expected one set of observations and sizes, got {'; '.join(shapes) or 'none'}"
         )
     if len(parts) == 1:
         return parts[0]
     contracts = [part.contract for part in parts if part.contract is not None]
     if len(meanings := sorted({contract.meaning for contract in contracts})) > 1:
-        raise ValueError(f"demos: expected one meaning of the state, got {'; '.join(meanings)}")
+        raise InputError(f"demos: expected one meaning of the state, got {'; '.join(meanings)}")
     contract = contracts[0] if len(contracts) == len(parts) else None
     if contract is not None and any(other.task != contract.task for other in contracts):
         contract = replace(contract, task=None)
@@ -236,7 +239,7 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
 
 def _check_window(horizon: int, n_obs_steps: int, n_action_steps: int) -> None:
     if min(horizon, n_obs_steps, n_action_steps) < 1 or n_obs_steps - 1 + n_action_steps > horizon:
-        raise ValueError(
-            "expected n_obs_steps >= 1, n_action_steps >= 1 and n_obs_steps - 1 + n_action_steps <= horizon, "
+        raise InputError(
+            "horizon: expected n_obs_steps >= 1, n_action_steps >= 1 and n_obs_steps - 1 + n_action_steps <= horizon, "
             f"got horizon={horizon}, n_obs_steps={n_obs_steps}, n_action_steps={n_action_steps}"
         )

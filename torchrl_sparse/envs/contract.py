@@ -12,6 +12,7 @@ from typing import Any
 
 from torchrl_sparse.envs.simulator import CONTROL_FREQ
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask, Task, find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.convention import Convention, source_convention
 
@@ -85,7 +86,7 @@ def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
     found = find_task(task)
     trained = policy.source.get("task")
     if trained is not None and named_task(trained) not in (None, found.name):
-        raise ValueError(f"policy: expected one that was trained for {found.name}, got one for {trained}")
+        raise InputError(f"policy: expected one that was trained for {found.name}, got one for {trained}")
     return _shown(found, policy)
 
 
@@ -93,7 +94,7 @@ def _shown(task: Task, policy: DiffusionPolicy) -> Contract:
     _check_actions(task, policy.source)
     rate = policy.source.get("control_freq")
     if isinstance(task, RobosuiteTask) and rate not in (None, CONTROL_FREQ):
-        raise ValueError(
+        raise InputError(
             f"policy: expected one of {CONTROL_FREQ} actions a second, as {task.name} takes, got one of {rate}"
         )
     cameras = _cameras(policy)
@@ -102,7 +103,7 @@ def _shown(task: Task, policy: DiffusionPolicy) -> Contract:
     found = (policy.normalizer.state_scale.numel(), policy.normalizer.action_scale.numel())
     expected = (_state_size(task, keys), task.action_dim)
     if found != expected:
-        raise ValueError(
+        raise InputError(
             f"policy: expected one of {expected[0]} observed numbers and {expected[1]} of an action, for {task.name}, "
             f"got one of {found[0]} and {found[1]}"
         )
@@ -130,13 +131,13 @@ def check_contract(policy: DiffusionPolicy, shown: Contract | None) -> None:
     else:
         return  # neither of both says what the numbers are
     if shown.meaning != expected.meaning:
-        raise ValueError(
+        raise InputError(
             f"demos: expected {expected.meaning}, as the policy's source says, got {shown.meaning}"
         )
     for name, key in expected.cameras.items():
         if shown.cameras.get(name) != key:
             got = shown.cameras.get(name, "none")
-            raise ValueError(f"demos: {name}: expected {key}, as the policy's source says, got {got}")
+            raise InputError(f"demos: {name}: expected {key}, as the policy's source says, got {got}")
 
 
 def provenance(contract: Contract | None) -> dict[str, str]:
@@ -193,7 +194,7 @@ def _cameras(policy: DiffusionPolicy) -> dict[str, str]:
     named = policy.source.get("cameras") or {}
     cameras = {name: named.get(name, "") for name in policy.vision.cameras}
     if not all(cameras.values()):
-        raise ValueError(f"policy.source['cameras']: expected those of {list(cameras)}, got {named}")
+        raise InputError(f"policy.source['cameras']: expected those of {list(cameras)}, got {named}")
     return cameras
 
 
@@ -205,7 +206,7 @@ def _check_actions(task: Task, source: Mapping[str, Any]) -> None:
     if task.abs_action is not None and absolute is not None and absolute != task.abs_action:
         kinds = {"True": "absolute actions (abs_action true)", "False": "relative actions (abs_action false)"}
         expected, got = (kinds.get(str(kind), repr(kind)) for kind in (task.abs_action, absolute))
-        raise ValueError(f"policy: expected one of {expected} for {task.name}, got one of {got}")
+        raise InputError(f"policy: expected one of {expected} for {task.name}, got one of {got}")
 
 
 def _state_size(task: Task, keys: tuple[str, ...]) -> int:
@@ -213,8 +214,8 @@ def _state_size(task: Task, keys: tuple[str, ...]) -> int:
         try:
             return task.state_size(keys)
         except ValueError as error:
-            raise ValueError(f"policy: {error}") from error
+            raise InputError(f"policy: {error}") from error
     if keys != task.state_keys:
         expected, got = ", ".join(task.state_keys), ", ".join(keys)
-        raise ValueError(f"policy: state_keys: expected {expected} for {task.name}, got {got}")
+        raise InputError(f"policy: state_keys: expected {expected} for {task.name}, got {got}")
     return task.state_dim

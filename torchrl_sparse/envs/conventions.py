@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.convention import Convention
 
 __all__ = ["check_convention", "object_state", "translate_objects"]
@@ -51,7 +52,7 @@ def check_convention(convention: str, task: str) -> None:
     """Raise ValueError unless observations of the robosuite task can be had in that convention."""
     known = get_args(Convention) if task in _PARTS else ("1.5",)
     if convention not in known:
-        raise ValueError(f"convention: expected {' or '.join(known)} for {task}, got {convention!r}")
+        raise InputError(f"convention: expected {' or '.join(known)} for {task}, got {convention!r}")
 
 
 def object_state(task: str, observed: Mapping[str, Any], convention: Convention) -> np.ndarray:
@@ -96,7 +97,7 @@ def translate_objects(
     for name in _PARTS[task][observed]:
         places[name] = range(end, end := end + _size(name))
     if state.shape[-1] != end:
-        raise ValueError(f"object: expected {end} numbers for {task}, got {state.shape[-1]}")
+        raise InputError(f"object: expected {end} numbers for {task}, got {state.shape[-1]}")
     order = [place for name in _PARTS[task][wanted] for place in places[name]]
     signs = np.concatenate([np.full(_size(name), _sign(name)) for name in _PARTS[task][wanted]])
     return state[..., order] * signs.astype(state.dtype)

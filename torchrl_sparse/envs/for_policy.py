@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl_sparse.envs.contract import policy_contract
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_task
 from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = ["camera_options", "diffusion_env"]
@@ -55,7 +56,7 @@ def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
     {'camera': 'agentview'}
     """
     if not cameras.keys() <= _CAMERA_OPTIONS.keys():
-        raise ValueError(
+        raise InputError(
             f"policy.source['cameras']: expected those of {list(_CAMERA_OPTIONS)}, got {dict(cameras)}"
         )
     return {_CAMERA_OPTIONS[name]: key.removesuffix("_image") for name, key in cameras.items()}

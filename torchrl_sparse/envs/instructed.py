@@ -15,6 +15,7 @@ from torchrl_sparse.envs.libero import SUITES, require_libero
 from torchrl_sparse.envs.libero_suite import make_suite_env
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
 from torchrl_sparse.envs.transforms import make_env
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.vla import VLASource
 
@@ -63,7 +64,7 @@ def find_instructed_task(name: str) -> InstructedTask:
             state_dim = task.state_size(task.proprioception_keys)
             return InstructedTask(task.name, state_dim, task.action_dim, task.early_cut)
     names, suites = ", ".join(task.name for task in tasks), ", ".join(SUITES)
-    raise ValueError(
+    raise InputError(
         f"task: expected one of {names}, their aliases or a suite of LIBERO ({suites}), got {name!r}"
     )
 
@@ -88,7 +89,7 @@ def instructed_env(
         >>> instructed_env("lift", policy, policy.source.cameras)
         Traceback (most recent call last):
         ...
-        ValueError: policy: expected one that was trained for Lift, got one for LiftNamed
+        torchrl_sparse.errors.InputError: policy: expected one that was trained for Lift, got one for LiftNamed
     """
     found = check_instructed(task, policy, cameras)
     options: dict[str, Any] = {"image_size": policy.network.config.image_size, "horizon": horizon}
@@ -118,7 +119,7 @@ def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -
     """
     found, trained = find_instructed_task(task), policy.source.task
     if trained is not None and _known(trained) not in (None, found.name):
-        raise ValueError(f"policy: expected one that was trained for {found.name}, got one for {trained}")
+        raise InputError(f"policy: expected one that was trained for {found.name}, got one for {trained}")
     _check_sizes(found, policy)
     if found.name not in SUITES:
         _check_cameras(cameras, policy.source.cameras)
@@ -145,7 +146,7 @@ def continued_vla_source(task: str, policy: VLAPolicy, cameras: Mapping[str, str
 def _check_sizes(task: InstructedTask, policy: VLAPolicy) -> None:
     config = policy.network.config
     if (config.state_dim, config.action_dim) != (task.state_dim, task.action_dim):
-        raise ValueError(
+        raise InputError(
             f"policy: expected one of {task.state_dim} observed numbers and {task.action_dim} of an action, for {task.name}, "
             f"got one of {config.state_dim} and {config.action_dim}"
         )
@@ -159,6 +160,6 @@ def _check_cameras(cameras: Mapping[str, str], trained: Mapping[str, str]) -> No
     """Refuse other cameras than the policy's own; those that it has not do no harm."""
     for name, key in trained.items():
         if cameras.get(name) != key:
-            raise ValueError(
+            raise InputError(
                 f"cameras.{name}: expected {key}, which the policy was trained with, got {cameras.get(name)}"
             )

@@ -26,6 +26,7 @@ from torchrl_sparse.envs.release_images import RENDERED_SIZE, ReleaseImages
 from torchrl_sparse.envs.simulator import import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask
 from torchrl_sparse.envs.transforms import EndEffectorVelocity
+from torchrl_sparse.errors import InputError
 
 __all__ = ["SUITES", "RotationVectorState", "make_libero_env", "require_libero", "suite_horizon"]
 
@@ -101,7 +102,7 @@ def suite_horizon(suite: str) -> int:
         ValueError: on an unknown suite.
     """
     if suite not in SUITES:
-        raise ValueError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+        raise InputError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
     return SUITES[suite]
 
 

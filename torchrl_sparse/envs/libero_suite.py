@@ -15,6 +15,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.envs.libero import make_libero_env, suite_horizon
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.seeds import FIRST_TEST_SEED, evaluation_seeds
+from torchrl_sparse.errors import InputError
 
 __all__ = ["LiberoSuite", "make_suite_env", "scene_of"]
 
@@ -41,7 +42,7 @@ def scene_of(seed: int) -> tuple[int, int | None]:
     state, task = divmod(seed - _FIRST, _TASKS)
     if not 0 <= state < _STATES:
         last = _FIRST + _TASKS * _STATES - 1
-        raise ValueError(
+        raise InputError(
             f"seed: expected test seeds from {_FIRST} to {last}, as many as a suite of LIBERO has initial states, got {seed}"
         )
     return task, state

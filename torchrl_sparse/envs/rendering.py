@@ -14,6 +14,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.failure import RunFailed
 
 GL_HINT = (
@@ -89,7 +90,7 @@ class CameraRenderer:
         camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         if camera_id < 0:
             names = [self._model.camera(i).name for i in range(self._model.ncam)]
-            raise ValueError(f"camera: expected one of {', '.join(names)}, got {camera!r}")
+            raise InputError(f"camera: expected one of {', '.join(names)}, got {camera!r}")
         view = mujoco.MjvCamera()
         view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, camera_id
         self._gl.make_current()

@@ -17,6 +17,7 @@ from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
 from torchrl_sparse.envs.simulator import make_simulator
 from torchrl_sparse.envs.tasks import find_robosuite_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import (
     ABSOLUTE_DIM,
     POSE_DIM,
@@ -51,8 +52,7 @@ class RobosuiteEnv(SeededEnv):
     Args:
         task: one of `torchrl_sparse.envs.tasks.TASKS`.
         action_mode: "absolute", 10 numbers per arm (position in m, 6-D rotation of the grip site in the world frame, gripper
-            -1 open to 1 closed), or "delta", robosuite's 7 normalised OSC_POSE numbers per arm. Where six numbers fix no
-            rotation, the hand stays turned as it is.
+            -1 open to 1 closed; a rotation that is none leaves the hand as it is), or "delta", 7 numbers of OSC_POSE per arm.
         horizon: steps until truncation; the task's own by default.
         seeds: seeds of successive episodes, repeated when used up. For paired evaluations.
         camera: camera of ``("observation", "image")``, e.g. "agentview"; none by default.
@@ -100,7 +100,7 @@ class RobosuiteEnv(SeededEnv):
         device: torch.device | str = "cpu",
     ):
         if action_mode not in ("absolute", "delta"):
-            raise ValueError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
+            raise InputError(f"action_mode: expected 'absolute' or 'delta', got {action_mode!r}")
         self.task = find_robosuite_task(task)
         horizon = self.task.horizon if horizon is None else horizon
         super().__init__(horizon=horizon, seeds=seeds, tells_way=self.task.way_of is not None, device=device)
@@ -108,9 +108,9 @@ class RobosuiteEnv(SeededEnv):
         asked = {keys.IMAGE: camera, keys.WRIST_IMAGE: wrist_camera}
         named = {key: name for key, name in asked.items() if name is not None}
         if image_size is not None and not named:
-            raise ValueError(f"image_size: expected a camera or wrist_camera with it, got {image_size} alone")
+            raise InputError(f"image_size: expected a camera or wrist_camera with it, got {image_size} alone")
         if seen_frames is not None and seen_frames < 1:
-            raise ValueError(f"seen_frames: expected None or at least 1, got {seen_frames}")
+            raise InputError(f"seen_frames: expected None or at least 1, got {seen_frames}")
         self._cameras = Cameras(named, 84 if image_size is None else image_size, fast=fast_render)
         self._seen_frames, self._unseen = seen_frames, False
         own_keys = self.task.state_keys if object_state else self.task.proprioception_keys

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.seeds import whole_seed
+from torchrl_sparse.errors import InputError
 
 NO_WAY = -1
 """Instead of a way: none showed so far."""
@@ -70,7 +71,7 @@ class SeededEnv(EnvBase):
     ):
         super().__init__(device=device, batch_size=[])
         if seeds is not None and not len(seeds):
-            raise ValueError("seeds: expected at least one seed, got none")
+            raise InputError("seeds: expected at least one seed, got none")
         self.horizon = horizon
         self._counts_parts, self._tells_way = counts_parts, tells_way
         self._seeds = None if seeds is None else itertools.cycle([whole_seed(seed) for seed in seeds])
@@ -156,7 +157,7 @@ class SeededEnv(EnvBase):
     def _action(tensordict: TensorDictBase) -> torch.Tensor:
         action = tensordict.get(keys.ACTION, None)
         if action is None and keys.CHUNK in tensordict.keys(True):
-            raise ValueError(
+            raise InputError(
                 "action: expected one, got a chunk of them: an executor is missing, ChunkExecutor(policy), which serves them"
             )
         return keys.read(tensordict, keys.ACTION)
@@ -164,12 +165,12 @@ class SeededEnv(EnvBase):
     def _check_action(self, action: torch.Tensor) -> np.ndarray:
         expected = self.action_spec.shape
         if action.shape != expected:
-            raise ValueError(
+            raise InputError(
                 f"action: expected {self.action_mode} shape {tuple(expected)}, got {tuple(action.shape)}"
             )
         action = action.detach().cpu().numpy().astype(np.float64)
         if not np.isfinite(action).all():
-            raise ValueError(f"action: expected finite numbers, got {action.tolist()}")
+            raise InputError(f"action: expected finite numbers, got {action.tolist()}")
         if self.action_mode == "delta":
             bounds = self.action_spec.space
             action = action.clip(bounds.low.cpu().numpy(), bounds.high.cpu().numpy())

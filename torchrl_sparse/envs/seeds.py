@@ -11,6 +11,8 @@ from __future__ import annotations
 import operator
 from typing import Any, Literal, get_args
 
+from torchrl_sparse.errors import InputError
+
 __all__ = [
     "CALIBRATION_SEED",
     "CLOSED_LOOP_SEED",
@@ -51,10 +53,10 @@ def evaluation_seeds(split: str, offset: int, episodes: int) -> range:
     (range(100200, 100203), range(210000, 210002))
     """
     if split not in get_args(Split):
-        raise ValueError(f"split: expected {' or '.join(get_args(Split))}, got {split!r}")
+        raise InputError(f"split: expected {' or '.join(get_args(Split))}, got {split!r}")
     of_split = _SPLITS[split]
     if offset < 0 or offset + episodes > len(of_split):
-        raise ValueError(
+        raise InputError(
             f"seed: expected {episodes} episodes from 0 to {len(of_split)} of the {split} seeds, got {offset}"
         )
     return of_split[offset : offset + episodes]
@@ -75,7 +77,7 @@ def tuning_seeds(first: int, episodes: int) -> range:
     """
     if first + episodes > FIRST_TEST_SEED:
         last = first + episodes - 1
-        raise ValueError(f"seed: expected seeds below {FIRST_TEST_SEED} for tuning, got the test seed {last}")
+        raise InputError(f"seed: expected seeds below {FIRST_TEST_SEED} for tuning, got the test seed {last}")
     return range(first, first + episodes)
 
 
@@ -88,12 +90,12 @@ def whole_seed(seed: Any) -> int:
     >>> whole_seed(1.7)
     Traceback (most recent call last):
     ...
-    ValueError: seed: expected a whole number from 0 to 2**63 - 1, got 1.7
+    torchrl_sparse.errors.InputError: seed: expected a whole number from 0 to 2**63 - 1, got 1.7
     """
     try:
         value = operator.index(seed)
     except TypeError:
         value = -1
     if not 0 <= value < 1 << 63:
-        raise ValueError(f"seed: expected a whole number from 0 to 2**63 - 1, got {seed!r}")
+        raise InputError(f"seed: expected a whole number from 0 to 2**63 - 1, got {seed!r}")
     return value

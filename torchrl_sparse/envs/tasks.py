@@ -20,6 +20,7 @@ import numpy as np
 from torchrl.envs import EnvBase
 
 from torchrl_sparse.envs.task import Task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import ABSOLUTE_DIM
 
 __all__ = ["TASKS", "RobosuiteTask", "StateTask", "Task", "find_robosuite_task", "find_task"]
@@ -37,14 +38,14 @@ class _Named:
     def load_way_of(self) -> Callable[[np.ndarray], int]:
         """See `Task.load_way_of`."""
         if self.way_of is None:
-            raise ValueError(f"task: expected one that tells its ways, got {self.name!r}, which does not")
+            raise InputError(f"task: expected one that tells its ways, got {self.name!r}, which does not")
         return _load(self.way_of)
 
     def load_expert(self) -> type[Any]:
         """See `Task.load_expert`."""
         if self.expert is None:
             having = ", ".join(name for name, task in TASKS.items() if getattr(task, "expert", None))
-            raise ValueError(f"task: expected one with an expert ({having}), got {self.name!r}")
+            raise InputError(f"task: expected one with an expert ({having}), got {self.name!r}")
         return _load(self.expert)
 
 
@@ -61,8 +62,7 @@ class RobosuiteTask(_Named):
         instructions: the task in words; where there are several, each episode asks for one of them.
         module: importing it registers the task with robosuite; None for robosuite's own.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.base.Expert`; None without one.
-        early_cut: see `Task`.
-        way_of: ``"module:function"`` that tells the way of an episode from its states; None where a task has but one.
+        early_cut, way_of: see `Task`; ``way_of`` is named as ``"module:function"``.
     """
 
     acts_in_poses: ClassVar[bool] = True
@@ -88,7 +88,7 @@ class RobosuiteTask(_Named):
         """Raise ValueError unless ``words`` are one of `instructions`."""
         if words not in self.instructions:
             expected = ", ".join(map(repr, self.instructions))
-            raise ValueError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
+            raise InputError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
 
     @property
     def state_keys(self) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class RobosuiteTask(_Named):
         sizes = {"object": self.object_dim, **arms}
         if not state_keys or not set(state_keys) <= sizes.keys() or len({*state_keys}) < len(state_keys):
             got = ", ".join(state_keys) or "none"
-            raise ValueError(f"state_keys: expected some of {', '.join(sizes)} for {self.name}, got {got}")
+            raise InputError(f"state_keys: expected some of {', '.join(sizes)} for {self.name}, got {got}")
         return sum(sizes[key] for key in state_keys)
 
     def make(self, **kwargs: Any) -> EnvBase:
@@ -175,7 +175,7 @@ class StateTask(_Named):
     @property
     def proprioception_keys(self) -> tuple[str, ...]:
         """Raise ValueError: no camera shows the rest."""
-        raise ValueError(f"cameras: expected none for {self.name}, whose policies see its state")
+        raise InputError(f"cameras: expected none for {self.name}, whose policies see its state")
 
     @property
     def acts_in_poses(self) -> bool:
@@ -297,4 +297,4 @@ def _find(name: str, tasks: Sequence[Any]) -> Any:
         if name in (task.name, task.alias):
             return task
     names = ", ".join(task.name for task in tasks)
-    raise ValueError(f"task: expected one of {names} or their aliases, got {name!r}")
+    raise InputError(f"task: expected one of {names} or their aliases, got {name!r}")

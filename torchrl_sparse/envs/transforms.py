@@ -14,6 +14,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_task
+from torchrl_sparse.errors import InputError
 
 
 def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
@@ -37,7 +38,7 @@ def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEn
 def state_history(n_obs_steps: int) -> list[Transform]:
     """Return transforms that write ``("history", "state")``, f32 [*B, n_obs_steps, Ds], oldest first."""
     if n_obs_steps < 1:
-        raise ValueError(f"n_obs_steps: expected at least 1, got {n_obs_steps}")
+        raise InputError(f"n_obs_steps: expected at least 1, got {n_obs_steps}")
     return [
         UnsqueezeTransform(dim=-2, in_keys=[keys.STATE], out_keys=[keys.HISTORY_STATE]),
         CatFrames(N=n_obs_steps, dim=-2, in_keys=[keys.HISTORY_STATE]),

@@ -38,6 +38,7 @@ from torchrl_sparse.blocks.saved import load_planner
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
 from torchrl_sparse.blocks.uniform import Uniform
 from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.keys import PRUNE_RATE
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.networks.diffusion.naming import CHAIN_PATTERN
@@ -264,7 +265,7 @@ def _find(text: str, planners: Path) -> Method:
             *METHODS,
             *(path.stem for path in sorted(planners.glob("*")) if _saved_path(planners, path.stem)),
         ]
-        raise ValueError(
+        raise InputError(
             f"methods: expected {', '.join(METHODS)}, or a planner in {planners} ({name}.json or {name}/), "
             f"got {text!r}{did_you_mean(name, known)}"
         )
@@ -288,7 +289,7 @@ def _saved_path(planners: Path, name: str) -> Path | None:
 def _ask_for(planner: Planner, written: MethodName) -> None:
     """Set the rate of queries that bring none. Both rates are tried: a wrong one is found now and not in mid-episode."""
     if planner.rate is None:
-        raise ValueError(
+        raise InputError(
             f"methods: {written.name}: expected a planner that takes a prune rate, got {type(planner).__name__}"
         )
     for rate in reversed(written.rates):

@@ -11,6 +11,7 @@ from torchrl_sparse.control.realtime_executor import RealtimeExecutor
 from torchrl_sparse.control.roll_forward import RollForward, StateModel
 from torchrl_sparse.control.selectors import CoherentChunk
 from torchrl_sparse.control.temporal_ensemble import TemporalEnsemble
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.diffusion import make_controller
 from torchrl_sparse.methods.names import MethodName
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -31,7 +32,7 @@ def executed_every(text: str, policy: DiffusionPolicy, n_action_steps: int) -> i
     """
     every, length = MethodName.parse(text).every, policy.horizon - policy.n_obs_steps + 1
     if every is not None and every > length:
-        raise ValueError(f"methods: {text}: expected at most the {length} actions of a chunk, got {every}")
+        raise InputError(f"methods: {text}: expected at most the {length} actions of a chunk, got {every}")
     return every or n_action_steps
 
 
@@ -55,7 +56,7 @@ def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> Ch
         (2, 4)
     """
     if MethodName.parse(text).ahead:
-        raise ValueError(f"methods: {text}: expected no _ahead where the world waits for an answer")
+        raise InputError(f"methods: {text}: expected no _ahead where the world waits for an answer")
     steps = executed_every(text, policy, n_action_steps)
     return ChunkExecutor(_averaged(text, policy), steps, make_controller(text), **execution_options(text))
 
@@ -83,7 +84,7 @@ def make_realtime_executor(
     asked: TensorDictModuleBase = policy
     if MethodName.parse(text).ahead:
         if model is None:
-            raise ValueError(
+            raise InputError(
                 f"methods: {text}: expected demos, to which the model of the state is fitted, got none"
             )
         asked = RollForward(policy, model.to(policy.device))

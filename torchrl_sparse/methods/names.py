@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["WEIGHTS", "MethodName"]
 
 WEIGHTS = ("bf16", "int8")
@@ -52,7 +54,7 @@ class MethodName:
         """
         match = _PATTERN.fullmatch(text)
         if match is None:
-            raise ValueError(
+            raise InputError(
                 "methods: expected NAME, NAME@RATE or NAME@COARSE-FINE, NAME also as NAME_everyN, NAME_ofS, NAME_ensembled, "
                 f"NAME_ahead, NAME:bf16 or NAME:int8, got {text!r}"
             )

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.vla import TOKEN_METHODS, make_pruner
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.tokens.base import TokenPruner
@@ -105,14 +106,14 @@ def numbered_pruner(method: str, number: float, settings: dict[str, Any]) -> Tok
     """
     tuned = [name for name, entry in TOKEN_METHODS.items() if entry.number is not None]
     if method not in tuned:
-        raise ValueError(f"method: expected one of {', '.join(tuned)}, got {method!r}")
+        raise InputError(f"method: expected one of {', '.join(tuned)}, got {method!r}")
     section = TOKEN_METHODS[method].settings
     if settings and section is None:
-        raise ValueError(f"settings: expected none for {method}, got {settings}")
+        raise InputError(f"settings: expected none for {method}, got {settings}")
     try:
         pruner = make_pruner(method, number=number, settings={section: settings} if section else None)
     except TypeError as error:
-        raise ValueError(f"settings: expected arguments of {method}, got {error}") from error
+        raise InputError(f"settings: expected arguments of {method}, got {error}") from error
     assert pruner is not None  # no number tunes the dense policy
     return pruner
 
@@ -132,7 +133,7 @@ def fewest_tokens(points: Sequence[BudgetPoint], tolerance: float) -> float:
         chosen = point.number
     if chosen is None:
         found = ", ".join(f"{point.number:g}: {point.loss:.3g}" for point in points)
-        raise ValueError(
+        raise InputError(
             f"tolerance: expected a loss of at most {tolerance:g} where most tokens are kept, got {found}"
         )
     return chosen

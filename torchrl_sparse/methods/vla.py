@@ -20,6 +20,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.action_aware import ActionAwareController
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.names import did_you_mean
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.dense_first import DenseFirst
@@ -161,7 +162,7 @@ class TokenMethodName:
         method = TOKEN_METHODS.get(name)
         if method is None:
             guess = did_you_mean(name, TOKEN_METHODS)
-            raise ValueError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}{guess}")
+            raise InputError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}{guess}")
         if not at:
             return cls(name)
         if method.number is not None and re.fullmatch(r"\d*\.?\d+", rest):
@@ -169,7 +170,7 @@ class TokenMethodName:
         if method.matches and rest.partition("@")[0] in TOKEN_METHODS:
             return cls(name, like=rest)
         forms = [name, *([f"{name}@NUMBER"] if method.number else []), *([f"{name}@METHOD"] * method.matches)]
-        raise ValueError(f"methods: expected {' or '.join(forms)}, got {text!r}")
+        raise InputError(f"methods: expected {' or '.join(forms)}, got {text!r}")
 
 
 def check_matches(texts: Iterable[str]) -> None:
@@ -178,13 +179,13 @@ def check_matches(texts: Iterable[str]) -> None:
     >>> check_matches(["dense", "fastv@specprune"])
     Traceback (most recent call last):
     ...
-    ValueError: methods: fastv@specprune: expected one of dense after @, got 'specprune'
+    torchrl_sparse.errors.InputError: methods: fastv@specprune: expected one of dense after @, got 'specprune'
     """
     like = {text: TokenMethodName.parse(text).like for text in texts}
     plain = [text for text, matched in like.items() if matched is None]
     for text, matched in like.items():
         if matched is not None and matched not in plain:
-            raise ValueError(f"methods: {text}: expected one of {', '.join(plain)} after @, got {matched!r}")
+            raise InputError(f"methods: {text}: expected one of {', '.join(plain)} after @, got {matched!r}")
 
 
 def make_pruner(
@@ -210,7 +211,7 @@ def make_pruner(
     arguments = settings_of(text, settings)
     if number is not None:
         if method.number is None:
-            raise ValueError(f"number: expected none for {written.name}, got {number}")
+            raise InputError(f"number: expected none for {written.name}, got {number}")
         arguments[method.number] = number
     return method.make(**arguments)
 

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import ABSOLUTE_DIM
 
 __all__ = ["MIN_RANGE", "Normalizer"]
@@ -84,7 +85,7 @@ class Normalizer(nn.Module):
         elif state_mode == "range":
             scale, offset = _range_map(state)
         else:
-            raise ValueError(f'state_mode must be "global" or "range", got {state_mode!r}')
+            raise InputError(f'state_mode: expected "global" or "range", got {state_mode!r}')
         return cls(scale.clone(), offset.clone(), *(_pose_map(action) if poses else _range_map(action)))
 
     def normalize_state(self, state: Tensor) -> Tensor:
@@ -119,23 +120,23 @@ def _range_map(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def _check_data(state: Tensor, action: Tensor, poses: bool) -> None:
     if state.ndim != 2 or action.ndim != 2 or len(state) != len(action) or not len(state):
-        raise ValueError(
-            f"expected state [N, Ds] and action [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}"
+        raise InputError(
+            f"state, action: expected [N, Ds] and [N, A], N > 0, got {list(state.shape)}, {list(action.shape)}"
         )
     if poses and action.shape[1] % ABSOLUTE_DIM:
-        raise ValueError(
+        raise InputError(
             f"action: expected {ABSOLUTE_DIM} numbers per arm, got a last axis of {action.shape[1]}"
         )
     for name, value in (("state", state), ("action", action)):
         if not value.isfinite().all():
-            raise ValueError(f"{name}: expected finite numbers, got {value[~value.isfinite()][0].item()}")
+            raise InputError(f"{name}: expected finite numbers, got {value[~value.isfinite()][0].item()}")
 
 
 def _check_pair(name: str, scale: Tensor, offset: Tensor) -> None:
     if scale.ndim != 1 or scale.shape != offset.shape:
-        raise ValueError(
-            f"{name}_scale and {name}_offset must be vectors of one size, "
+        raise InputError(
+            f"{name}_scale, {name}_offset: expected vectors of one size, "
             f"got {list(scale.shape)} and {list(offset.shape)}"
         )
     if not (scale.isfinite().all() and offset.isfinite().all() and (scale != 0).all()):
-        raise ValueError(f"{name}_scale and {name}_offset must be finite and the scale without zeros")
+        raise InputError(f"{name}_scale, {name}_offset: expected finite numbers and a scale without zeros")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import reprlib
 from typing import Any
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["check_size"]
 
 
@@ -16,7 +18,7 @@ def check_size(name: str, value: Any, most: int, least: int = 1) -> None:
     >>> check_size("n_layer", 10**12, 256)
     Traceback (most recent call last):
     ...
-    ValueError: n_layer: expected a whole number from 1 to 256, got 1000000000000
+    torchrl_sparse.errors.InputError: n_layer: expected a whole number from 1 to 256, got 1000000000000
     """
     if type(value) is not int or not least <= value <= most:
-        raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {reprlib.repr(value)}")
+        raise InputError(f"{name}: expected a whole number from {least} to {most}, got {reprlib.repr(value)}")

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["WorkerDied", "backend_runtime", "check_backend", "ray_death"]
 
 _BACKENDS = ("process", "ray")
@@ -21,9 +23,9 @@ class WorkerDied(RuntimeError):
 def check_backend(backend: str, workers: int) -> None:
     """Raise ValueError for an unknown backend or no worker."""
     if backend not in _BACKENDS:
-        raise ValueError(f"backend: expected one of {', '.join(_BACKENDS)}, got {backend!r}")
+        raise InputError(f"backend: expected one of {', '.join(_BACKENDS)}, got {backend!r}")
     if workers < 1:
-        raise ValueError(f"workers: expected at least 1, got {workers}")
+        raise InputError(f"workers: expected at least 1, got {workers}")
 
 
 def backend_runtime(backend: str, workers: int) -> AbstractContextManager[None]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["check_device"]
 
 
@@ -18,10 +20,10 @@ def check_device(name: str) -> str:
     >>> check_device("abacus")
     Traceback (most recent call last):
     ...
-    ValueError: expected one that this machine and PyTorch have, got 'abacus'
+    torchrl_sparse.errors.InputError: expected one that this machine and PyTorch have, got 'abacus'
     """
     try:
         torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:  # of a name that is none, and without CUDA compiled in
-        raise ValueError(f"expected one that this machine and PyTorch have, got {name!r}") from error
+        raise InputError(f"expected one that this machine and PyTorch have, got {name!r}") from error
     return name

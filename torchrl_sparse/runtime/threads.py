@@ -5,6 +5,8 @@ from contextlib import contextmanager
 
 import torch
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["num_threads"]
 
 
@@ -20,7 +22,7 @@ def num_threads(threads: int | None) -> Iterator[None]:
     1
     """
     if threads is not None and threads < 1:
-        raise ValueError(f"threads: expected at least 1 or None, got {threads}")
+        raise InputError(f"threads: expected at least 1 or None, got {threads}")
     before = torch.get_num_threads()
     if threads is not None:
         torch.set_num_threads(threads)

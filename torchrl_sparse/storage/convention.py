@@ -9,6 +9,8 @@ import re
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["Convention", "source_convention", "version_convention"]
 
 Convention = Literal["1.5", "1.4"]
@@ -27,7 +29,7 @@ def source_convention(source: Mapping[str, Any]) -> Convention:
     try:
         return version_convention(source.get("robosuite") or ("1.2" if "weights" in source else "1.5"))
     except ValueError as error:
-        raise ValueError(f"policy.source['robosuite']: {error}") from error
+        raise InputError(f"policy.source['robosuite']: {error}") from error
 
 
 def version_convention(version: str) -> Convention:
@@ -38,5 +40,5 @@ def version_convention(version: str) -> Convention:
     """
     numbers = re.match(r"(\d+)\.(\d+)", version)
     if numbers is None:
-        raise ValueError(f"expected a version such as 1.4.1, got {version!r}")
+        raise InputError(f"expected a version such as 1.4.1, got {version!r}")
     return "1.4" if tuple(map(int, numbers.groups())) < (1, 5) else "1.5"

@@ -25,6 +25,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -134,7 +135,7 @@ def _load(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
 def _check_warm_start(file: Path, steps: int | None, sampler: Sampler) -> None:
     if steps is not None and not 1 <= steps < sampler.num_inference_steps:
         most = sampler.num_inference_steps - 1
-        raise ValueError(f"{file}: warm_start: expected 1 to {most} of the schedule's steps, got {steps}")
+        raise InputError(f"{file}: warm_start: expected 1 to {most} of the schedule's steps, got {steps}")
 
 
 def _networks(file: Path, config: _Config) -> tuple[TransformerForDiffusion, VisionEncoder | None]:
@@ -160,4 +161,4 @@ def _make(file: Path, field: str, kind: Callable[..., T], arguments: dict[str, A
     try:
         return kind(**arguments)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{file}: {field}: {error}") from error
+        raise InputError(f"{file}: {field}: {error}") from error

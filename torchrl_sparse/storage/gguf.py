@@ -19,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["GGUF"]
 
 _MAGIC, _VERSIONS, _ALIGNMENT, _MAX_DIMS = b"GGUF", (2, 3), 32, 4
@@ -168,4 +170,4 @@ class GGUF:
         return _Stored(shape, self._number("I"), self._number("Q"))
 
     def _fault(self, text: str) -> ValueError:
-        return ValueError(f"{self.path}: {text}")
+        return InputError(f"{self.path}: {text}")

@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.fingerprint import is_same_policy
 from torchrl_sparse.storage.atomic import atomic_path
 
@@ -71,7 +72,7 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     >>> parse_json('{"solved": true}', dict[str, int], "line 3")
     Traceback (most recent call last):
     ...
-    ValueError: line 3: solved: expected a valid integer, got True
+    torchrl_sparse.errors.InputError: line 3: solved: expected a valid integer, got True
     """
     from pydantic import ValidationError
     from pydantic_core import from_json
@@ -80,19 +81,19 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
     _check_size(len(data), where)
     parts = data.count(b"[") + data.count(b"{")
     if parts > MAX_PARTS:  # of an empty list, two bytes, Python makes sixty
-        raise ValueError(f"{where}: expected at most {MAX_PARTS} lists and objects, got {parts}")
+        raise InputError(f"{where}: expected at most {MAX_PARTS} lists and objects, got {parts}")
     try:
         read = from_json(data, allow_inf_nan=False)  # also where a field may hold anything
     except ValueError as error:
-        raise ValueError(f"{where}: expected a complete JSON file, got: {error}") from error
+        raise InputError(f"{where}: expected a complete JSON file, got: {error}") from error
     try:
         made = _adapter(kind).validate_json(b"[%b]" % data)[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
-        raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+        raise InputError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
     try:
         json.loads(b'{"": %b}' % data, object_pairs_hook=_once)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
     if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(read, to_plain(made), where)
     return made
@@ -107,14 +108,14 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     >>> check_plain("few", int, "episodes")
     Traceback (most recent call last):
     ...
-    ValueError: episodes: expected a valid integer, got 'few'
+    torchrl_sparse.errors.InputError: episodes: expected a valid integer, got 'few'
     """
     from pydantic import ValidationError
 
     try:
         made = _adapter(kind).validate_python((value,))[0]  # type: ignore[arg-type]  # classes have a hash
     except ValidationError as error:
-        raise ValueError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
+        raise InputError(f"{where}: {_fault(error.errors(include_url=False)[0])}") from error
     if _names_numbers(kind):  # type: ignore[arg-type]  # classes have a hash
         _check_numbers(value, to_plain(made), where)
     return made
@@ -222,7 +223,7 @@ def _check_numbers(read: Any, made: Any, where: str) -> None:
         and isinstance(read, (bool, int, float))
         and type(read) is not type(made)
     ):
-        raise ValueError(f"{where}: expected {made!r}, got {read!r}")
+        raise InputError(f"{where}: expected {made!r}, got {read!r}")
 
 
 def _once(entries: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -230,10 +231,10 @@ def _once(entries: list[tuple[str, Any]]) -> dict[str, Any]:
     made = dict(entries)
     if len(made) < len(entries):
         ((twice, count),) = Counter(name for name, _ in entries).most_common(1)
-        raise ValueError(f"{twice}: expected one entry of this name, got {count}")
+        raise InputError(f"{twice}: expected one entry of this name, got {count}")
     for name, value in entries:
         if isinstance(value, (float, list)) and _is_infinite(value):
-            raise ValueError(f"{f'{name}: ' if name else ''}expected finite numbers, got one beyond floats")
+            raise InputError(f"{f'{name}: ' if name else ''}expected finite numbers, got one beyond floats")
     return made
 
 
@@ -245,7 +246,7 @@ def _is_infinite(value: Any) -> bool:
 
 def _check_size(size: int, where: str) -> None:
     if size > MAX_BYTES:
-        raise ValueError(f"{where}: expected at most {MAX_BYTES} bytes of JSON, got {size}")
+        raise InputError(f"{where}: expected at most {MAX_BYTES} bytes of JSON, got {size}")
 
 
 def _short(value: Any) -> str:

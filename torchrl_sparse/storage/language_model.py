@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -77,14 +78,14 @@ def read_language_model(path: str | Path) -> LanguageModel:
     file = GGUF(Path(path))
     for name, value in _FIXED.items():
         if (found := _entry(file, name, type(value))) != value:
-            raise ValueError(f"{path}: {name}: expected {value!r}, got {found!r}")
+            raise InputError(f"{path}: {name}: expected {value!r}, got {found!r}")
     if scaled := sorted(name for name in file.metadata if name.startswith("llama.rope.scaling")):
-        raise ValueError(f"{path}: expected rotary embeddings that are not scaled, got {scaled}")
+        raise InputError(f"{path}: expected rotary embeddings that are not scaled, got {scaled}")
     try:
         sizes = _sizes(file)
         config = VLAConfig.tiny(**sizes)
     except ValueError as error:
-        raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     return LanguageModel(sizes, _weights(file, config), _tokenizer(file), digest_of(path))
 
 
@@ -108,7 +109,7 @@ def digest_of(path: str | Path) -> str:
 def _entry(file: GGUF, name: str, kind: type[T]) -> T:
     value = file.metadata.get(name)
     if type(value) is not kind:
-        raise ValueError(f"{file.path}: {name}: expected {kind.__name__}, got {str(value)[:80]}")
+        raise InputError(f"{file.path}: {name}: expected {kind.__name__}, got {str(value)[:80]}")
     return value
 
 
@@ -122,7 +123,7 @@ def _sizes(file: GGUF) -> dict[str, Any]:
     )
     for name in _HEAD_SIZES:  # rotary embeddings of a part of a head would be others
         if (found := file.metadata.get(name, llm.dim // heads)) != llm.dim // heads:
-            raise ValueError(
+            raise InputError(
                 f"{name}: expected {llm.dim // heads}, the size of a head, got {str(found)[:80]}"
             )
     return {
@@ -174,7 +175,7 @@ def _tokenizer(file: GGUF) -> LlamaTokenizer:
         pairs = [tuple(merge.split(" ")) for merge in merges]
         tokenizer = Tokenizer(models.BPE({token: number for number, token in enumerate(tokens)}, pairs))
     except Exception as error:  # of Rust's, which are plain ones
-        raise ValueError(f"{file.path}: tokenizer.ggml: expected byte pairs, got: {error}") from error
+        raise InputError(f"{file.path}: tokenizer.ggml: expected byte pairs, got: {error}") from error
     digits = pre_tokenizers.Digits(individual_digits=True)
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
         [digits, pre_tokenizers.ByteLevel(add_prefix_space=False)]

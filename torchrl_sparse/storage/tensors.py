@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = [
@@ -55,7 +56,7 @@ def read_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
             _check_header(path, {name: file.get_slice(name) for name in names}, expected)
             tensors = {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
-        raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
+        raise InputError(f"{path}: expected a complete safetensors file, got: {error}") from error
     check_finite(str(path), tensors)
     return tensors
 
@@ -67,7 +68,7 @@ def _check_header(path: Path, found: Mapping[str, Any], expected: Mapping[str, T
     for name, part in found.items():
         types = _FLAGS if expected is not None and expected[name].dtype == torch.bool else _NUMBERS
         if part.get_dtype() not in types:
-            raise ValueError(f"{path}: {name}: expected a type of {list(types)}, got {part.get_dtype()}")
+            raise InputError(f"{path}: {name}: expected a type of {list(types)}, got {part.get_dtype()}")
 
 
 def take(tensors: dict[str, T], prefix: str) -> dict[str, T]:
@@ -94,14 +95,14 @@ def check_shapes(
     >>> check_shapes("a.safetensors", {"w": (2, 3)}, {"w": (2, 4)})
     Traceback (most recent call last):
     ...
-    ValueError: a.safetensors: w: expected shape (2, 4), got (2, 3)
+    torchrl_sparse.errors.InputError: a.safetensors: w: expected shape (2, 4), got (2, 3)
     """
     missing, extra = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     if missing or extra:
-        raise ValueError(f"{where}: tensors: missing {_first(missing)}, unexpected {_first(extra)}")
+        raise InputError(f"{where}: tensors: missing {_first(missing)}, unexpected {_first(extra)}")
     for name, shape in expected.items():
         if found[name] != shape:
-            raise ValueError(f"{where}: {name}: expected shape {shape}, got {found[name]}")
+            raise InputError(f"{where}: {name}: expected shape {shape}, got {found[name]}")
 
 
 def _first(names: list[str]) -> str:
@@ -113,7 +114,7 @@ def check_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError, beginning with ``where``, if a tensor holds NaN or infinity."""
     for name, value in tensors.items():
         if not value.isfinite().all():
-            raise ValueError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
+            raise InputError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
 
 
 def check_folder(path: Path) -> None:

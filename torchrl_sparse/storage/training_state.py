@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences
 
@@ -47,19 +48,19 @@ def read_checkpoint(
         raise
     except Exception as error:
         # torch reports damaged and unsafe files through many exception types.
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
         ) from error
     if not isinstance(state, dict) or not fields - optional <= set(state) <= fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a training checkpoint of this version with {sorted(fields)}, got {found}; "
             f"move it away to begin anew"
         )
     for name, expected in header.items():
         stored, asked = (_without(free, values) for values in (state[name], expected))
         if differing := describe_differences(stored, asked):
-            raise ValueError(
+            raise InputError(
                 f"{path}: made with another {name}: {differing}; choose another out or move it away"
             )
     return state

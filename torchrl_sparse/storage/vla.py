@@ -22,6 +22,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.adapters import add_adapters, is_frozen
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -132,7 +133,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = 
         with torch.device("meta"):
             own = trained_state(_build(config, stored.base), stored.base)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}") from error
     _check_architecture(where, expected, config)
     identity = QuantileNormalizer.identity(config.state_dim, config.action_dim)
     tensors = read_tensors(
@@ -146,7 +147,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = 
     try:
         normalizer = QuantileNormalizer(**take(tensors, _NORMALIZER))
     except ValueError as error:
-        raise ValueError(f"{path / 'model.safetensors'}: normalizer: {error}") from error
+        raise InputError(f"{path / 'model.safetensors'}: normalizer: {error}") from error
     return StoredVLA(network.eval(), normalizer, tokenizer, stored.source or VLASource(), stored.base)
 
 
@@ -159,13 +160,13 @@ def trained_state(network: VLANetwork, base: AdaptedBase | None) -> dict[str, Te
 def _read_base(where: Path, stored: AdaptedBase | None, path: Path | None) -> LanguageModel | None:
     if (stored is None) != (path is None):
         needs = "none" if stored is None else f"the file with SHA-256 {stored.sha256}"
-        raise ValueError(f"{where}: base: expected {needs}, got {path}")
+        raise InputError(f"{where}: base: expected {needs}, got {path}")
     if stored is None or path is None:
         return None
     if not path.is_file():
         raise FileNotFoundError(f"base: expected a file {path}, got none")
     if (found := digest_of(path)) != stored.sha256:  # before anything else in it is believed
-        raise ValueError(
+        raise InputError(
             f"{path}: expected the file with SHA-256 {stored.sha256}, which {where} names, got {found}"
         )
     return read_language_model(path)
@@ -174,7 +175,7 @@ def _read_base(where: Path, stored: AdaptedBase | None, path: Path | None) -> La
 def _check_base(config: VLAConfig, language: LanguageModel | None) -> None:
     for name, size in ({} if language is None else language.sizes).items():
         if (found := getattr(config, name)) != size:
-            raise ValueError(f"network.{name}: expected {size}, as in the base, got {found}")
+            raise InputError(f"network.{name}: expected {size}, as in the base, got {found}")
 
 
 def _build(config: VLAConfig, base: AdaptedBase | None) -> VLANetwork:
@@ -187,7 +188,7 @@ def _check_architecture(path: Path, expected: VLAConfig | None, found: VLAConfig
         return
     want, have = expected.to_dict(), found.to_dict()
     parts = [f"{name}: expected {want[name]}, got {have[name]}" for name in want if want[name] != have[name]]
-    raise ValueError(f"{path}: {'; '.join(parts)}")
+    raise InputError(f"{path}: {'; '.join(parts)}")
 
 
 def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

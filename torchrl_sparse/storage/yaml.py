@@ -15,6 +15,8 @@ from typing import Any
 
 import yaml
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["read_yaml"]
 
 MAX_ENTRIES = (
@@ -31,7 +33,7 @@ class _Loader(yaml.SafeLoader):
         names: set[Any] = set()
         for key, _ in node.value:
             if (name := _name(key)) in names:
-                raise ValueError(f"{_line(key)}: {key.value}: expected one entry of this name, got another")
+                raise InputError(f"{_line(key)}: {key.value}: expected one entry of this name, got another")
             names.add(name)
         return node
 
@@ -45,7 +47,7 @@ class _Loader(yaml.SafeLoader):
                 continue
             for source in value.value if isinstance(value, yaml.SequenceNode) else [value]:
                 if not isinstance(source, yaml.MappingNode):
-                    raise ValueError(
+                    raise InputError(
                         f"{_line(key)}: <<: expected a mapping or a list of them, got another value"
                     )
                 self.flatten_mapping(source)
@@ -87,14 +89,14 @@ def read_yaml(path: str | os.PathLike) -> Any:
         read = yaml.load(Path(path).read_bytes(), _Loader)
         for number, (place, fault) in enumerate(_faults(read)):
             if fault or number >= MAX_ENTRIES:
-                raise ValueError(f"{place}{fault or f'expected at most {MAX_ENTRIES} entries, got more'}")
+                raise InputError(f"{place}{fault or f'expected at most {MAX_ENTRIES} entries, got more'}")
     except RecursionError as error:
-        raise ValueError(f"{path}: expected YAML, got one that is too deep") from error
+        raise InputError(f"{path}: expected YAML, got one that is too deep") from error
     # of explicit tags, such as !!int on no number, PyYAML lets Python's own errors through
     except (yaml.YAMLError, UnicodeDecodeError, LookupError, AttributeError) as error:
-        raise ValueError(f"{path}: expected YAML, got {' '.join(str(error).split())}") from error
+        raise InputError(f"{path}: expected YAML, got {' '.join(str(error).split())}") from error
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from error
     return read
 
 

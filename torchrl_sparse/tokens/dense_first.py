@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import Entry
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 
@@ -39,7 +40,7 @@ class DenseFirst(TokenPruner):
 
     def bind(self, spec: VisualSpec) -> None:
         if skipped := self.inner.layers_skipped(spec.num_layers):
-            raise ValueError(
+            raise InputError(
                 f"inner: expected a pruner that skips no layers, got one that skips {sorted(skipped)}"
             )
         self.inner.bind(spec)

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import best, check_share
@@ -73,7 +74,7 @@ class EfficientVLAPruner(TokenPruner):
     def bind(self, spec: VisualSpec) -> None:
         wrong = sorted(layer for layer in self.skipped if not self._LAYER < layer < spec.num_layers)
         if wrong:
-            raise ValueError(
+            raise InputError(
                 f"skipped: expected layers from {self._LAYER + 1} to {spec.num_layers - 1}, got {wrong}"
             )
 
@@ -137,6 +138,6 @@ def redundant_layers(similarity: Tensor, count: int) -> list[int]:
     mean = similarity.mean(0)
     free = len(mean) - EfficientVLAPruner._LAYER - 1
     if not 0 <= count <= free:
-        raise ValueError(f"expected 0 to {free} layers to skip, got {count}")
+        raise InputError(f"skipped: expected 0 to {free} layers, got {count}")
     order = mean[-free:].argsort(descending=True, stable=True)[:count] + len(mean) - free
     return sorted(order.tolist())

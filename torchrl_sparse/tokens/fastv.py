@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import best, check_share
@@ -41,13 +42,13 @@ class FastVPruner(TokenPruner):
     def __init__(self, share: float = 0.5, layer: int = 2, depth: int | None = None):
         check_share("share", share)
         if layer < 1:
-            raise ValueError(f"layer: expected at least 1, got {layer}")
+            raise InputError(f"layer: expected at least 1, got {layer}")
         self.share = share
         self.layer, self.depth = layer, depth
 
     def bind(self, spec: VisualSpec) -> None:
         if (layer := self._scaled(spec.num_layers)) >= spec.num_layers:
-            raise ValueError(f"layer: expected less than the model's {spec.num_layers} layers, got {layer}")
+            raise InputError(f"layer: expected less than the model's {spec.num_layers} layers, got {layer}")
 
     def _scaled(self, num_layers: int) -> int:
         return self.layer if self.depth is None else max(1, round(self.layer * num_layers / self.depth))

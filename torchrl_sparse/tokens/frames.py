@@ -7,6 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["FRAME_KEYS", "compare_frames", "look_back", "past_frame_keys", "patches", "similarity"]
@@ -22,7 +23,7 @@ def past_frame_keys(furthest: int) -> list[NestedKey]:
         ValueError: if that is less than one query.
     """
     if furthest < 1:
-        raise ValueError(f"look_back: expected at least 1 query, got {furthest}")
+        raise InputError(f"look_back: expected at least 1 query, got {furthest}")
     return [keys.TOKEN_PAST_FRAMES, keys.EEF_VEL] if furthest > 1 else []
 
 
@@ -42,7 +43,7 @@ def patches(frames: Tensor, grid: tuple[int, int]) -> Tensor:
     """
     (height, width), (rows, columns) = frames.shape[-2:], grid
     if height % rows or width % columns:
-        raise ValueError(
+        raise InputError(
             f"frames: expected a size that {rows} x {columns} patches divide, got {height} x {width}"
         )
     cut = frames.unflatten(-1, (columns, -1)).unflatten(-3, (rows, -1))  # [B, V, 3, rows, y, columns, x]

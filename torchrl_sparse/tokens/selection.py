@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 
 __all__ = ["best", "best_per_camera", "check_budget", "check_share", "ranks", "scaled_layers"]
@@ -73,7 +74,7 @@ def check_budget(name: str, budget: float, spec: VisualSpec) -> None:
         ValueError: naming the budget and the model's tokens.
     """
     if not 0 < budget <= spec.per_camera:
-        raise ValueError(
+        raise InputError(
             f"{name}: expected more than 0 and at most the model's {spec.per_camera} tokens per camera, got {budget:g}"
         )
 
@@ -85,4 +86,4 @@ def check_share(name: str, share: float) -> None:
         ValueError: naming it.
     """
     if not 0 < share <= 1:
-        raise ValueError(f"{name}: expected more than 0 and at most 1, got {share:g}")
+        raise InputError(f"{name}: expected more than 0 and at most 1, got {share:g}")

@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import LayerState, TokenKind
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.selection import check_share, scaled_layers
@@ -113,7 +114,7 @@ class SparseVLMPruner(TokenPruner):
         raters: Literal["layer", "embeddings"] = "layer",
     ):
         if raters not in ("layer", "embeddings"):
-            raise ValueError(f"raters: expected 'layer' or 'embeddings', got {raters!r}")
+            raise InputError(f"raters: expected 'layer' or 'embeddings', got {raters!r}")
         for name, value in {"scale": scale, "recycled": recycled, "clusters": clusters}.items():
             check_share(name, value)
         self.scale, self.recycled, self.clusters = scale, recycled, clusters

@@ -22,11 +22,10 @@ Eq.    function                          defines
 ====== ================================= =============================================================================
 
 The numbers of Eqs. 3 and 4 are inferred. What the paper leaves open is settled so: the carried score is the mean of Eq. 1 over
-two deep layers, 0 for tokens that were gone there; it contributes as many tokens as one layer does, and what changed at most as
-many (K_G = K_D = K); the threshold of Eq. 2 and the share kept by a dynamic layer are those of the release; an episode's first
-query keeps every token until the dynamic layers, because nothing is known of it yet. Where the four sets of a coarse query do
-not overlap, that keeps 192 of 512 visual tokens after two layers and 80 after the last dynamic one: 320 and 112 of about 600
-tokens pruned, beside the 315 (52.5 %) and 19 % that are reported of the paper.
+two deep layers, 0 for tokens that were gone there. It contributes as many tokens as one layer does, and changes at most as many
+(K_G = K_D = K). The threshold of Eq. 2 and a dynamic layer's share are the release's. An episode's first call keeps all.
+Where the four sets of a coarse call do not overlap, that keeps 192 of 512 visual tokens after two layers and 80 after the last
+dynamic one: 320 and 112 of some 600 are pruned, beside the 315 (52.5 %) and 19 % that are reported of the paper.
 """
 
 from __future__ import annotations
@@ -39,6 +38,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.hooks import LayerState, VisualSpec
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.frames import FRAME_KEYS, compare_frames, past_frame_keys
@@ -199,12 +199,14 @@ class SpecPrune(TokenPruner):
 
     def __init__(self, preset: Literal["paper", "release"] = "paper", **changes: Any):
         if preset not in PRESETS:
-            raise ValueError(f"preset: expected 'paper' or 'release', got {preset!r}")
+            raise InputError(f"preset: expected 'paper' or 'release', got {preset!r}")
         self.options = replace(PRESETS[preset], **changes)
         for name in ("keep_share", "wrist_share", "beta"):
             check_share(name, getattr(self.options, name))
         if not (self.options.carry or self.options.changed or self.options.local):
-            raise ValueError("expected one of carry, changed and local, got none of them: nothing would stay")
+            raise InputError(
+                "SpecPrune: expected one of carry, changed and local, got none of them: nothing would stay"
+            )
         self.look_back = self.options.look_back
         past = past_frame_keys(self.look_back)
         self.in_keys = [*FRAME_KEYS, *past, keys.TOKEN_BUDGET]
@@ -214,7 +216,7 @@ class SpecPrune(TokenPruner):
 
     def bind(self, spec: VisualSpec) -> None:
         if spec.num_layers <= _SPECULATION:
-            raise ValueError(f"SpecPrune: expected more than {_SPECULATION} layers, got {spec.num_layers}")
+            raise InputError(f"SpecPrune: expected more than {_SPECULATION} layers, got {spec.num_layers}")
         check_budget("alpha * budget", self.options.alpha * self.options.budget, spec)
         self.spec = spec
         self._dynamic_layers = self._scaled(self.options.dynamic_layers) if self.options.dynamic else []

@@ -8,6 +8,7 @@ import numpy as np
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, TYPE_COLORS
 from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.errors import InputError
 
 __all__ = ["plot_pruner_curves", "read_scalars"]
 
@@ -48,7 +49,7 @@ def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike
     """
     needed = ["train/fidelity", "train/rate_cost", *(f"train/rate_{kind}" for kind in BLOCK_TYPES)]
     if missing := [name for name in needed if name not in curves]:
-        raise ValueError(f"curves: expected {needed}, missing {missing}")
+        raise InputError(f"curves: expected {needed}, missing {missing}")
     figure, grid = make_figure(9, 6.6, rows=3, columns=1, sharex=True)
     fidelity, sparsity, shares = grid[:, 0]
     fidelity.plot(*curves["train/fidelity"].T, color="#0072B2", alpha=0.7, label="training batches")

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.training.trainer import Trainer
 
 __all__ = ["DemonstrationTrainer", "TrainConfig", "split_windows", "trained_parameters"]
@@ -55,19 +56,19 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.max_steps < 1 or self.batch_size < 1:
-            raise ValueError(
-                f"expected max_steps and batch_size >= 1, "
+            raise InputError(
+                f"max_steps, batch_size: expected at least 1, "
                 f"got max_steps={self.max_steps}, batch_size={self.batch_size}"
             )
         for name in ("lr_warmup_steps", "weight_decay", "max_grad_norm"):
             if not (value := getattr(self, name)) >= 0:
-                raise ValueError(f"{name}: expected 0 or more, got {value}")
+                raise InputError(f"{name}: expected 0 or more, got {value}")
         if not self.lr > 0:
-            raise ValueError(f"lr: expected a positive number, got {self.lr}")
+            raise InputError(f"lr: expected a positive number, got {self.lr}")
         if self.precision not in ("fp32", "bf16"):
-            raise ValueError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
+            raise InputError(f'precision: expected "fp32" or "bf16", got {self.precision!r}')
         if not 0 <= self.val_ratio < 1:
-            raise ValueError(f"val_ratio: expected a share in [0, 1), got {self.val_ratio}")
+            raise InputError(f"val_ratio: expected a share in [0, 1), got {self.val_ratio}")
 
 
 class DemonstrationTrainer(Trainer):
@@ -177,7 +178,9 @@ def split_windows(
     """
     num_val = math.ceil(val_ratio * len(demos))
     if num_val >= len(demos):
-        raise ValueError(f"val_ratio {val_ratio} of {len(demos)} episodes leaves none to train on")
+        raise InputError(
+            f"val_ratio: expected one that leaves episodes to train on, got {val_ratio} of {len(demos)}"
+        )
     split = len(demos) - num_val
     held_out = demos.window_rows(*sizes, range(split, len(demos))) if num_val else None
     return demos.window_rows(*sizes, range(split)), held_out

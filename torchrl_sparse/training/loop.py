@@ -10,6 +10,7 @@ from typing import Any
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.runtime.interrupt import StopSignal
 from torchrl_sparse.runtime.wandb_run import wandb_arguments
@@ -117,4 +118,4 @@ def _step_of(line: bytes, path: Path) -> int:
     try:
         return int(line.split(b",")[0])
     except ValueError as error:
-        raise ValueError(f"{path}: expected lines of step and value, got {line!r}") from error
+        raise InputError(f"{path}: expected lines of step and value, got {line!r}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torchrl_sparse import keys
 from torchrl_sparse.control.roll_forward import StateModel
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.errors import InputError
 
 __all__ = ["fit_state_model"]
 
@@ -24,7 +25,7 @@ def fit_state_model(demos: Demonstrations, steps: int) -> tuple[StateModel, floa
         ValueError: for fewer episodes, or if they are too short.
     """
     if len(demos) < 2:
-        raise ValueError(f"demos: expected 2 demonstrations or more, got {len(demos)}")
+        raise InputError(f"demos: expected 2 demonstrations or more, got {len(demos)}")
     episodes = [
         (rows.get(keys.STATE), rows.get(keys.ACTION)) for rows in map(demos.episode, range(len(demos)))
     ]

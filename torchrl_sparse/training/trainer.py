@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.training_state import read_checkpoint, write_checkpoint
 
 __all__ = ["StepConfig", "Trainer", "batch_indices", "checksum", "step_seed"]
@@ -176,7 +177,7 @@ class Trainer(ABC):
         fields = header.keys() | self.state().keys()
         state = read_checkpoint(path, fields, header, optional={UNLOGGED}, free=LENGTH)
         if (taken := state["step"]) > self.total:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected at most {self.total} steps, as asked for, got {taken}; ask for more or choose another out"
             )
         self.load_state(state)

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
@@ -75,7 +76,7 @@ def carried_noise(
         ((87, 20), True)
     """
     if draws < 3 or not len(targets):
-        raise ValueError(f"expected draws >= 3 and queries, got {draws} draws of {len(targets)} queries")
+        raise InputError(f"expected draws >= 3 and queries, got {draws} draws of {len(targets)} queries")
     network, target = policy.network, targets["target"]
     generator = torch.Generator().manual_seed(seed)
     shape = (len(targets) * draws, sampler.num_inference_steps, *target.shape[1:])

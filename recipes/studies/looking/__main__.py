@@ -31,6 +31,7 @@ from torchrl_sparse.control.queries import record_queries
 from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.seeds import DEVELOPMENT_SEED, tuning_seeds
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import write_json
 from torchrl_sparse.training.diffusion.published import published_shape
@@ -51,9 +52,9 @@ def main(config: DictConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     if config.oracle.attempts and not config.pruner:
-        raise ValueError(f"oracle.attempts: expected 0 without a pruner, got {config.oracle.attempts}")
+        raise InputError(f"oracle.attempts: expected 0 without a pruner, got {config.oracle.attempts}")
     if config.sampler and config.pruner:
-        raise ValueError(
+        raise InputError(
             f"sampler: expected null with a pruner, which brings its own, got {config.sampler!r}"
         )
     policy, task = make_policy(config), find_task(config.task).name

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import Dense
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH, dense_answers
 from torchrl_sparse.training.pruner.loss import varying_share
@@ -132,7 +133,7 @@ def episode_rows(queries: TensorDictBase) -> list[Tensor]:
     episodes = queries[keys.EPISODE_SEED].flatten()
     rows = [(episodes == number).nonzero().flatten() for number in episodes.unique()]
     if len(rows) < 2:
-        raise ValueError(f"queries: expected those of two episodes at least, got {len(rows)}")
+        raise InputError(f"queries: expected those of two episodes at least, got {len(rows)}")
     return rows
 
 

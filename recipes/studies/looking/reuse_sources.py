@@ -18,6 +18,7 @@ from torch.nn.functional import cosine_similarity
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.blocks.mask import BLOCK_TYPES
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = ["ReuseSources", "reuse_sources", "source_similarity"]
@@ -75,7 +76,7 @@ def reuse_sources(policy: DiffusionPolicy, queries: TensorDictBase) -> ReuseSour
     noise = policy.sample_noise(encoded[keys.SEED].flatten())
     elapsed = queries[keys.ELAPSED].flatten().tolist()
     if not any(elapsed):
-        raise ValueError("queries: expected some with a query of their episode before them, got none")
+        raise InputError("queries: expected some with a query of their episode before them, got none")
     total, before = 0, None
     for row in range(len(queries)):
         recorder = FeatureRecorder()

@@ -35,6 +35,7 @@ from torchrl_sparse.cli.options import Word, Words
 from torchrl_sparse.cli.recipe import recipe
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.results.schema import DENSE, load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
@@ -91,7 +92,7 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
     for path in config.results:
         results = load_results(path)
         if results.task != task:
-            raise ValueError(f"results: {path}: expected a table of {task}, got one of {results.task}")
+            raise InputError(f"results: {path}: expected a table of {task}, got one of {results.task}")
         found = outcomes(results).items()
         played[path] = {name: outcome for name, outcome in found if answers_alone(MethodName.parse(name))}
     return played
@@ -103,7 +104,7 @@ def answers_alone(name: MethodName) -> bool:
 
 
 def no_calibration() -> Any:
-    raise ValueError("planners: expected the BAC schedules of the tables, got a folder without one of them")
+    raise InputError("planners: expected the BAC schedules of the tables, got a folder without one of them")
 
 
 def measure(

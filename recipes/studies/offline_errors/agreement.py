@@ -14,6 +14,7 @@ from recipes.studies.offline_errors.ranks import (
     rank_correlation,
 )
 from recipes.studies.offline_errors.results import MEASURES, OfflineResults, Outcome
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.json import read_json, write_json
 
 __all__ = [
@@ -87,7 +88,7 @@ def agreement_of(results: Sequence[OfflineResults]) -> OfflineAgreement:
     groups = [(_short(path), one, table) for one in results for path, table in one.played.items()]
     methods = {name: len(table) for name, _, table in groups}
     if len(methods) < len(groups):
-        raise ValueError(f"aggregate: expected every table once, got {[name for name, _, _ in groups]}")
+        raise InputError(f"aggregate: expected every table once, got {[name for name, _, _ in groups]}")
 
     def agree(measure: str, outcome: str) -> Agreement:
         ours, errors = ([_errors(one, table, key) for _, one, table in groups] for key in (measure, "error"))

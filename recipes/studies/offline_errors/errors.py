@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import planned_answers
 
@@ -79,7 +80,7 @@ def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> Offl
         OfflineErrors(error=1.0, energy_score=0.0, energy_distance=2.0, spread=1.4142135381698608)
     """
     if min(answers.shape[1], dense.shape[1]) < 2:
-        raise ValueError(
+        raise InputError(
             f"draws: expected at least 2, got {answers.shape[1]} of the method and {dense.shape[1]} of dense"
         )
     across = torch.cdist(answers, dense).mean()

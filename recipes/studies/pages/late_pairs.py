@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.build import Terms, compare_pair
 from torchrl_sparse.evaluation.results.realtime import Realtime, RealtimePoint, load_realtime
 from torchrl_sparse.evaluation.results.report import comparison_rows
@@ -37,7 +38,7 @@ def late_pair_rows(path: Path, pairs: Sequence[tuple[str, str]]) -> list[dict[st
     results = load_realtime(path)
     points = dict(_late(results))
     if unknown := [point for pair in pairs for point in pair if point not in points]:
-        raise ValueError(f"pairs: expected two of {', '.join(points)}, got {', '.join(unknown)}")
+        raise InputError(f"pairs: expected two of {', '.join(points)}, got {', '.join(unknown)}")
     played = {name: _episodes(path.parent, name, results, points) for pair in pairs for name in pair}
     first = points[pairs[0][0]]
     terms = Terms(

@@ -14,6 +14,7 @@ from recipes.studies.pages.result_tables import acceleration_tables, realtime_ta
 from recipes.studies.pages.scores import score_rows, told_scores
 from recipes.studies.pages.ways import way_rows
 from recipes.studies.simulate_stopping.results import load_stopping, stopping_rows
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.ways import told_ways
 from torchrl_sparse.evaluation.results.build import Terms, compare_pair
 from torchrl_sparse.evaluation.results.realtime import load_realtime
@@ -43,7 +44,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     """
     if not path.name.startswith((*_READERS,)):
         names = ", ".join(f"{kind}*.json" for kind in _READERS)
-        raise ValueError(f"expected a file {names}, got {path.name}")
+        raise InputError(f"expected a file {names}, got {path.name}")
     if pairs:
         return _pairs(path, pairs)
     if which in _OF_EPISODES:
@@ -51,7 +52,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
     tables = next(read for kind, read in _READERS.items() if path.name.startswith(kind))(path)
     name = which or next(iter(tables))
     if name not in tables:
-        raise ValueError(f"rows: expected one of {', '.join(tables)}, got {name!r}")
+        raise InputError(f"rows: expected one of {', '.join(tables)}, got {name!r}")
     return tables[name]
 
 
@@ -61,7 +62,7 @@ def _pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> Table:
     results = load_results(path)
     names = {name for pair in pairs for name in pair}
     if unknown := sorted(names - results.methods.keys()):
-        raise ValueError(f"pairs: expected two of {', '.join(results.methods)}, got {', '.join(unknown)}")
+        raise InputError(f"pairs: expected two of {', '.join(results.methods)}, got {', '.join(unknown)}")
     played = _episodes(path, results, names)
     terms = Terms(
         Design(results.dense.success.n),
@@ -78,7 +79,7 @@ def _told(path: Path, which: str) -> Table:
     results = load_results(path)
     told = tell(_episodes(path, results, results.methods))
     if not told:
-        raise ValueError(f"rows: expected episodes of {results.task} {expected}, got none")
+        raise InputError(f"rows: expected episodes of {results.task} {expected}, got none")
     return make_table(subject(results), rows(told, results))
 
 

@@ -40,6 +40,7 @@ from pathlib import Path
 
 from recipes.studies.pages.page_rows import read_table
 from recipes.studies.pages.side_by_side import Published, side_by_side
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.result_files import Row, Table
 from torchrl_sparse.evaluation.results.tables import markdown_table, select_columns
 from torchrl_sparse.storage.atomic import atomic_path
@@ -65,13 +66,13 @@ class _Directive:
         for word in shlex.split(text):
             name, equals, value = word.partition("=")
             if equals and name not in _OPTIONS:
-                raise ValueError(f"expected the options {', '.join(_OPTIONS)}, got {name!r}")
+                raise InputError(f"expected the options {', '.join(_OPTIONS)}, got {name!r}")
             if equals:
                 options[name] = value
             else:
                 files.append(word)
         if not files:
-            raise ValueError(f"expected a file of results, got {text!r}")
+            raise InputError(f"expected a file of results, got {text!r}")
         return cls(files, options)
 
     def parts(self, option: str) -> list[str]:
@@ -140,7 +141,7 @@ def _find_end(lines: Sequence[str], start: int, where: str) -> int:
             return number
         if _BEGIN.fullmatch(lines[number]):
             break
-    raise ValueError(f"{where}: expected a line {_END} after the table, got none")
+    raise InputError(f"{where}: expected a line {_END} after the table, got none")
 
 
 def _make_table(text: str, root: Path, where: str) -> str:
@@ -176,7 +177,7 @@ def _rows(directive: _Directive, tables: Sequence[Table], root: Path) -> list[Ro
     ]
     known = dict.fromkeys(table.name(row) for table in tables for row in table.rows)
     if unknown := [name for name in methods if name not in known]:
-        raise ValueError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
+        raise InputError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
     several = ["task"] if len(tasks) > 1 else []
     return select_columns(rows, directive.parts("columns") or [*several, *tables[0].columns])
 
@@ -196,13 +197,13 @@ def _family(tables: Sequence[Table], rows: Sequence[Row]) -> str:
 
 def _told_apart(tables: Sequence[Table], policies: Sequence[str]) -> list[Table]:
     if len(policies) != len(tables):
-        raise ValueError(
+        raise InputError(
             f"policies: expected {len(tables)} names, one for each file, got {' | '.join(policies)}"
         )
     tasks: dict[str, str] = {}
     for table, policy in zip(tables, policies, strict=True):
         if tasks.setdefault(policy, table.task) != table.task:
-            raise ValueError(
+            raise InputError(
                 f"policies: expected {policy} to be of {tasks[policy]}, got a file of {table.task}"
             )
     return [replace(table, task=policy) for table, policy in zip(tables, policies, strict=True)]
@@ -217,5 +218,5 @@ def _select_rows(table: Table, methods: Sequence[str]) -> list[Row]:
 def _pair(text: str) -> tuple[str, str]:
     first, colon, second = text.partition(" : ")
     if not colon:
-        raise ValueError(f"pairs: expected METHOD : METHOD, got {text!r}")
+        raise InputError(f"pairs: expected METHOD : METHOD, got {text!r}")
     return first.strip(), second.strip()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.result_files import Row, Table
 
 __all__ = ["Published", "PublishedFigure", "side_by_side"]
@@ -65,13 +66,13 @@ def side_by_side(
     for table in tables:
         for row in table.rows:
             if missing := [cell for cell in cells if cell not in row]:
-                raise ValueError(f"cells: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
+                raise InputError(f"cells: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
             found[table.task].setdefault(
                 table.name(row), ", ".join(filter(None, (row[cell] for cell in cells)))
             )
     known = list(dict.fromkeys(name for texts in found.values() for name in texts))
     if unknown := [name for name in methods if name not in known]:
-        raise ValueError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
+        raise InputError(f"methods: expected some of {' | '.join(known)}, got {' | '.join(unknown)}")
     titles = titles or {}
     return [_row(name, found, published, titles) for name in methods or known]
 

@@ -31,6 +31,7 @@ from torchrl_sparse.cli.options import Between, Count, Positive, Section
 from torchrl_sparse.cli.recipe import benchmark_command, recipe
 from torchrl_sparse.data.for_policy import policy_demos
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.tables import markdown_table
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
@@ -101,7 +102,7 @@ def make_judges(policy: DiffusionPolicy, config: DictConfig) -> tuple[Judge, Jud
     task = find_task(config.task)
     demos = policy_demos(config.demos, task.name, policy)
     if len(demos) < 2:
-        raise ValueError(f"demos: expected at least 2, of which some are held out, got {len(demos)}")
+        raise InputError(f"demos: expected at least 2, of which some are held out, got {len(demos)}")
     split = len(demos) - min(ceil(config.held_out * len(demos)), len(demos) - 1)
     n_action_steps = executed_steps(task.name, policy.source)
     options = {"draws": config.draws, "n_action_steps": n_action_steps, "reuse": config.reuse}

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
 
@@ -76,7 +77,7 @@ class Evolution:
     def __post_init__(self) -> None:
         for name in ("population", "generations"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}")
 
 
 class ChainSpace:
@@ -108,16 +109,16 @@ class ChainSpace:
         num_train_timesteps: int = 100,
     ) -> None:
         if not budget > 1:
-            raise ValueError(
+            raise InputError(
                 f"budget: expected more than 1 step, the first, which prunes nothing, got {budget}"
             )
         for length in lengths:
             if not 2 <= length <= num_train_timesteps:
-                raise ValueError(f"lengths: expected 2 to {num_train_timesteps} steps, got {length}")
+                raise InputError(f"lengths: expected 2 to {num_train_timesteps} steps, got {length}")
         if not lengths:
-            raise ValueError("lengths: expected at least one, got none")
+            raise InputError("lengths: expected at least one, got none")
         if not min(weights, default=0) > 0:
-            raise ValueError(f"weights: expected positive numbers, got {weights}")
+            raise InputError(f"weights: expected positive numbers, got {weights}")
         self._shares = np.asarray(weights, dtype=np.float64) / np.sum(weights)
         self.budget, self.lengths, self.num_train_timesteps = budget, tuple(lengths), num_train_timesteps
 

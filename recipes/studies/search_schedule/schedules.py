@@ -20,6 +20,7 @@ from recipes.studies.offline_errors.errors import draw_answers, energy_scores
 from recipes.studies.search_schedule.evolution import ChainSpace, Evolution, PrunedChain, evolve
 from torchrl_sparse.blocks.mask import Reuse
 from torchrl_sparse.blocks.schedule import CacheSchedule, SchedulePlanner
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
@@ -293,5 +294,5 @@ def _read(path: Path, made_for: dict[str, Any]) -> Tried | None:
         return None
     found = read_json(path, Tried)
     if differing := describe_differences(found.made_for, made_for):
-        raise ValueError(f"{path}: made with other settings: {differing}; choose another out or move it away")
+        raise InputError(f"{path}: made with other settings: {differing}; choose another out or move it away")
     return found

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.blocks.engine.native.test_engine import make_network, make_query
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine import denoise
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.library import native_available
@@ -104,15 +105,15 @@ def test_threads_change_no_bit():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda guide: guide._replace(actions=guide.actions[:, :3]), r"guide.actions: expected shape \[2, 10, 7\]"),
-        (lambda guide: guide._replace(pull=guide.pull[..., 0]), r"guide.pull: expected shape \[2, 10, 1\], got \[2, 10\]"),
-        (lambda guide: guide._replace(pull=guide.pull.double()), "guide.pull: expected torch.float32"),
-        (lambda guide: guide._replace(pull=guide.pull + 1), r"guide.pull: expected numbers in \[0, 1\]"),
-        (lambda guide: guide._replace(pull=guide.pull * torch.nan), r"guide.pull: expected numbers in \[0, 1\]"),
+        (lambda guide: guide._replace(actions=guide.actions[:, :3]), "guide.actions"),
+        (lambda guide: guide._replace(pull=guide.pull[..., 0]), "guide.pull"),
+        (lambda guide: guide._replace(pull=guide.pull.double()), "guide.pull"),
+        (lambda guide: guide._replace(pull=guide.pull + 1), "guide.pull"),
+        (lambda guide: guide._replace(pull=guide.pull * torch.nan), "guide.pull"),
     ],
 )  # fmt: skip
 def test_a_wrong_guide_is_refused_by_name(engine, change, message):
     network, sampler = make_network("lift"), Sampler("ddpm", 6)
     noise, cond, _ = make_query(network, sampler)
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         ENGINES[engine](network, sampler).denoise(noise, cond, guide=change(make_guide(network, 2)))

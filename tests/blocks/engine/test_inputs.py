@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from tests.blocks.conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine import ENGINES, denoise, make_engine
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
@@ -133,9 +134,7 @@ def test_a_sampler_cannot_be_shortened_under_an_engine(engine, ddpm, name):
 def test_weights_that_are_no_floating_point_numbers(engine, network, query):
     engine.denoise(*query)
     network.head.bias.data = network.head.bias.data.int()
-    with pytest.raises(
-        ValueError, match=r"network: expected floating-point weights, got 'head\.bias' of torch\.int32"
-    ):
+    with refused("network"):
         engine.denoise(*query)
     with pytest.raises(ValueError, match=r"'head\.bias' of torch\.int32|it reads float32 weights"):
         make_engine(engine.name, network, Sampler("ddpm", NUM_STEPS))
@@ -163,7 +162,7 @@ def test_the_native_engine_reads_no_weight_beyond_its_end(network, ddpm, query, 
         pytest.skip(ENGINES["native"].applies(network)[1])
     engine = make_engine("native", network, ddpm)
     WRONG_SHAPES[name](network)
-    with pytest.raises(ValueError, match=f"network: {name}: expected shape"):
+    with refused(f"network: {name}"):
         engine.denoise(*query)
 
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from tests.blocks.conftest import ACTION_DIM, COND_DIM, HORIZON, NUM_LAYERS, NUM_STEPS, OBS_STEPS, random_mask
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.blocks.mask import mask_from_steps, num_buffers
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -207,17 +208,17 @@ def test_a_dense_query_records_what_every_block_adds(network, ddpm, query):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"noise": torch.zeros(5, 9, 6, 4)}, r"noise: expected shape \[5, 10, 6, 4\], got \[5, 9, 6, 4\]"),
-        ({"noise": torch.zeros(5, 10, 6, 3)}, r"noise: expected shape \[5, 10, 6, 4\], got \[5, 10, 6, 3\]"),
-        ({"cond": torch.zeros(5, 2, 7)}, r"cond: expected shape \[5, 2, 5\], got \[5, 2, 7\]"),
-        ({"mask": random_mask(4)}, r"mask: expected shape \[5, 10, 6\].*got \[4, 10, 6\]"),
-        ({"mask": random_mask()}, r"mask: expected shape \[5, 10, 6\].*got \[10, 6\]"),
-        ({"mask": random_mask(5).float()}, r"expected a tensor of dtype torch.bool, got dtype torch.float32"),
-        ({"mask": torch.ones(5, 10, 6, dtype=torch.bool)}, r"row 0 .* to prune nothing, got True"),
-        ({"reuse": "layer"}, r"reuse: expected one of \['block', 'type', 'single'\], got 'layer'"),
+        ({"noise": torch.zeros(5, 9, 6, 4)}, "noise"),
+        ({"noise": torch.zeros(5, 10, 6, 3)}, "noise"),
+        ({"cond": torch.zeros(5, 2, 7)}, "cond"),
+        ({"mask": random_mask(4)}, "prune mask"),
+        ({"mask": random_mask()}, "prune mask"),
+        ({"mask": random_mask(5).float()}, "prune mask"),
+        ({"mask": torch.ones(5, 10, 6, dtype=torch.bool)}, "prune mask"),
+        ({"reuse": "layer"}, "reuse"),
     ],
 )
 def test_wrong_input_is_refused(network, ddpm, query, change, message):
     arguments = {"noise": query[0], "cond": query[1], **change}
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         denoise(network, ddpm, **arguments)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine import ENGINES, denoise, make_engine
 from torchrl_sparse.blocks.engine.native import engine as native, weights as native_weights
 from torchrl_sparse.blocks.engine.torch import engine as torch_engine
@@ -150,7 +151,7 @@ def test_weights_without_values_are_refused_by_name(name, network, query):
     engine = engine_of(name, network)
     engine.denoise(*query)
     network.decoder.layers[1].linear2.to("meta")
-    with pytest.raises(ValueError, match=r"'decoder\.layers\.1\.linear2\.weight' on the meta device"):
+    with refused("network"):
         engine.denoise(*query)
     with pytest.raises(ValueError, match=r"on the meta device|the network is on meta"):
         make_engine(name, network.to("meta"), Sampler("ddpm", 10))

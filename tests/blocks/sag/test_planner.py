@@ -8,6 +8,7 @@ from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
 from tests.blocks.conftest import COND_DIM, NUM_LAYERS, NUM_STEPS, OBS_STEPS
+from tests.refusals import refused
 from torchrl_sparse.blocks.mask import NetworkSizes, query_flops
 from torchrl_sparse.blocks.planner import PlanSpec
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
@@ -133,11 +134,11 @@ def test_a_shift_of_all_logits_has_no_gradient():
 @pytest.mark.parametrize("rate", [0.4, 0.98, float("nan")])
 def test_a_rate_out_of_range_is_refused(rate):
     pruner, cond = make_pruner(rate_range=(0.5, 0.97)), observations(1)
-    with pytest.raises(ValueError, match=r"rate: expected prune rates in \[0.5, 0.97\]"):
+    with refused("rate"):
         pruner.rate = rate
-    with pytest.raises(ValueError, match=r"prune_rate.*expected prune rates in \[0.5, 0.97\]"):
+    with refused("('diffusion', 'prune_rate')"):
         plan(pruner, cond, rate=rate)
-    with pytest.raises(ValueError, match=r"trained for the rate 0.7 alone"):
+    with refused("rate"):
         make_pruner().rate = 0.8
 
 
@@ -151,7 +152,7 @@ def test_a_rate_out_of_range_is_refused(rate):
     ],
 )
 def test_another_policy_or_sampler_is_refused(spec, message):
-    with pytest.raises(ValueError, match=f"SAGPruner: made for {message}"):
+    with refused("SAGPruner"):
         make_pruner().bind(spec)
 
 
@@ -172,12 +173,12 @@ def test_columns_that_are_not_to_be_seen_change_nothing(rate_range):
 
 @pytest.mark.parametrize("unseen", [-1, COND_DIM, True, 1.0])
 def test_columns_that_cannot_be_left_out_are_refused(unseen):
-    with pytest.raises(ValueError, match=f"unseen: expected 0 to {COND_DIM - 1} columns, got {unseen}"):
+    with refused("unseen"):
         PrunerNetwork(TIMESTEPS, NUM_BLOCKS, (OBS_STEPS, COND_DIM), unseen=unseen)
 
 
 def test_an_observation_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"expected \[B, To, D\] = \[B, 2, 5\], got \[1, 2, 6\]"):
+    with refused("('diffusion', 'cond')"):
         plan(make_pruner(), torch.zeros(1, 2, 6))
 
 
@@ -243,7 +244,7 @@ def test_weights_that_are_no_floating_point_numbers_are_refused_by_name(tmp_path
     make_pruner().save_pretrained(tmp_path)
     tensors = load_file(tmp_path / "pruner.safetensors")
     save_file(tensors | {"obs.bias": tensors["obs.bias"].to(dtype)}, tmp_path / "pruner.safetensors")
-    with pytest.raises(ValueError, match=r"pruner\.safetensors: obs\.bias: expected a type of .*'F32'"):
+    with refused("pruner.safetensors: obs.bias"):
         SAGPruner.from_pretrained(tmp_path)
 
 
@@ -277,5 +278,5 @@ def test_weights_that_changed_are_not_answered_with_the_old_ones(change):
 
 def test_rate_range_and_network_have_to_agree():
     network = PrunerNetwork(TIMESTEPS, NUM_BLOCKS, (OBS_STEPS, COND_DIM))
-    with pytest.raises(ValueError, match="rate_range: expected one if and only if"):
+    with refused("rate_range"):
         SAGPruner(network, PrunerInfo("8d1f", "ddim", 0.7, (0.5, 0.97)))

@@ -9,6 +9,7 @@ import torch
 
 from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.accelerate.small import GRID, HORIZON, METHODS, ask, episodes_of, fixed_times
+from tests.refusals import refused
 from torchrl_sparse import Sampler, Uniform
 from torchrl_sparse.blocks.engine import native_available
 from torchrl_sparse.evaluation.accelerate import Grid, Request, candidates, run
@@ -72,7 +73,7 @@ def test_dense_and_chains_without_a_cache_are_tried_with_rounded_weights(go):
     assert found.candidates["dense:int8"].family == "rounded"
     assert found.candidates["ddpm2_logsnr:int8"].family == "stochastic"
     assert found.candidates["dense:int8"].error != found.candidates["dense"].error
-    with pytest.raises(ValueError, match="rounded: expected some of bf16, int8, got 'int4'"):
+    with refused("rounded"):
         Grid(rounded=("int4",))
 
 
@@ -116,10 +117,7 @@ def test_another_budget_reuses_what_was_measured(go, monkeypatch):
     found, _ = go(budget_ms=5.0)
     assert set(found.ranking) == {"ddim4", "ddpm2_logsnr"}
     assert all(1e3 * found.candidates[name].latency_s.p95 <= 5 for name in found.ranking)
-    with pytest.raises(
-        ValueError,
-        match=r"budget_ms: expected at least 2, what the .*, ddpm2_logsnr, takes",
-    ):
+    with refused("budget_ms"):
         go(budget_ms=1.0)
 
 
@@ -159,10 +157,10 @@ def test_a_pruner_is_one_more_candidate(go):
 
 def test_other_demonstrations_and_damaged_files_are_refused_by_name(go, tmp_path):
     go()
-    with pytest.raises(ValueError, match=r"ddpm2\.json: made with other settings: demos is 'other.h5' here"):
+    with refused("ddpm2.json"):
         go(made_for={"demos": "other.h5"})
     (tmp_path / "errors.json").write_text('{"format": "torchrl_sparse.errors/1"}')
-    with pytest.raises(ValueError, match=r"errors\.json: made_for: expected this key"):
+    with refused("errors.json: made_for"):
         go()
 
 
@@ -170,9 +168,7 @@ def test_a_file_that_disagrees_with_itself_is_refused(go, tmp_path):
     go()
     path = Path(tmp_path / "acceleration.json")
     path.write_text(json.dumps(json.loads(path.read_text()) | {"chosen": "magic"}))
-    with pytest.raises(
-        ValueError, match=r"acceleration\.json: chosen: expected one of the ranking, got 'magic'"
-    ):
+    with refused("acceleration.json: chosen"):
         load_acceleration(path)
 
 
@@ -181,21 +177,21 @@ def test_schedules_of_another_policy_are_refused_by_name(go, policy):
     go(grid=grid)
     with torch.no_grad():
         policy.network.pos_emb += 1
-    with pytest.raises(ValueError, match=r"bac2\.json: made for policy fingerprint"):
+    with refused("bac2.json"):
         go(grid=grid)
 
 
 def test_what_cannot_be_accelerated_is_refused_before_anything_is_written(go, policy, tmp_path):
     for field, name, message in (
-        ("samplers", "magic3", "samplers: "),
-        ("cached", "ddpm", "cached: expected a sampler with its steps, such as ddpm3, got 'ddpm'"),
-        ("searched", "ddpm_90_10", "searched: expected KIND and STEPS, such as ddpm3, got 'ddpm_90_10'"),
+        ("samplers", "magic3", "samplers: sampler"),
+        ("cached", "ddpm", "cached"),
+        ("searched", "ddpm_90_10", "searched"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with refused(message):
             replace(GRID, **{field: (name,)})
-    with pytest.raises(ValueError, match="samplers: ddpm200: num_inference_steps: expected"):
+    with refused("samplers: ddpm200: num_inference_steps"):
         go(grid=replace(GRID, samplers=("ddpm200",)))
     policy.plan = Uniform(2)
-    with pytest.raises(ValueError, match="policy: expected one that nothing is pruned of yet, got Uniform"):
+    with refused("policy"):
         go()
     assert list(tmp_path.iterdir()) == []

@@ -11,6 +11,7 @@ pytest.importorskip("transformers")
 
 from tests.envs.test_libero_suite import made  # noqa: F401
 from tests.recipe_modules import RECIPES, load_recipe, run
+from tests.refusals import refused
 from tests.storage.published import openvla
 from torchrl_sparse.cli.options import check_options
 from torchrl_sparse.envs import instructed
@@ -65,10 +66,10 @@ def test_a_published_folder_plays_a_suite(made, published, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("task=libero_90", "task: expected one of Lift, .* got 'libero_90'"),
-        ("episodes=501", "seed: expected test seeds from 210000 to 210499"),
-        ("policy=assets/vla", "policy: expected one that was trained for libero_goal, got one for LiftNamed"),
-        ("policy=assets/lift", "assets/lift/config.json: format: expected 'torchrl_sparse.vla_policy/1'"),
+        ("task=libero_90", "task"),
+        ("episodes=501", "seed"),
+        ("policy=assets/vla", "policy"),
+        ("policy=assets/lift", "assetsconfig.json: format"),
     ],
 )
 def test_what_cannot_be_played_is_refused(made, published, tmp_path, monkeypatch, option, message):  # noqa: F811
@@ -77,7 +78,7 @@ def test_what_cannot_be_played_is_refused(made, published, tmp_path, monkeypatch
     options += ["heads=null"] if "policy" in option else []  # which are said of published folders alone
     with hydra.initialize_config_dir(str(RECIPES), version_base=None):
         config = hydra.compose("benchmark_vla", [*options, f"out={tmp_path}/out", option])
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         load_recipe("benchmark_vla").main.__wrapped__(config)
     assert not (tmp_path / "out").exists()
 

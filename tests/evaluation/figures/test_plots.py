@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from tests.evaluation import synthetic
+from tests.refusals import refused
 from torchrl_sparse.evaluation.figures import labels, pareto, plots
 from torchrl_sparse.evaluation.figures.colors import OTHER_COLORS
 from torchrl_sparse.methods import METHODS
@@ -109,19 +110,19 @@ def test_block_labels():
 @pytest.mark.parametrize(
     ("draw", "message"),
     [
-        (lambda p: plots.plot_schedule(np.zeros((4, 6)), p, name="x"), r"bool array .*got float64 \[4, 6\]"),
-        (lambda p: plots.plot_schedule(np.zeros((4, 5), bool), p, name="x"), r"\[K, 3L\], got bool \[4, 5\]"),
-        (lambda p: plots.plot_similarity(np.ones((3, 4, 5)), p), r"\[3L, K, K\], got \[3, 4, 5\]"),
-        (lambda p: plots.plot_similarity(np.full((3, 4, 4), np.nan), p), "finite"),
-        (lambda p: plots.plot_error_surge({"a": np.ones((4, 6))}, {}, p), r"same schedules, got \['a'\] and"),
+        (lambda p: plots.plot_schedule(np.zeros((4, 6)), p, name="x"), "mask"),
+        (lambda p: plots.plot_schedule(np.zeros((4, 5), bool), p, name="x"), "mask"),
+        (lambda p: plots.plot_similarity(np.ones((3, 4, 5)), p), "similarity"),
+        (lambda p: plots.plot_similarity(np.full((3, 4, 4), np.nan), p), "similarity"),
+        (lambda p: plots.plot_error_surge({"a": np.ones((4, 6))}, {}, p), "errors and masks"),
         (
             lambda p: plots.plot_error_surge({"a": np.ones((4, 6))}, {"a": np.ones((5, 6), bool)}, p),
-            r"errors\['a'\]: expected shape \(5, 6\), got \(4, 6\)",
+            "errors['a']",
         ),
     ],
 )
 def test_faults_leave_no_file(tmp_path, draw, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         draw(tmp_path / "figure.png")
     assert os.listdir(tmp_path) == []
 

@@ -4,6 +4,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.evaluation.figures.video import Caption, add_caption, write_video
 
 
@@ -58,14 +59,14 @@ def test_captioned_video(tmp_path):
 @pytest.mark.parametrize(
     ("images", "captions", "message"),
     [
-        ([], None, "at least one"),
-        (frames(2), [Caption("bac", 0)], "one per frame, 2, got 1"),
-        ([np.zeros((4, 4, 3))], None, r"frames\[0\]: expected uint8 \[h, w, 3\].*float64"),
-        ([*frames(2), *frames(1, 64, 64)], None, r"frames\[2\]: .*got uint8 \[64, 64, 3\]"),
-        ([np.zeros((4, 4), np.uint8)], None, r"frames\[0\]: .*\[4, 4\]"),
+        ([], None, "frames"),
+        (frames(2), [Caption("bac", 0)], "captions"),
+        ([np.zeros((4, 4, 3))], None, "frames[0]"),
+        ([*frames(2), *frames(1, 64, 64)], None, "frames[2]"),
+        ([np.zeros((4, 4), np.uint8)], None, "frames[0]"),
     ],
 )
 def test_faults_leave_no_file(tmp_path, images, captions, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         write_video(images, tmp_path / "rollout.mp4", captions=captions)
     assert os.listdir(tmp_path) == []

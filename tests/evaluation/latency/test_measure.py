@@ -4,6 +4,7 @@ from datetime import datetime
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.evaluation.latency.measure import (
     describe_machine,
     measure_latency,
@@ -102,15 +103,15 @@ def test_machine_description():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: measure_latency({}), "at least one callable"),
-        (lambda: measure_latency({"a": lambda: None}, repeats=0), "repeats >= 1"),
-        (lambda: measure_latency({"a": lambda: None}, threads=0), "threads: expected at least 1"),
-        (lambda: summarize_latency([]), "got none"),
-        (lambda: summarize_latency([float("nan")]), "finite"),
+        (lambda: measure_latency({}), "calls"),
+        (lambda: measure_latency({"a": lambda: None}, repeats=0), "repeats, warmup"),
+        (lambda: measure_latency({"a": lambda: None}, threads=0), "threads"),
+        (lambda: summarize_latency([]), "latencies"),
+        (lambda: summarize_latency([float("nan")]), "latencies"),
     ],
 )
 def test_faults(call, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         call()
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from recipes.studies.pages.page_rows import read_table
 from tests.evaluation.synthetic import DENSE_FLOPS, MACHINE, POLICY, make_results
+from tests.refusals import refused
 from torchrl_sparse.evaluation.latency.measure import summarize_latency
 from torchrl_sparse.evaluation.results.build import MethodRun, Terms, build_results
 from torchrl_sparse.evaluation.results.parts import ActionError, Flops, Percentiles, Success
@@ -87,7 +88,7 @@ def test_any_two_methods_are_compared_seed_by_seed():
     terms = Terms(Design(20), 60, early_cut=30)
     table = format_table(build_results(runs, terms=terms, pairs=[["a", "b"]], **ABOUT))
     assert f"15 : 10 | +25.0 [{100 * low:+.1f}, {100 * high:+.1f}]" in " ".join(table.split())
-    with pytest.raises(ValueError, match=r"pairs: expected two of dense, a, b, got \['a', 'c'\]"):
+    with refused("pairs"):
         build_results(runs, terms=terms, pairs=[["a", "c"]], **ABOUT)
 
 
@@ -113,22 +114,22 @@ def test_flops_average_over_queries_not_episodes():
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
-        (lambda: {"fast": run([1])}, "'dense'.*got \\['fast'\\]"),
-        (lambda: {"dense": run([1, 1]), "fast": run([1, 1], first_seed=1)}, "fast: .*seeds.*\\[0, 2\\]"),
-        (lambda: {"dense": run([1, 1]), "fast": run([1])}, "fast: .*seeds.*\\[1\\]"),
-        (lambda: {"dense": run([1], queries=0)}, "at least one query"),
+        (lambda: {"fast": run([1])}, "runs"),
+        (lambda: {"dense": run([1, 1]), "fast": run([1, 1], first_seed=1)}, "fast"),
+        (lambda: {"dense": run([1, 1]), "fast": run([1])}, "fast"),
+        (lambda: {"dense": run([1], queries=0)}, "episodes"),
         (
             lambda: {"dense": MethodRun(run([1]).episodes * 2, run([1]).latency, (0, 0))},
-            "one episode per seed",
+            "episodes",
         ),
         (
             lambda: {"dense": MethodRun(run([1]).episodes, run([1]).latency, (math.nan, 0))},
-            "mean: expected a finite number",
+            "mean",
         ),
     ],
 )
 def test_build_refuses(runs, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         build(runs())
 
 
@@ -253,5 +254,5 @@ def test_pairs_are_part_of_the_file(tmp_path):
     table = read_table(tmp_path / "results.json", "pairs")
     assert (table.rows[0]["success"], table.rows[0]["against"]) == ("15 : 5", "slow")
     assert "| fast     | slow      |    15 : 5 |" in format_table(found)
-    with pytest.raises(ValueError, match=r"pairs: expected two of dense, fast, slow, got \['fast', 'sag'\]"):
+    with refused("pairs"):
         build_results(runs, terms=Terms(Design(20), 60), pairs=[["fast", "sag"]], **ABOUT)

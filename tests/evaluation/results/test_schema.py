@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from tests.evaluation.synthetic import make_results
+from tests.refusals import refused
 from torchrl_sparse.evaluation.results.schema import Results, Stopping, load_results, save_results
 from torchrl_sparse.storage.json import parse_json, to_plain
 
@@ -27,64 +28,72 @@ def test_round_trip(tmp_path):
 def test_failed_save_keeps_the_old_file(tmp_path):
     path = save_results(make_results(20), tmp_path / "results.json")
     before = path.read_bytes()
-    with pytest.raises(ValueError, match="seed"):
+    with refused("results.json: seed"):
         save_results(replace(make_results(20), seed="zero"), path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["results.json"]
 
 
 FAULTS = {
-    "schema": (("schema",), 1, "schema: expected 2, got 1"),
-    "boolean integer": (("seed",), True, "seed: expected a valid integer, got True"),
-    "float integer": (("machine", "threads"), 1.0, "machine.threads: expected a valid integer, got 1.0"),
-    "number for text": (("task",), 7, "task: expected a valid string, got 7"),
-    "nan": (("methods", "bac", "prune_rate"), math.nan, "expected a complete JSON file"),
-    "rate": (("methods", "bac", "success", "rate"), 0.5, "methods.bac.success.rate: expected k / n"),
-    "k beyond n": (("methods", "bac", "success", "k"), 21, "methods.bac.success.k: expected 0 to 20, got 21"),
-    "no episodes": (("methods", "bac", "success", "n"), 0, "methods.bac.success.n: expected at least 1"),
-    "reversed interval": (("methods", "bac", "success", "ci95"), [0.9, 0.1], "ci95: expected low <= high"),
-    "short interval": (("methods", "bac", "paired_vs_dense", "ci95"), [0.9], "paired_vs_dense.ci95"),
+    "schema": (("schema",), 1, "results.json: schema"),
+    "boolean integer": (("seed",), True, "results.json: seed"),
+    "float integer": (("machine", "threads"), 1.0, "results.json: machine.threads"),
+    "number for text": (("task",), 7, "results.json: task"),
+    "nan": (("methods", "bac", "prune_rate"), math.nan, "results.json"),
+    "rate": (("methods", "bac", "success", "rate"), 0.5, "results.json: methods.bac.success.rate"),
+    "k beyond n": (("methods", "bac", "success", "k"), 21, "results.json: methods.bac.success.k"),
+    "no episodes": (("methods", "bac", "success", "n"), 0, "results.json: methods.bac.success.n"),
+    "reversed interval": (
+        ("methods", "bac", "success", "ci95"),
+        [0.9, 0.1],
+        "results.json: methods.bac.success.ci95",
+    ),
+    "short interval": (
+        ("methods", "bac", "paired_vs_dense", "ci95"),
+        [0.9],
+        "results.json: methods.bac.paired_vs_dense.ci95.1",
+    ),
     "verdict": (
         ("methods", "bac", "paired_vs_dense", "verdict"),
         "fine",
-        "verdict: expected 'non-inferior', 'inferior' or 'undecided', got 'fine'",
+        "methods.bac.paired_vs_dense.verdict",
     ),
-    "percentiles": (("methods", "bac", "latency_s", "p95"), 1e-9, "latency_s.p50: expected 0 < p50 <= p95"),
+    "percentiles": (("methods", "bac", "latency_s", "p95"), 1e-9, "results.json: methods.bac.latency_s.p50"),
     "negative flops": (
         ("methods", "bac", "flops", "per_query"),
         -1.0,
-        "methods.bac.flops.per_query: expected at least 0",
+        "results.json: methods.bac.flops.per_query",
     ),
     "negative executed": (
         ("methods", "bac", "flops", "executed"),
         -1.0,
-        "methods.bac.flops.executed: expected at least 0 or null",
+        "results.json: methods.bac.flops.executed",
     ),
-    "no object": (("machine",), "fast", "machine: expected an object, got 'fast'"),
-    "prune rate": (("methods", "bac", "prune_rate"), 90, "methods.bac.prune_rate: expected 0 to 1, got 90"),
+    "no object": (("machine",), "fast", "results.json: machine"),
+    "prune rate": (("methods", "bac", "prune_rate"), 90, "results.json: methods.bac.prune_rate"),
     "tokens": (
         ("methods", "bac", "tokens"),
         {"kept_mean": 1.0, "kept_fine": "many", "kept_coarse": None},
-        "methods.bac.tokens.kept_fine: expected a valid number, got 'many'",
+        "results.json: methods.bac.tokens.kept_fine",
     ),
-    "split": (("split",), "train", "split: expected 'test' or 'development', got 'train'"),
-    "horizon": (("episode_horizon",), 4.5, "episode_horizon: expected a valid integer, got 4.5"),
+    "split": (("split",), "train", "results.json: split"),
+    "horizon": (("episode_horizon",), 4.5, "results.json: episode_horizon"),
     "time ratio": (
         ("methods", "bac", "time_vs_dense", "ratio"),
         0,
-        "methods.bac.time_vs_dense.ratio: expected a number above 0",
+        "results.json: methods.bac.time_vs_dense.ratio",
     ),
     "share": (
         ("methods", "bac", "success_within"),
         {"44": 1.2},
-        "methods.bac.success_within: expected steps and",
+        "results.json: methods.bac.success_within",
     ),
-    "p-value": (("methods", "bac", "p_values", "time"), 0.7, "methods.bac.p_values.time: expected 0 to 0.5"),
-    "no times": (("methods", "bac", "time_vs_dense"), None, "methods.bac.time_vs_dense: expected an object"),
+    "p-value": (("methods", "bac", "p_values", "time"), 0.7, "results.json: methods.bac.p_values.time"),
+    "no times": (("methods", "bac", "time_vs_dense"), None, "results.json: methods.bac.time_vs_dense"),
     "planning": (
         ("methods", "bac", "planning_s"),
         {"p50": 0.0, "p95": 1.0, "n": 3},
-        "methods.bac.planning_s.p50: expected 0 < p50",
+        "results.json: methods.bac.planning_s.p50",
     ),
 }
 
@@ -97,7 +106,7 @@ def test_a_fault_is_named_with_its_path(name):
     for key in path[:-1]:
         target = target[key]
     target[path[-1]] = value
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         read(results)
 
 
@@ -105,23 +114,23 @@ def test_missing_and_unknown_keys():
     results = to_plain(make_results(20))
     missing = copy.deepcopy(results)
     del missing["methods"]["bac"]["flops"]["ratio_to_dense"]
-    with pytest.raises(ValueError, match=r"methods.bac.flops.ratio_to_dense: expected this key"):
+    with refused("results.json: methods.bac.flops.ratio_to_dense"):
         read(missing)
     unknown = copy.deepcopy(results)
     unknown["policy"]["params_m"] = 9
-    with pytest.raises(ValueError, match=r"policy.params_m: expected no such key, got 9"):
+    with refused("results.json: policy.params_m"):
         read(unknown)
     without = copy.deepcopy(results)
     del without["methods"]["dense"]
-    with pytest.raises(ValueError, match="methods: expected the key 'dense'"):
+    with refused("results.json: methods"):
         read(without)
-    with pytest.raises(ValueError, match=r"results.json: expected an object, got \[1, 2\]"):
+    with refused("results.json"):
         read([1, 2])
 
 
 def test_all_methods_have_as_many_episodes():
     results, fewer = make_results(20), make_results(10)
-    with pytest.raises(ValueError, match=r"methods.bac.success.n: expected 20, as every method, got 10"):
+    with refused("methods.bac.success.n"):
         replace(results, methods={**results.methods, "bac": fewer.methods["bac"]})
 
 
@@ -131,19 +140,16 @@ def test_methods_may_stop_early_where_the_file_says_so():
     early = replace(results, methods=stopped, until_decided=Stopping(20, 2))
     assert early.methods["bac"].success.n == 10
     more = {"dense": fewer.dense, "bac": results.methods["bac"]}
-    with pytest.raises(ValueError, match=r"methods.bac.success.n: expected at most 10, as dense, got 20"):
+    with refused("methods.bac.success.n"):
         replace(early, methods=more)
 
 
 def test_load_names_the_file(tmp_path):
     path = tmp_path / "results.json"
     path.write_text('{"schema": 2')
-    with pytest.raises(ValueError, match=r"results.json: expected a complete JSON file"):
+    with refused("results.json"):
         load_results(path)
-    for schema, why in (
-        (9, "expected 2, got 9$"),
-        (1, "expected 2, got 1; schema 1 had no times to success"),
-    ):
+    for schema in (9, 1):
         path.write_text(json.dumps({"schema": schema}))
-        with pytest.raises(ValueError, match=rf"results.json: schema: {why}"):
+        with refused("results.json: schema"):
             load_results(path)

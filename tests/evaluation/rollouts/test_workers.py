@@ -16,6 +16,7 @@ import torch
 from torchrl.data import NonTensor
 
 from tests.evaluation.rollouts.fakes import FakeActor, FakeEnv
+from tests.refusals import refused
 from tests.worker_killer import Killer
 from torchrl_sparse import keys
 from torchrl_sparse.evaluation.rollouts import paired, process_collector
@@ -215,12 +216,12 @@ def test_robosuite_gives_the_same_in_two_workers(backend):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"workers": 0}, "workers: expected at least 1, got 0"),
-        ({"backend": "smoke"}, "backend: expected one of process, ray, got 'smoke'"),
+        ({"workers": 0}, "workers"),
+        ({"backend": "smoke"}, "backend"),
     ],
 )
 def test_options_are_checked(options, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         run(FakeEnv, **options)
 
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import norm
 
 from recipes.studies.simulate_stopping.simulation import Population
+from tests.refusals import refused
 from torchrl_sparse.evaluation.statistics.durations import (
     allowed_steps,
     correlation,
@@ -67,15 +68,15 @@ def test_verdicts_lie_on_either_side_of_the_margin():
     assert time_verdict((0.9, 1.09)) == "non-inferior"
     assert time_verdict((1.11, 1.4)) == "inferior"
     assert time_verdict((1.05, 1.3), margin=0.5) == "non-inferior"
-    with pytest.raises(ValueError, match="time margin must lie strictly between 0 and 1, got 0"):
+    with refused("margin"):
         time_verdict((1, 1), 0)
 
 
 def test_an_unsolved_episode_counts_the_horizon():
     assert restricted_times([True, False, True], [400, 400, 12], 400).tolist() == [400, 400, 12]
-    with pytest.raises(ValueError, match=r"horizon: expected at most 400 steps of an episode, .* got 401"):
+    with refused("horizon"):
         restricted_times([True], [401], 400)
-    with pytest.raises(ValueError, match=r"horizon: .* fewer only of solved ones, got 399"):
+    with refused("horizon"):
         restricted_times([False], [399], 400)
 
 
@@ -89,9 +90,7 @@ def test_success_counts_what_was_solved_in_time():
 
 
 def test_unequal_numbers_of_episodes_are_refused():
-    with pytest.raises(
-        ValueError, match="pairs need as many episodes of both, and at least one, got 2 and 1"
-    ):
+    with refused("pairs"):
         time_ratio([1, 2], [1], 400)
-    with pytest.raises(ValueError, match="got 0 and 0"):
+    with refused("pairs"):
         time_z([], [], 400, 1.1)

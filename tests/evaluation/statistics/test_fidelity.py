@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.evaluation.statistics import fidelity
 from torchrl_sparse.evaluation.statistics.fidelity import action_error, block_errors, relative_error
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -24,7 +25,7 @@ def test_action_error():
     other = chunk.clone()
     other[1, 2, 0] = -2.4
     assert action_error(other, chunk) == pytest.approx((0.1, 2.4))
-    with pytest.raises(ValueError, match=r"expected shape \(2, 4, 3\), got \(2, 3, 3\)"):
+    with refused("chunks"):
         action_error(chunk[:, :3], chunk)
 
 

@@ -1,7 +1,6 @@
 """Holm's correction, against its definition."""
 
-import pytest
-
+from tests.refusals import refused
 from torchrl_sparse.evaluation.statistics.multiplicity import holm
 
 
@@ -15,5 +14,5 @@ def test_it_steps_down_until_one_fails():
 def test_comparisons_without_a_p_value_count():
     assert holm({"a": 0.004}, comparisons=7) == set()
     assert holm({"a": 0.003}, comparisons=7) == {"a"}
-    with pytest.raises(ValueError, match="comparisons: expected at least 2, got 1"):
+    with refused("comparisons"):
         holm({"a": 0.1, "b": 0.1}, comparisons=1)

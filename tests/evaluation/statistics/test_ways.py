@@ -1,5 +1,6 @@
 import pytest
 
+from tests.refusals import refused
 from torchrl_sparse.evaluation.statistics.ways import way_entropy
 
 
@@ -13,5 +14,5 @@ def test_entropy_of_known_frequencies(ways, bits):
 
 @pytest.mark.parametrize("ways", [[], [-1, -1]])
 def test_no_way_has_no_entropy(ways):
-    with pytest.raises(ValueError, match="ways: expected at least one episode that showed its way, got none"):
+    with refused("ways"):
         way_entropy(ways)

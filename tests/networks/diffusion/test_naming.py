@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 SHAPE = (2, 10, 10)
@@ -46,24 +47,24 @@ def test_names_and_configs_of_old_files_are_unchanged():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kind": "flow"}, "kind: expected one of ddpm, ddim, dpmpp2m, sde2m, unipc, got 'flow'"),
-        ({"spacing": "even"}, "spacing: expected one of leading, trailing, linspace, logsnr, got 'even'"),
-        ({"eta": 0.5}, 'eta: expected .* "ddim" alone, got 0.5 of kind "ddpm"'),
-        ({"kind": "ddim", "eta": 1.5}, r"eta: expected a number in \[0, 1\].* got 1.5"),
-        ({"kind": "ddim", "eta": float("nan")}, "eta: expected .* got nan"),
-        ({"kind": "ddim", "eta": "0.5"}, "eta: expected .* got '0.5'"),
+        ({"kind": "flow"}, "kind"),
+        ({"spacing": "even"}, "spacing"),
+        ({"eta": 0.5}, "eta"),
+        ({"kind": "ddim", "eta": 1.5}, "eta"),
+        ({"kind": "ddim", "eta": float("nan")}, "eta"),
+        ({"kind": "ddim", "eta": "0.5"}, "eta"),
         (
             {"kind": "ddim", "num_inference_steps": 101},
-            "num_inference_steps: expected a whole number from 1 to 100, got 101",
+            "num_inference_steps",
         ),
-        ({"num_inference_steps": 12, "spacing": "logsnr"}, "expected fewer, 'logsnr' has no 12 falling"),
-        ({"kind": "unipc"}, "expected fewer, 'leading' has no 100 falling"),
-        ({"timesteps": [9, 5], "spacing": "trailing"}, "spacing: expected none beside timesteps"),
-        ({"timesteps": []}, "num_inference_steps: expected a whole number from 1 to 100, got 0"),
+        ({"num_inference_steps": 12, "spacing": "logsnr"}, "num_inference_steps"),
+        ({"kind": "unipc"}, "num_inference_steps"),
+        ({"timesteps": [9, 5], "spacing": "trailing"}, "spacing"),
+        ({"timesteps": []}, "num_inference_steps"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         Sampler(**arguments)
 
 
@@ -73,7 +74,7 @@ def test_bad_arguments_are_named(arguments, message):
     [(2, [5, 5]), (2, [1, 9]), (1, [100]), (1, [-1]), (1, [float("inf")]), (2, ["9", "5"]), (3, [9, 5])],
 )
 def test_timesteps_that_do_not_fall_are_refused(kind, steps, timesteps):
-    with pytest.raises(ValueError, match=rf"timesteps: expected {steps} .*fall.*got \["):
+    with refused("timesteps"):
         Sampler(kind, steps, timesteps=timesteps)
 
 
@@ -83,14 +84,14 @@ def test_timesteps_that_do_not_fall_are_refused(kind, steps, timesteps):
      "ddim_123456", None],
 )  # fmt: skip
 def test_other_names_are_refused(name):
-    with pytest.raises(ValueError, match=f"sampler: expected KIND.*got {name!r}"):
+    with refused("sampler"):
         Sampler.from_name(name, 2)
 
 
 def test_a_name_and_a_number_of_steps_must_agree():
-    with pytest.raises(ValueError, match="num_inference_steps: expected those of sampler 'ddpm10', got 5"):
+    with refused("num_inference_steps"):
         Sampler.from_name("ddpm10", 5)
-    with pytest.raises(ValueError, match="timesteps: expected 3"):
+    with refused("timesteps"):
         Sampler.from_name("ddim_9_5", 3)
 
 
@@ -104,9 +105,9 @@ def test_a_sampler_cannot_be_changed():
 
 def test_steps_say_what_they_need():
     sampler, sample = Sampler(), torch.zeros(SHAPE)
-    with pytest.raises(ValueError, match=r"k=3 .*needs noise_k"):
+    with refused("noise_k"):
         sampler.step(sample, 3, sample)
-    with pytest.raises(IndexError, match=r"0\.\.99, got 100"):
+    with refused("noise_k", IndexError):
         sampler.step(sample, 100, sample)
-    with pytest.raises(ValueError, match=r"cleans: expected 2 predictions before step k=3 of unipc, got 1"):
+    with refused("cleans"):
         Sampler("unipc", 5).step(sample, 3, sample, cleans=(sample,))

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from transformers import LlamaConfig, LlamaModel
 
+from tests.refusals import refused
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, pack, row_attention
 from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
@@ -257,14 +258,14 @@ def test_a_row_with_shared_heads_is_the_row_alone(grouped, sequence):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kv_heads": 3}, "kv_heads: expected a divisor of llm.heads=2, got 3"),
+        ({"kv_heads": 3}, "kv_heads"),
         ({"kv_heads": 0}, "kv_heads"),
-        ({"rope_base": 0.0}, "rope_base: expected a positive number, got 0.0"),
-        ({"norm_eps": float("inf")}, "norm_eps: expected a positive number, got inf"),
+        ({"rope_base": 0.0}, "rope_base"),
+        ({"norm_eps": float("inf")}, "norm_eps"),
     ],
 )
 def test_sizes_that_no_decoder_has_are_named(changes, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         VLAConfig.tiny(**changes)
 
 

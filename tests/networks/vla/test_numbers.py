@@ -7,6 +7,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from tests.refusals import refused
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.flops import decoder_flops, fixed_flops, query_flops
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
@@ -60,9 +61,9 @@ def test_grippers_are_decided_at_a_half():
 
 def test_impossible_quantiles_are_refused():
     one = torch.ones(1)
-    with pytest.raises(ValueError, match="action: expected finite quantiles"):
+    with refused("action"):
         QuantileNormalizer(-one, one, one, -one, one.bool())
-    with pytest.raises(ValueError, match="gripper: expected bool"):
+    with refused("gripper"):
         QuantileNormalizer(-one, one, -one, one, one)
 
 
@@ -78,16 +79,16 @@ def test_the_crop_is_central_and_linear():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"image_size": 30}, "multiple of patch_size=14"),
-        ({"cameras": ()}, "one or two keys"),
+        ({"image_size": 30}, "image_size"),
+        ({"cameras": ()}, "cameras"),
         ({"crop_area": 0.0}, "crop_area"),
-        ({"chunk_size": 0}, "chunk_size: expected a whole number"),
-        ({"dino": TransformerSize(16, 1, 2, 32)}, "at least 2 layers"),
-        ({"dino": TransformerSize(16, 2, 2, 40)}, "multiple of dino.dim=16"),
+        ({"chunk_size": 0}, "chunk_size"),
+        ({"dino": TransformerSize(16, 1, 2, 32)}, "dino, siglip"),
+        ({"dino": TransformerSize(16, 2, 2, 40)}, "dino.mlp"),
     ],
 )
 def test_sizes_that_do_not_fit_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         VLAConfig.tiny(**changes)
 
 

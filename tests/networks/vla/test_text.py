@@ -6,6 +6,7 @@ import pytest
 import torch
 from tokenizers import Tokenizer, models, pre_tokenizers
 
+from tests.refusals import refused
 from torchrl_sparse.networks.vla.text import LlamaTokenizer, WordTokenizer, tokenizer_from_config
 
 
@@ -98,12 +99,12 @@ def test_config_round_trip(make, definition):
 
 
 def test_damaged_files_are_named(definition, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"tokenizer.json"):
+    with refused("tokenizer", FileNotFoundError):
         LlamaTokenizer.from_file(tmp_path / "tokenizer.json")
     (tmp_path / "tokenizer.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"tokenizer.json: expected the text of a tokenizer.json"):
+    with refused("tokenizer.json"):
         LlamaTokenizer.from_file(tmp_path / "tokenizer.json")
     charsmap = {"normalizer": {"type": "Precompiled", "precompiled_charsmap": ""}}
     (tmp_path / "tokenizer.json").write_text(json.dumps(json.loads(definition) | charsmap))
-    with pytest.raises(ValueError, match=r"tokenizer.json: expected the text .*Precompiled"):
+    with refused("tokenizer.json"):
         LlamaTokenizer.from_file(tmp_path / "tokenizer.json")

@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy
 from torchrl_sparse.blocks.engine.native import NativeEngine, native_available, tsp
 from torchrl_sparse.blocks.planner import Planner, StaticPlanner
@@ -236,16 +237,14 @@ def with_camera():
 
 def test_what_cannot_be_exported_is_refused_and_nothing_is_written(tmp_path):
     path = tmp_path / "policy.tsp"
-    with pytest.raises(
-        ValueError, match=r"^plan: expected one that does not look .* or a SAGPruner, got Looks$"
-    ):
+    with refused("plan"):
         make_policy(plan=Looks()).export(path)
-    with pytest.raises(ValueError, match=r"^export: expected a policy of states, got cameras \['image'\]$"):
+    with refused("export"):
         with_camera().export(path)
-    with pytest.raises(ValueError, match=r"^weights: expected one of .*, got 'int8'$"):
+    with refused("weights"):
         make_policy().export(path, weights="int8")
-    with pytest.raises(ValueError, match=r"^export: it needs n_cond_layers = 0, the network has 1$"):
+    with refused("export"):
         make_policy(n_cond_layers=1).export(path)
-    with pytest.raises(ValueError, match=r"^noise: expected one of \['torch', 'philox'\], got 'mt19937'$"):
+    with refused("noise"):
         make_policy().noise = "mt19937"
     assert list(tmp_path.iterdir()) == []

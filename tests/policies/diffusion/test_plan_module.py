@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.blocks import mask as masks
 from torchrl_sparse.blocks.engine import base, denoise
@@ -67,7 +68,7 @@ def test_a_rule_that_is_changed_counts_from_the_next_query_on_in_copies_too(poli
     torch.testing.assert_close(td[keys.CHUNK], expected_chunk(policy, td, "single"), atol=1e-5, rtol=0)
     assert policy.plan.reuse == "type"
     policy.plan.reuse = "types"
-    with pytest.raises(ValueError, match=r"reuse: expected one of .*, got 'types'"):
+    with refused("reuse"):
         policy(request(3))
 
 
@@ -107,15 +108,11 @@ class PrunesTheFirstStep(Planner):
 @pytest.mark.parametrize("engine", ["reference", "torch", "auto"])
 def test_a_wrong_mask_is_named_with_its_planner(policy, engine):
     policy.engine, policy.plan = engine, PrunesTheFirstStep()
-    with pytest.raises(
-        ValueError, match=r"^PrunesTheFirstStep: prune mask: expected row 0 .* got True for layers"
-    ):
+    with refused("PrunesTheFirstStep: prune mask"):
         policy(request(2))
     wide = torch.zeros(2, policy.num_inference_steps, 99, dtype=torch.bool)
     policy.module["plan"] = TensorDictModule(lambda cond: wide, [keys.COND], [keys.PRUNE_MASK])
-    with pytest.raises(
-        ValueError, match=r"^TensorDictModule: prune mask: expected shape \[2, 8, 6\].*\[2, 8, 99\]"
-    ):
+    with refused("TensorDictModule: prune mask"):
         policy(request(2))
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.refusals import refused
 from torchrl_sparse import (
     BAC,
     CacheSchedule,
@@ -124,13 +125,13 @@ def test_a_plan_that_does_not_fit_leaves_the_policy_as_it_was(policy):
     layers = policy.network.n_layer
     policy.plan = SchedulePlanner(CacheSchedule("mine", policy.fingerprint, 8, layers, steps))
     before = policy(request(1))[keys.CHUNK]
-    with pytest.raises(ValueError, match="made for num_inference_steps 8, got 4; assign plan = None, then"):
+    with refused("SchedulePlanner"):
         policy.sampler = Sampler("ddim", 4)
-    with pytest.raises(ValueError, match="made for policy fingerprint 'another'"):
+    with refused("SchedulePlanner"):
         policy.plan = SchedulePlanner(CacheSchedule("mine", "another", 8, layers, steps))
-    with pytest.raises(ValueError, match=r"^plan: expected a Planner, got str 'bac'$"):
+    with refused("plan"):
         policy.plan = "bac"
-    with pytest.raises(ValueError, match=r"^sampler: expected a Sampler, got the class Sampler$"):
+    with refused("sampler"):
         policy.sampler = Sampler
     assert policy.num_inference_steps == 8
     assert torch.equal(policy(request(1))[keys.CHUNK], before)
@@ -146,15 +147,13 @@ def test_keys_are_declared(policy):
 
 
 def test_bad_observations_are_named(policy):
-    with pytest.raises(
-        ValueError, match=r"expected \[\*B, n_obs_steps, state\] = \[\*B, 2, 5\], got \[3, 2, 6\]"
-    ):
+    with refused("('history', 'state')"):
         policy(TensorDict({keys.HISTORY_STATE: torch.zeros(3, 2, 6)}, [3]))
     with pytest.raises(KeyError, match=r"expected the key \('history', 'state'\), got .*other"):
         policy(TensorDict({"other": torch.zeros(3, 1)}, [3]))
     td = request(3)
     td[keys.HISTORY_STATE][1, 0, 2] = float("nan")
-    with pytest.raises(ValueError, match=r"expected finite numbers, got nan at \[1, 0, 2\]"):
+    with refused("('history', 'state')"):
         policy(td)
 
 

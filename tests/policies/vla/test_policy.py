@@ -7,6 +7,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import InitTracker, SerialEnv, TransformedEnv
 from torchrl.envs.custom import ToyVLAEnv
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.networks.vla.config import VLAConfig
@@ -192,7 +193,7 @@ def test_wrong_inputs_are_named(policy, query, key, value, message):
 
 def test_a_tokenizer_with_too_many_ids_is_refused(network):
     words = [f"word{i}" for i in range(100)]
-    with pytest.raises(ValueError, match="vocab_size=320"):
+    with refused("tokenizer"):
         VLAPolicy(network, tokenizer=WordTokenizer(words))
 
 
@@ -265,5 +266,5 @@ def test_one_instruction_serves_a_batch(policy, query):
 
 
 def test_an_empty_batch_is_refused_by_name(policy, query):
-    with pytest.raises(ValueError, match=r"batch: expected at least one query, got batch size \[0\]"):
+    with refused("batch"):
         policy(query(2)[:0])

@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -29,25 +30,25 @@ def test_round_trip_at_half_precision(policy, query, tmp_path):
 
 def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
     VLAPolicy(VLANetwork(VLAConfig.tiny(cameras=(keys.IMAGE,)))).save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match=r"config.json: cameras: expected .*wrist_image.*, got \[\['obs"):
+    with refused("config.json: cameras"):
         VLAPolicy.from_pretrained(tmp_path, config=network.config)
 
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("format", "other", "format: expected"),
-        ("tokenizer", {"kind": "pickle"}, "tokenizer: expected kind"),
-        ("network", {}, "expected the fields"),
-        ("source", {"cameras": ["image"]}, "source.cameras: expected an object"),
-        ("source", {"images": "mine"}, "source.images: expected 'rendered' or 'openvla_oft', got 'mine'"),
+        ("format", "other", "config.json: format"),
+        ("tokenizer", {"kind": "pickle"}, "config.json: tokenizer"),
+        ("network", {}, "config.json"),
+        ("source", {"cameras": ["image"]}, "config.json: source.cameras"),
+        ("source", {"images": "mine"}, "config.json: source.images"),
     ],
 )
 def test_a_wrong_config_is_named(policy, tmp_path, field, value, message):
     policy.save_pretrained(tmp_path)
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**config, field: value}))
-    with pytest.raises(ValueError, match=f"config.json: {message}"):
+    with refused(message):
         VLAPolicy.from_pretrained(tmp_path)
 
 
@@ -56,5 +57,5 @@ def test_other_sizes_than_the_weights_are_named(policy, tmp_path):
     config = json.loads((tmp_path / "config.json").read_text())
     config["network"]["vocab_size"] = 400
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"embed_tokens.weight: expected shape \(400, 32\), got \(320, 32\)"):
+    with refused("network.decoder.llama.embed_tokens.weight"):
         VLAPolicy.from_pretrained(tmp_path)

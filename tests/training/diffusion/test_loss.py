@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.refusals import refused
 from torchrl_sparse import keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.normalize import Normalizer
@@ -51,5 +52,5 @@ def test_every_parameter_gets_a_gradient(make_network, normalizer, batch):
 
 def test_chunk_of_a_wrong_shape_is_named(make_network, normalizer, batch):
     loss = DiffusionLoss(make_network(), normalizer)
-    with pytest.raises(ValueError, match=r"action: expected shape \[B, 6, 10\], got \[4, 5, 10\]"):
+    with refused("action"):
         loss(batch.set(keys.ACTION, batch[keys.ACTION][:, :5]))

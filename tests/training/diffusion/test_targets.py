@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.refusals import refused
 from torchrl_sparse import DiffusionPolicy, Normalizer, Sampler, keys
 from torchrl_sparse.training.diffusion.targets import add_queries, load_targets, make_targets, save_targets
 
@@ -59,19 +60,16 @@ def test_targets_are_kept_in_a_file_for_what_they_were_made_for(targets, tmp_pat
     loaded = load_targets(path, made_for)
     assert set(loaded.keys(True, True)) == set(targets.keys(True, True))
     assert (loaded == targets).all()
-    with pytest.raises(
-        ValueError,
-        match=r"targets.safetensors: made with other settings: policy is 'two' here and 'one' there",
-    ):
+    with refused("targets.safetensors"):
         load_targets(path, {**made_for, "policy": "two"})
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(ValueError, match=r"targets.safetensors: expected a complete safetensors file"):
+    with refused("targets.safetensors"):
         load_targets(path, made_for)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 1.5])
 def test_an_empty_calibration_set_is_refused(policy, demos, share):
-    with pytest.raises(ValueError, match=r"share: expected at least one of \d+ windows"):
+    with refused("share"):
         make_targets(policy, demos, share=share, n_action_steps=4)
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.blocks.conftest import NUM_STEPS
+from tests.refusals import refused
 from tests.training.pruner.conftest import NUM_BLOCKS, sag_gates
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import prune_rate
@@ -22,7 +23,7 @@ def test_gates_are_fitted_to_a_mask(policy, targets, rate_input):
     logits = gates.prune_logits(cond, rate)[:, 1:]
     assert ((logits > 0) == mask[1:]).float().mean() > 0.98
     assert logits.abs().max() < 4  # or gradients would not reach them
-    with pytest.raises(ValueError, match=r"mask: expected \[K, 3L\] = \[\d+, \d+\] as the gates have, got"):
+    with refused("mask"):
         fit_to_masks(gates, [mask[1:]], targets)
 
 
@@ -39,9 +40,9 @@ def test_gates_are_fitted_to_a_mask_for_each_of_several_rates(policy, targets):
         logits = gates.prune_logits(cond, rate)
         pruned = logits[:, 1:] > rate_threshold(logits, rate)
         assert (pruned == mask[1:]).float().mean() > 0.9
-    with pytest.raises(ValueError, match="masks: expected one for gates that do not read the rate, got 2"):
+    with refused("masks"):
         fit_to_masks(sag_gates(policy), masks, targets)
-    with pytest.raises(ValueError, match="masks: expected at least one, got 0"):
+    with refused("masks"):
         fit_to_masks(gates, [], targets)
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.blocks.conftest import NUM_LAYERS, NUM_STEPS
+from tests.refusals import refused
 from tests.training.pruner.conftest import NUM_BLOCKS, sag_gates
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import StaticGates, noise_errors
@@ -170,15 +171,13 @@ def test_the_policy_is_not_trained(policy, targets):
 
 def test_a_checkpoint_of_another_training_is_refused(policy, targets, tmp_path):
     trainer_of(policy, targets).save(tmp_path / "checkpoint.pt")
-    with pytest.raises(
-        ValueError, match=r"checkpoint.pt: made with another config: rate is 0.8 here and 0.6"
-    ):
+    with refused("checkpoint.pt"):
         trainer_of(policy, targets, rate=0.8).load(tmp_path / "checkpoint.pt")
-    with pytest.raises(ValueError, match="made with another targets"):
+    with refused("checkpoint.pt"):
         trainer_of(policy, targets[:-3]).load(tmp_path / "checkpoint.pt")
     data = (tmp_path / "checkpoint.pt").read_bytes()
     (tmp_path / "half.pt").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ValueError, match=r"half.pt: expected a training checkpoint"):
+    with refused("half.pt"):
         trainer_of(policy, targets).load(tmp_path / "half.pt")
 
 
@@ -192,39 +191,37 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"objective": "steps"}, r"objective: expected one of \['actions', 'noise'\], got 'steps'"),
-        ({"objective": "noise"}, "reuse: expected 'block' with objective 'noise', got 'type'"),
-        ({"rate": 1.0}, r"rate: expected a prune rate in \(0, 1\), got 1.0"),
-        ({"rate_range": (0.7, 0.9)}, "rate_range: expected 0 < low <= rate=0.6"),
+        ({"objective": "steps"}, "objective"),
+        ({"objective": "noise"}, "reuse"),
+        ({"rate": 1.0}, "rate"),
+        ({"rate_range": (0.7, 0.9)}, "rate_range"),
         (
             {"rate_range": (0.5, 0.9), "cost": "flops"},
-            "cost: expected 'blocks' with a rate_range, got 'flops'",
+            "cost",
         ),
-        ({"estimator": "reinforce"}, "estimator: expected one of .*got 'reinforce'"),
-        ({"cost": "joules"}, "cost: expected one of .*got 'joules'"),
-        ({"reuse": "layer"}, "reuse: expected one of .*got 'layer'"),
-        ({"lr": 0.0}, "lr: expected a positive number, got 0.0"),
-        ({"final_temperature": 0.0}, "final_temperature: expected a positive number, got 0.0"),
-        ({"variety": -1.0}, "variety: expected a weight >= 0, got -1.0"),
-        ({"variety": 0.1, "information": 1.5}, r"information: expected bits in \(0, 1\], or None, got 1.5"),
-        ({"information": 0.1}, "information: expected None without variety, got 0.1"),
+        ({"estimator": "reinforce"}, "estimator"),
+        ({"cost": "joules"}, "cost"),
+        ({"reuse": "layer"}, "reuse"),
+        ({"lr": 0.0}, "lr"),
+        ({"final_temperature": 0.0}, "final_temperature"),
+        ({"variety": -1.0}, "variety"),
+        ({"variety": 0.1, "information": 1.5}, "information"),
+        ({"information": 0.1}, "information"),
     ],
 )
 def test_a_wrong_configuration_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
+    with refused(message):
         dataclasses.replace(SMALL, **options)
 
 
 def test_gates_and_configuration_have_to_agree(policy, targets):
-    with pytest.raises(ValueError, match="rate_range: expected one if and only if the gates read the rate"):
+    with refused("rate_range"):
         trainer_of(policy, targets, sag_gates(policy), rate_range=(0.5, 0.7))
-    with pytest.raises(ValueError, match="expected at least 2 observations, got 1"):
+    with refused("targets"):
         trainer_of(policy, targets[:1])
-    with pytest.raises(
-        ValueError, match=f"rate: expected at most {1 - 1 / NUM_STEPS:g}, since the first step"
-    ):
+    with refused("rate"):
         trainer_of(policy, targets, rate=0.99)
-    with pytest.raises(ValueError, match=r"rate: expected at most 0\.5, since every other step is kept"):
+    with refused("rate"):
         trainer_of(policy, targets, objective="noise", reuse="block", rate=0.6)
 
 

@@ -8,6 +8,7 @@ from torchrl.envs import InitTracker, StepCounter, TransformedEnv
 from torchrl.envs.custom import ToyVLAEnv
 
 from tests.recipe_modules import run
+from tests.refusals import refused
 from tests.tokens.helpers import CONFIG, LAYERS, PER_CAMERA, later, make_policy, query
 from tests.training.vla.rendered import write_demos
 from torchrl_sparse import ChunkExecutor, keys
@@ -66,7 +67,7 @@ def test_errors_are_those_of_the_executed_actions_after_the_first_query():
     assert tight.loss > 0 == whole.loss
     assert tight.kept < whole.kept == CONFIG.num_visual
     assert (tight.number, whole.number) == (0.2, 1.0)
-    with pytest.raises(ValueError, match=r"expected one with at least two queries, got \[1, 1\]"):
+    with refused("episodes"):
         measure_errors(policy, [queries[:1]] * 2, {0.2: pruner(0.2)}, n_action_steps=1)
 
 

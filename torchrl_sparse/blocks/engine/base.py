@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import Reuse, check_reuse, validate_mask
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -114,7 +115,7 @@ def check_query(
     for name, shape in expected.items():
         check_input(name, given[name], shape, network.pos_emb)
     if guide is not None and not ((guide.pull >= 0) & (guide.pull <= 1)).all():
-        raise ValueError(f"guide.pull: expected numbers in [0, 1], got {guide.pull.flatten().tolist()}")
+        raise InputError(f"guide.pull: expected numbers in [0, 1], got {guide.pull.flatten().tolist()}")
     if mask is not None:
         validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
     check_reuse(reuse)
@@ -124,10 +125,10 @@ def check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor)
     """Raise ValueError unless ``tensor`` is dense, of this shape, and of the type and device of ``like``."""
     if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested:
         came = f"layout {tensor.layout}" if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise ValueError(f"{name}: expected a dense tensor, got {came}")
+        raise InputError(f"{name}: expected a dense tensor, got {came}")
     if tuple(tensor.shape) != shape:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
+        raise InputError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
     if tensor.dtype != like.dtype or tensor.device != like.device:
-        raise ValueError(
+        raise InputError(
             f"{name}: expected {like.dtype} on {like.device}, as the network, got {tensor.dtype} on {tensor.device}"
         )

@@ -11,6 +11,7 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.spacing import falls_evenly
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -38,7 +39,7 @@ def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
         scheduler.set_timesteps(timesteps=sampler.timesteps.tolist())
         return scheduler
     if sampler.kind != "ddim" or not falls_evenly(sampler.timesteps.tolist(), sampler.num_train_timesteps):
-        raise ValueError(f"eager baseline: diffusers has no sampler {sampler.name!r} that clips and steps so")
+        raise InputError(f"eager baseline: diffusers has no sampler {sampler.name!r} that clips and steps so")
     scheduler = DDIMScheduler(set_alpha_to_one=True, steps_offset=0, **options)
     scheduler.set_timesteps(sampler.num_inference_steps)
     return scheduler

@@ -11,6 +11,7 @@ from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.reference import ReferenceEngine
 from torchrl_sparse.blocks.engine.torch.engine import TorchEngine
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -56,7 +57,7 @@ def check_engine(name: str) -> None:
     """Raise ValueError unless ``name`` is in :data:`ENGINES`, or ``"auto"``."""
     names = ["auto", *ENGINES]
     if name not in names:
-        raise ValueError(f"engine: expected one of {names}, got {name!r}")
+        raise InputError(f"engine: expected one of {names}, got {name!r}")
 
 
 def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
@@ -81,7 +82,7 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sam
         name = next(name for name, entry in ENGINES.items() if entry.applies(network)[0])
     applies, reason = ENGINES[name].applies(network)
     if not applies:
-        raise ValueError(f"{name} engine: {reason}")
+        raise InputError(f"{name} engine: {reason}")
     return ENGINES[name].make(network, sampler)
 
 

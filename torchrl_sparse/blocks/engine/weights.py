@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.frozen import Frozen
 
 __all__ = ["Members", "WeightWatch", "check_weights"]
@@ -143,9 +144,9 @@ def check_weights(network: nn.Module) -> None:
     """Raise ValueError, naming it, if ``network`` has a weight without values, or one that is no floating-point number."""
     for name, parameter in network.named_parameters():
         if not parameter.is_floating_point():
-            raise ValueError(f"network: expected floating-point weights, got {name!r} of {parameter.dtype}")
+            raise InputError(f"network: expected floating-point weights, got {name!r} of {parameter.dtype}")
         if parameter.is_meta:
-            raise ValueError(
+            raise InputError(
                 f"network: expected weights with values, got {name!r} on the meta device (move the network with "
                 f"to_empty(), then load_state_dict())"
             )

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner, PrunerWeights
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import MAX_TRAIN_TIMESTEPS
 from torchrl_sparse.networks.diffusion.transformer import SinusoidalPosEmb
 from torchrl_sparse.networks.sizes import check_size
@@ -238,11 +239,11 @@ def _check(
     **sizes: int,
 ) -> None:
     if len(cond_shape) != 2:
-        raise ValueError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
+        raise InputError(f"cond_shape: expected two sizes, got {reprlib.repr(cond_shape)}")
     if not all(type(step) is int and 0 <= step < MAX_TRAIN_TIMESTEPS for step in timesteps):
-        raise ValueError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
+        raise InputError(f"timesteps: expected diffusion timesteps, got {reprlib.repr(timesteps)}")
     if not isinstance(rate_input, bool):
-        raise ValueError(f"rate_input: expected true or false, got {reprlib.repr(rate_input)}")
+        raise InputError(f"rate_input: expected true or false, got {reprlib.repr(rate_input)}")
     check_size("timesteps", len(timesteps), _MAX_CELLS)
     check_size("num_blocks", num_blocks, _MAX_CELLS // len(timesteps))
     check_size("width", sizes["width"], _MAX_TOKEN)
@@ -250,6 +251,6 @@ def _check(
     for name, size in (*sizes.items(), *(("cond_shape", size) for size in cond_shape)):
         check_size(name, size, _MAX_WIDTH)
     if type(unseen) is not int or not 0 <= unseen < cond_shape[1]:
-        raise ValueError(f"unseen: expected 0 to {cond_shape[1] - 1} columns, got {reprlib.repr(unseen)}")
+        raise InputError(f"unseen: expected 0 to {cond_shape[1] - 1} columns, got {reprlib.repr(unseen)}")
     if sizes["width"] % sizes["n_head"]:
-        raise ValueError(f"width: expected a multiple of n_head={sizes['n_head']}, got {sizes['width']}")
+        raise InputError(f"width: expected a multiple of n_head={sizes['n_head']}, got {sizes['width']}")

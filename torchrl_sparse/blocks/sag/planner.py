@@ -34,6 +34,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.keys import COND, PRUNE_RATE
 from torchrl_sparse.storage.json import read_json, write_json
 from torchrl_sparse.storage.tensors import read_tensors, write_tensors
@@ -103,11 +104,11 @@ class _Config(PrunerInfo):
 def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
     """Raise ValueError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
     if not 0 < rate < 1:
-        raise ValueError(f"rate: expected a prune rate in (0, 1), got {rate}")
+        raise InputError(f"rate: expected a prune rate in (0, 1), got {rate}")
     if rate_range is not None:
         low, high = rate_range
         if not 0 < low <= rate <= high < 1:
-            raise ValueError(f"rate_range: expected 0 < low <= rate={rate} <= high < 1, got {low}, {high}")
+            raise InputError(f"rate_range: expected 0 < low <= rate={rate} <= high < 1, got {low}, {high}")
 
 
 class SAGPruner(Planner):
@@ -138,7 +139,7 @@ class SAGPruner(Planner):
     def __init__(self, network: PrunerNetwork, info: PrunerInfo) -> None:
         super().__init__()
         if network.rate_input != (info.rate_range is not None):
-            raise ValueError(
+            raise InputError(
                 f"rate_range: expected one if and only if the network reads the rate, "
                 f"got {info.rate_range} and rate_input={network.rate_input}"
             )
@@ -194,7 +195,7 @@ class SAGPruner(Planner):
             ValueError: if the observations do not have the shape that the pruner was trained on.
         """
         if cond.shape[1:] != self.network.cond_shape:
-            raise ValueError(
+            raise InputError(
                 f"{COND}: expected [B, To, D] = [B, {self.network.cond_shape[0]}, {self.network.cond_shape[1]}], "
                 f"got {list(cond.shape)}"
             )
@@ -234,7 +235,7 @@ class SAGPruner(Planner):
         path = Path(path)
         config = read_json(path / "config.json", _Config)
         if config.format != cls.format:
-            raise ValueError(
+            raise InputError(
                 f"{path / 'config.json'}: format: expected {cls.format!r}, got {config.format!r}"
             )
         info = PrunerInfo(**{field.name: getattr(config, field.name) for field in fields(PrunerInfo)})
@@ -242,7 +243,7 @@ class SAGPruner(Planner):
             with torch.device("meta"):  # compared with the weights before memory is taken for it
                 expected = PrunerNetwork(**config.network).state_dict()
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{path / 'config.json'}: network: {error}") from error
+            raise InputError(f"{path / 'config.json'}: network: {error}") from error
         tensors = read_tensors(path / "pruner.safetensors", expected)
         network = PrunerNetwork(**config.network)
         network.load_state_dict(tensors)
@@ -250,9 +251,9 @@ class SAGPruner(Planner):
 
     def _check_rates(self, rates: Tensor, name: Any) -> None:
         if self.info.rate_range is None:
-            raise ValueError(f"{name}: this pruner was trained for the rate {self.info.rate} alone")
+            raise InputError(f"{name}: this pruner was trained for the rate {self.info.rate} alone")
         low, high = self.info.rate_range
         if not ((rates >= low) & (rates <= high)).all():
-            raise ValueError(
+            raise InputError(
                 f"{name}: expected prune rates in [{low}, {high}], got {rates.min():.3g} to {rates.max():.3g}"
             )

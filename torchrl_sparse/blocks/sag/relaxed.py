@@ -23,6 +23,7 @@ from torch.utils.checkpoint import checkpoint
 from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.reference import ComputedRows
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -153,7 +154,7 @@ def _chain(
     pruned = gate.detach().bool()
     check_query(network, sampler, noise, cond, pruned, reuse)
     if not 0 < explore <= 1:
-        raise ValueError(f"explore: expected a probability in (0, 1], got {explore}")
+        raise InputError(f"explore: expected a probability in (0, 1], got {explore}")
     explored = torch.rand(gate.shape[1:], device=gate.device) < explore
     computed = ComputedRows(pruned & ~explored)
     gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))

@@ -18,6 +18,7 @@ from torchrl_sparse.envs.experts.operators import OPERATORS, draw_operator
 from torchrl_sparse.envs.robosuite import RobosuiteEnv
 from torchrl_sparse.envs.simulator import CONTROL_FREQ, controller_config, import_robosuite
 from torchrl_sparse.envs.tasks import RobosuiteTask, StateTask
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import absolute_to_pose, pose_to_absolute
 
 __all__ = ["Demonstrator", "RobosuiteDemonstrator", "StateDemonstrator", "StateExpert"]
@@ -152,7 +153,7 @@ class StateDemonstrator:
     def __init__(self, task: StateTask, env: EnvBase, rng: np.random.Generator, quality: str):
         if quality not in self.qualities:
             known = ", ".join(self.qualities)
-            raise ValueError(f"quality: expected one of {known} for {task.name}, got {quality!r}")
+            raise InputError(f"quality: expected one of {known} for {task.name}, got {quality!r}")
         self.operator = quality
         self._expert: StateExpert = task.load_expert()(rng)
         self._rng, self._noise = rng, np.zeros(task.action_dim)

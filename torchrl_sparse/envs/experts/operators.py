@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from torchrl_sparse.errors import InputError
+
 Range = tuple[float, float]
 """Lower and upper end of a uniform distribution."""
 
@@ -114,6 +116,6 @@ def draw_operator(quality: str, rng: np.random.Generator) -> Operator:
         ValueError: if there is no such quality; the message lists those there are.
     """
     if quality not in OPERATORS:
-        raise ValueError(f"quality: expected one of {', '.join(OPERATORS)}, got {quality!r}")
+        raise InputError(f"quality: expected one of {', '.join(OPERATORS)}, got {quality!r}")
     operators = OPERATORS[quality]
     return operators[rng.integers(len(operators))]

@@ -17,6 +17,7 @@ from torchrl_sparse.blocks.calibration import Calibration, calibrate
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.blocks.schedule import CacheSchedule
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.accelerate.stages import Search, read_or_make
 from torchrl_sparse.evaluation.results.acceleration import Family
 from torchrl_sparse.evaluation.results.schema import DENSE
@@ -67,10 +68,10 @@ class Grid:
                 _check_chain(field, name)
         for name in self.searched:
             if SamplerName.parse(name).timesteps is not None:
-                raise ValueError(f"searched: expected KIND and STEPS, such as ddpm3, got {name!r}")
+                raise InputError(f"searched: expected KIND and STEPS, such as ddpm3, got {name!r}")
         for weights in self.rounded:
             if weights not in WEIGHTS:
-                raise ValueError(f"rounded: expected some of {', '.join(WEIGHTS)}, got {weights!r}")
+                raise InputError(f"rounded: expected some of {', '.join(WEIGHTS)}, got {weights!r}")
 
 
 def calibrate_candidates(
@@ -131,9 +132,9 @@ def _check_chain(field: str, name: str) -> None:
     try:
         parts = SamplerName.parse(name)
     except ValueError as error:
-        raise ValueError(f"{field}: {error}") from error
+        raise InputError(f"{field}: {error}") from error
     if parts.num_inference_steps is None and parts.timesteps is None:
-        raise ValueError(f"{field}: expected a sampler with its steps, such as ddpm3, got {name!r}")
+        raise InputError(f"{field}: expected a sampler with its steps, such as ddpm3, got {name!r}")
 
 
 def _check_fits(policy: DiffusionPolicy, grid: Grid) -> None:
@@ -143,7 +144,7 @@ def _check_fits(policy: DiffusionPolicy, grid: Grid) -> None:
             try:
                 _sampler(policy, name)
             except ValueError as error:
-                raise ValueError(f"{field}: {name}: {error}") from error
+                raise InputError(f"{field}: {name}: {error}") from error
 
 
 def _sampler(policy: DiffusionPolicy, name: str) -> Sampler:

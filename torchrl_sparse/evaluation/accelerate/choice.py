@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import chain, zip_longest
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.acceleration import FAMILIES, Candidate, Played
 from torchrl_sparse.evaluation.results.schema import DENSE
 
@@ -27,13 +28,13 @@ def within_budget(candidates: Mapping[str, Candidate], budget_ms: float | None) 
         limit = candidates[DENSE].latency_s.p50
         fast = [name for name, candidate in others.items() if candidate.latency_s.p50 < limit]
         if not fast:
-            raise ValueError("budget_ms: expected a candidate that is faster than dense, got none")
+            raise InputError("budget_ms: expected a candidate that is faster than dense, got none")
         return fast
     fast = [name for name, candidate in others.items() if 1e3 * candidate.latency_s.p95 <= budget_ms]
     if not fast:
         name = min(others, key=lambda name: others[name].latency_s.p95)
         needed = 1e3 * others[name].latency_s.p95
-        raise ValueError(
+        raise InputError(
             f"budget_ms: expected at least {needed:.3g}, what the fastest candidate, {name}, takes here, got {budget_ms:g}"
         )
     return fast

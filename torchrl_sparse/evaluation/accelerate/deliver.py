@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.seeds import evaluation_seeds
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.film import film_masks
 from torchrl_sparse.evaluation.figures.acceleration import plot_acceleration
 from torchrl_sparse.evaluation.figures.html_report import write_report
@@ -98,7 +99,7 @@ def write_acceleration_report(found: Acceleration, out: Path) -> Path:
     path = out / "report.html"
     faults = write_report(out, path, title=f"{found.task}: {verdict_line(found)}")
     if faults:
-        raise ValueError("; ".join(f"{out / name}: {fault}" for name, fault in faults.items()))
+        raise InputError("; ".join(f"{out / name}: {fault}" for name, fault in faults.items()))
     return path
 
 

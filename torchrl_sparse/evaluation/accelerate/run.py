@@ -28,6 +28,7 @@ from torchrl_sparse.control.queries import answer
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.envs.contract import provenance
 from torchrl_sparse.envs.tasks import find_task
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.accelerate.candidates import Grid, calibrate_candidates, family
 from torchrl_sparse.evaluation.accelerate.choice import choose, rank, within_budget
 from torchrl_sparse.evaluation.accelerate.finalists import Finalists
@@ -148,7 +149,7 @@ def accelerate(
 
 def _check_policy(policy: DiffusionPolicy) -> None:
     if policy.plan.fingerprint != policy.with_plan(None).plan.fingerprint:
-        raise ValueError(
+        raise InputError(
             f"policy: expected one that nothing is pruned of yet, got {type(policy.plan).__name__}"
         )
 

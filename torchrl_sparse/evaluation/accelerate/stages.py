@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.storage.json import describe_differences, read_json, to_plain, write_json
 
@@ -81,7 +82,7 @@ def read_or_make(
         if not differing:
             return found
         if not anew:
-            raise ValueError(
+            raise InputError(
                 f"{path}: made with other settings: {differing}; choose another out or move it away"
             )
     made = make()

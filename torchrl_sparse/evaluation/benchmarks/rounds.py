@@ -7,6 +7,7 @@ from contextlib import closing
 
 from torchrl.envs import EnvBase
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.build import Terms
 from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
@@ -37,7 +38,7 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
     (10, 20, 30, 40, 50, 60)
     """
     if until not in _UNTIL:
-        raise ValueError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
+        raise InputError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
     if until == "episodes":
         return Design(episodes)
     return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))

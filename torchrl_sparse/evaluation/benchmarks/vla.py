@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, tokens_kept
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.methods.token_budget import TokenBudget
@@ -134,7 +135,7 @@ def filmed_methods(videos: Iterable[str], methods: Sequence[str]) -> dict[str, s
     for video in videos:
         meant = [name for name in methods if video in (name, TokenMethodName.parse(name).name)]
         if video not in meant and len(meant) != 1:
-            raise ValueError(f"videos: expected one of {', '.join(methods)}, got {video!r}")
+            raise InputError(f"videos: expected one of {', '.join(methods)}, got {video!r}")
         filmed[video] = video if video in meant else meant[0]
     return filmed
 

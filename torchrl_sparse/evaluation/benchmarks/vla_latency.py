@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine, measure_latency
 from torchrl_sparse.evaluation.latency.vla_cases import VLACase
 from torchrl_sparse.evaluation.latency.vla_products import ProductCall, product_calls
@@ -53,13 +54,13 @@ def _equal_pruners(
     policy: VLAPolicy, pruners: Mapping[str, TokenPruner | None], name: str
 ) -> dict[str, TokenPruner]:
     if name not in pruners:
-        raise ValueError(f"equal_to: expected one of {', '.join(pruners)}, got {name!r}")
+        raise InputError(f"equal_to: expected one of {', '.join(pruners)}, got {name!r}")
     share = VLACase(policy, {name: pruners[name]}).answer(name)[keys.KEPT].item()
     share /= policy.network.config.num_visual
     # the share of layers that see every token
     before = FastVPruner().layer / policy.network.config.llm.layers
     if share <= before:
-        raise ValueError(
+        raise InputError(
             f"equal_to: expected a method that keeps more than {before:.0%}, got {share:.0%} of {name}"
         )
     return {

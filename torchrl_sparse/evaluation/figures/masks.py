@@ -7,6 +7,7 @@ import numpy as np
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS
 from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.plots import block_labels, type_legend
 
 __all__ = ["mask_panel", "plot_mask_statistics", "plot_mask_strip"]
@@ -112,5 +113,5 @@ def _colors(mask: np.ndarray) -> np.ndarray:
 def _check_masks(masks: np.ndarray) -> np.ndarray:
     masks = np.asarray(masks)
     if masks.dtype != bool or masks.ndim != 3 or not len(masks) or masks.shape[2] % _TYPES:
-        raise ValueError(f"masks: expected bool [Q > 0, K, 3L], got {masks.dtype} {list(masks.shape)}")
+        raise InputError(f"masks: expected bool [Q > 0, K, 3L], got {masks.dtype} {list(masks.shape)}")
     return masks

@@ -15,6 +15,7 @@ import numpy as np
 
 from torchrl_sparse.blocks.mask import BLOCK_TYPES, REUSED_COLOR, TYPE_COLORS
 from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.colors import method_colors
 
 if TYPE_CHECKING:
@@ -104,9 +105,9 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
     """
     similarity = np.asarray(similarity, dtype=np.float64)
     if similarity.ndim != 3 or similarity.shape[0] % _TYPES or similarity.shape[1] != similarity.shape[2]:
-        raise ValueError(f"similarity: expected shape [3L, K, K], got {list(similarity.shape)}")
+        raise InputError(f"similarity: expected shape [3L, K, K], got {list(similarity.shape)}")
     if not np.isfinite(similarity).all():
-        raise ValueError("similarity: expected finite values, got NaN or infinity")
+        raise InputError("similarity: expected finite values, got NaN or infinity")
     layers, steps = similarity.shape[0] // _TYPES, similarity.shape[1]
     figure, grid = make_figure(9, 3.9, rows=_TYPES, columns=layers)
     for index, panel in enumerate(similarity):
@@ -143,13 +144,13 @@ def plot_error_surge(
         ValueError: if names or shapes differ.
     """
     if list(errors) != list(masks) or not errors:
-        raise ValueError(
+        raise InputError(
             f"errors and masks: expected the same schedules, got {list(errors)} and {list(masks)}"
         )
     masks = {name: _check_mask(mask, f"masks[{name!r}]") for name, mask in masks.items()}
     for name, error in errors.items():
         if error.shape != masks[name].shape:
-            raise ValueError(f"errors[{name!r}]: expected shape {masks[name].shape}, got {error.shape}")
+            raise InputError(f"errors[{name!r}]: expected shape {masks[name].shape}, got {error.shape}")
     figure, grid = make_figure(9, 6.2, rows=3, columns=1, heights=(3, 3, 0.34 * len(errors)), sharex=True)
     ffn_axes, all_axes, update_axes = grid[:, 0]
     colors = method_colors(errors)
@@ -184,7 +185,7 @@ def _draw_updates(axes: Axes, masks: Mapping[str, np.ndarray], colors: Mapping[s
 def _check_mask(mask: Any, name: str) -> np.ndarray:
     mask = np.asarray(mask)
     if mask.dtype != np.bool_ or mask.ndim != 2 or mask.shape[1] % _TYPES or not mask.size:
-        raise ValueError(
+        raise InputError(
             f"{name}: expected a bool array of shape [K, 3L], got {mask.dtype} {list(mask.shape)}"
         )
     return mask

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchrl_sparse.canvas import make_figure, save_figure
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.figures.colors import method_colors
 from torchrl_sparse.methods.token_budget import TokenBudget
 
@@ -47,7 +48,7 @@ def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: i
     cameras, _, height, width = images.shape
     side = round((len(depth) / cameras) ** 0.5)
     if cameras * side**2 != len(depth) or height % side or width % side:
-        raise ValueError(
+        raise InputError(
             f"depth: expected a square grid of tokens for each of {cameras} images of {height} x {width} that divides "
             f"them, got {len(depth)} tokens"
         )
@@ -72,8 +73,8 @@ def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path
         ValueError: if there is nothing to show, or labels do not match.
     """
     if not len(pictures) or len(pictures) != len(labels):
-        raise ValueError(
-            f"expected at least one picture and a label for each, got {len(pictures)} and {len(labels)}"
+        raise InputError(
+            f"pictures: expected at least one and a label for each, got {len(pictures)} and {len(labels)}"
         )
     cameras = pictures[0].shape[1] // pictures[0].shape[0]
     size = 9 / len(pictures)
@@ -109,7 +110,7 @@ def plot_control(
     series = {"fine": fine, "queried": queried, **({} if kept is None else {"kept": kept})}
     for name, values in series.items():
         if len(values) != len(speed):
-            raise ValueError(f"{name}: expected {len(speed)} steps like speed, got {len(values)}")
+            raise InputError(f"{name}: expected {len(speed)} steps like speed, got {len(values)}")
     rows = 1 if kept is None else 2
     figure, grid = make_figure(9, 2.2 + 1.6 * rows, rows=rows, columns=1, sharex=True)
     axes = [grid] if kept is None else grid[:, 0]
@@ -145,7 +146,7 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
     """
     if not depth or any(np.ndim(values) != 2 or not np.size(values) for values in depth.values()):
         shapes = {name: list(np.shape(values)) for name, values in depth.items()}
-        raise ValueError(f"depth: expected [queries, N] for at least one method, got {shapes}")
+        raise InputError(f"depth: expected [queries, N] for at least one method, got {shapes}")
     figure, axes = make_figure(9, 3.8)
     colors = method_colors(depth)
     for place, (name, values) in enumerate(depth.items()):
@@ -174,7 +175,7 @@ def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) 
     """
     measures = sorted({budget.measure for budget in budgets})
     if len(measures) != 1:
-        raise ValueError(f"budgets: expected one measure, got {', '.join(measures) or 'no budget'}")
+        raise InputError(f"budgets: expected one measure, got {', '.join(measures) or 'no budget'}")
     figure, axes = make_figure(9, 4.2)
     colors = method_colors(budget.method for budget in budgets)
     above, below = (4, 6), (-6, -15)

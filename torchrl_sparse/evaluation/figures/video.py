@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.atomic import atomic_path
 
 __all__ = ["Caption", "add_caption", "write_video"]
@@ -67,9 +68,9 @@ def write_video(
     import imageio.v3 as iio
 
     if not len(frames):
-        raise ValueError("frames: expected at least one, got none")
+        raise InputError("frames: expected at least one, got none")
     if captions is not None and len(captions) != len(frames):
-        raise ValueError(f"captions: expected one per frame, {len(frames)}, got {len(captions)}")
+        raise InputError(f"captions: expected one per frame, {len(frames)}, got {len(captions)}")
     shape = np.shape(frames[0])
     for index, frame in enumerate(frames):
         _check_frame(frame, shape, index)
@@ -124,7 +125,7 @@ def _check_frame(frame: np.ndarray, shape: tuple[int, ...], index: int) -> None:
     fits = isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.shape == shape
     if not fits or len(shape) != 3 or shape[2] != 3:
         got = f"{getattr(frame, 'dtype', type(frame).__name__)} {list(np.shape(frame))}"
-        raise ValueError(f"frames[{index}]: expected uint8 [h, w, 3], all of one size, got {got}")
+        raise InputError(f"frames[{index}]: expected uint8 [h, w, 3], all of one size, got {got}")
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from torchrl_sparse.blocks.engine import Engine, NativeEngine, ReferenceEngine, 
 from torchrl_sparse.blocks.engine.eager import EagerBaseline
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.native.supports import native_supports
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.training.diffusion.published import published_network
@@ -50,7 +51,7 @@ def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
         ValueError: on an unknown shape.
     """
     if shape not in SHAPES:
-        raise ValueError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")
+        raise InputError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")
     torch.manual_seed(0)
     task, changes = SHAPES[shape]
     return published_network(task, **changes, **sizes).eval().requires_grad_(False)

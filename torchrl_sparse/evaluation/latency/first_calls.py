@@ -9,6 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase, Variant
 from torchrl_sparse.runtime.clock import synchronised_clock
 
@@ -69,7 +70,7 @@ def _first_call(case: EngineCase, name: str, variant: Variant, expected: Tensor)
     peak = torch.cuda.max_memory_allocated(case.device) - others if on_gpu else None
     error, most = (actions - expected).abs().max().item(), _MOST.get(name.split()[0], _MOST_F32)
     if not error <= most:
-        raise ValueError(
+        raise InputError(
             f"{name}: expected the actions of the reference up to {most:g}, got a difference of {error:g}"
         )
     return FirstCall(seconds, peak)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.threads import num_threads
 
 __all__ = [
@@ -70,10 +71,10 @@ def summarize_latency(samples: Sequence[float]) -> Latency:
     """
     values = np.asarray(samples, dtype=np.float64)
     if values.size == 0:
-        raise ValueError("expected at least one latency, got none")
+        raise InputError("latencies: expected at least one, got none")
     if not np.isfinite(values).all() or (values < 0).any():
-        raise ValueError(
-            f"latencies must be finite and >= 0 s, got min {values.min()} s and max {values.max()} s"
+        raise InputError(
+            f"latencies: expected finite seconds of at least 0, got min {values.min()} s and max {values.max()} s"
         )
     p50, p95 = np.percentile(values, [50, 95])
     return Latency(float(p50), float(p95), int(values.size), tuple(values.tolist()))
@@ -115,9 +116,9 @@ def measure_latency(
     (True, 5)
     """
     if not callables:
-        raise ValueError("expected at least one callable to time, got none")
+        raise InputError("calls: expected at least one to time, got none")
     if repeats < 1 or warmup < 0:
-        raise ValueError(f"expected repeats >= 1 and warmup >= 0, got {repeats} and {warmup}")
+        raise InputError(f"repeats, warmup: expected at least 1 and 0, got {repeats} and {warmup}")
     device, inputs = torch.device(device), inputs or {}
     order = list(callables)
     generator = random.Random(seed)

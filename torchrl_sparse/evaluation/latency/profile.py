@@ -24,6 +24,7 @@ from torchrl_sparse.blocks.engine.factory import ENGINES
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.packing import units
 from torchrl_sparse.blocks.engine.native.weights import NativeWatch
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import measure_latency, next_arguments
 from torchrl_sparse.evaluation.latency.stages import example_query, stage_seconds
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -85,9 +86,9 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
     query = example_query(policy)
     engine = policy.module["denoise"].engine.get(policy.network, policy.sampler)
     if not isinstance(engine, NativeEngine):
-        raise ValueError(f"engine: expected native, got {engine.name}")
+        raise InputError(f"engine: expected native, got {engine.name}")
     if not policy.plan.is_static:
-        raise ValueError(
+        raise InputError(
             f"plan: expected one that does not look at the observation, got {type(policy.plan).__name__}"
         )
     noise, state, seed = policy.sample_noise(torch.tensor([1])), query["history", "state"], torch.tensor([1])
@@ -235,7 +236,7 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
     try:
         found = ctypes.CDLL(str(library.resolve()))
     except OSError as error:
-        raise ValueError(f"library: expected libtsp.so, got {library} ({error})") from error
+        raise InputError(f"library: expected libtsp.so, got {library} ({error})") from error
     found.tsp_load.restype, found.tsp_free.argtypes = c_void_p, [c_void_p]
     found.tsp_query.argtypes = [c_void_p, c_void_p, c_uint64, c_void_p]
     with tempfile.TemporaryDirectory() as folder:
@@ -243,7 +244,7 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
         reason = ctypes.create_string_buffer(256)
         handle = found.tsp_load(f"{folder}/policy.tsp".encode(), reason, c_size_t(len(reason)))
     if handle is None:
-        raise ValueError(f"library: {reason.value.decode()}")
+        raise InputError(f"library: {reason.value.decode()}")
     try:
         yield lambda: found.tsp_query(handle, state.data_ptr(), 1, chunk.data_ptr())
     finally:

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.engine.factory import EngineName
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.engine_cases import make_network
 from torchrl_sparse.evaluation.latency.measure import measure_latency
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -57,7 +58,7 @@ def image_policy(
     vision = VisionEncoder(_CAMERAS, image_size=(_IMAGE, _IMAGE), width=width)
     state = network.cond_dim - vision.feature_dim
     if state < 1:
-        raise ValueError(
+        raise InputError(
             f"cond_dim: expected more than the features' {vision.feature_dim}, got {network.cond_dim}"
         )
     parts = {"vision": vision, "sampler": sampler, "engine": engine}

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.tasks import TASKS, RobosuiteTask
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.decoder import pack, visual_scores
 from torchrl_sparse.networks.vla.hooks import LayerState
@@ -70,7 +71,7 @@ def make_policy(
         ValueError: on an unknown shape.
     """
     if shape not in SHAPES:
-        raise ValueError(f"shape: expected one of {', '.join(SHAPES)}, got {shape!r}")
+        raise InputError(f"shape: expected one of {', '.join(SHAPES)}, got {shape!r}")
     config = SHAPES[shape]
     torch.manual_seed(0)
     network = make_network(config, dtype=dtype, device=device).requires_grad_(False)

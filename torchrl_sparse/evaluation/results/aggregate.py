@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.envs.seeds import Split
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.results.comparisons import surviving
 from torchrl_sparse.evaluation.results.parts import PValues
 from torchrl_sparse.evaluation.results.schema import DENSE, Results, load_results
@@ -66,26 +67,26 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
         if results.by_degrees:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected a task that success and time decide, got {results.task}, by degrees"
             )
         if results.dense_did_nothing:
-            raise ValueError(f"{path}: {NONE_SOLVED}")
+            raise InputError(f"{path}: {NONE_SOLVED}")
     tasks, splits = (
         [results.task for results in found.values()],
         {results.split for results in found.values()},
     )
     if len(set(tasks)) != len(tasks) or len(splits) != 1:
-        raise ValueError(f"aggregate: expected different tasks of one split, got {tasks} of {sorted(splits)}")
+        raise InputError(f"aggregate: expected different tasks of one split, got {tasks} of {sorted(splits)}")
     if len(margins := {_margins(results) for results in found.values()}) != 1:
-        raise ValueError(f"aggregate: expected the same margins in all files, got {sorted(margins)}")
+        raise InputError(f"aggregate: expected the same margins in all files, got {sorted(margins)}")
     shared = [
         name
         for name in next(iter(found.values())).methods
         if name != DENSE and all(name in results.methods for results in found.values())
     ]
     if not shared:
-        raise ValueError(f"aggregate: expected a method that all of {tasks} have, got none")
+        raise InputError(f"aggregate: expected a method that all of {tasks} have, got none")
     return AggregateResults(2, tuple(tasks), splits.pop(), {name: _entry(name, found) for name in shared})
 
 
@@ -118,7 +119,7 @@ def _episodes(path: Path, name: str, first: int, n: int) -> list[EpisodeResult]:
     log = path.parent / "episodes" / f"{name}.jsonl"
     found = [episode for episode in read_episodes(log) if first <= episode.seed < first + n]
     if len(found) != n:
-        raise ValueError(
+        raise InputError(
             f"{log}: expected the {n} episodes from seed {first} that {path.name} counts, got {len(found)}"
         )
     return found

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Latency, Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
@@ -123,7 +124,7 @@ def build_results(
             range.
     """
     if DENSE not in runs:
-        raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
+        raise InputError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
     design, uneven = terms.design, any(run.every for run in runs.values())
     return Results(
         SCHEMA,
@@ -190,7 +191,7 @@ def _spent(run: MethodRun) -> dict[str, float]:
 
 def _pair(names: Sequence[str], runs: Mapping[str, MethodRun], terms: Terms) -> PairedEntry:
     if len(names) != 2 or not set(names) <= set(runs):
-        raise ValueError(f"pairs: expected two of {', '.join(runs)}, got {list(names)}")
+        raise InputError(f"pairs: expected two of {', '.join(runs)}, got {list(names)}")
     first, second = (runs[name].episodes for name in names)
     if terms.design.looks > 1:  # methods may have stopped after different numbers of episodes
         shared = {episode.seed for episode in first} & {episode.seed for episode in second}

@@ -14,6 +14,7 @@ import torch
 
 from torchrl_sparse.control.realtime_executor import delay_steps
 from torchrl_sparse.envs.seeds import Split
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.build import Terms, compare_episodes
 from torchrl_sparse.evaluation.results.comparisons import surviving
@@ -127,7 +128,7 @@ def build_realtime(
         ValueError: if the dense policy is missing, methods differ in their delays (their own apart), or seeds differ.
     """
     if DENSE not in runs:
-        raise ValueError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
+        raise InputError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
     dense = runs[DENSE]
     dense_own = dense.episodes[dense.own_delay(control_freq)]
     methods = {}
@@ -136,7 +137,7 @@ def build_realtime(
         for steps, episodes in sorted(run.episodes.items()):
             against = dense_own if steps == own and name != DENSE else dense.episodes.get(steps)
             if against is None:
-                raise ValueError(f"{name}: expected episodes of {DENSE!r} at {steps} steps of delay too")
+                raise InputError(f"{name}: expected episodes of {DENSE!r} at {steps} steps of delay too")
             points.append(
                 _point(name, steps, steps == own, compare_episodes(name, episodes, against, terms), episodes)
             )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchrl_sparse.envs.seeds import Split, evaluation_seeds
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.parts import (
     ActionError,
@@ -193,7 +194,7 @@ def load_results(path: str | os.PathLike) -> Results:
     found = read_json(path, dict[str, Any]).get("schema")
     if type(found) is not int or found != SCHEMA:  # true is 1
         older = "; schema 1 had no times to success: run its benchmark again" if found == 1 else ""
-        raise ValueError(f"{path}: schema: expected {SCHEMA}, got {found!r}{older}")
+        raise InputError(f"{path}: schema: expected {SCHEMA}, got {found!r}{older}")
     return read_json(path, Results)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from tabulate import tabulate
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["LEFT", "markdown_table", "select_columns"]
 
 LEFT = frozenset(
@@ -46,5 +48,5 @@ def select_columns(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) ->
     """
     for row in rows:
         if missing := [column for column in columns if column not in row]:
-            raise ValueError(f"columns: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
+            raise InputError(f"columns: expected some of {' | '.join(row)}, got {' | '.join(missing)}")
     return [{column: row[column] for column in columns} for row in rows]

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.runtime.disk import naming_full_disk
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import MAX_BYTES, describe_differences, parse_json
@@ -102,7 +103,9 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
     """
     queries = sum(episode.queries for episode in episodes)
     if queries == 0:
-        raise ValueError(f"expected at least one query of the policy, got none in {len(episodes)} episodes")
+        raise InputError(
+            f"episodes: expected at least one call of the policy, got none in {len(episodes)} episodes"
+        )
     return Totals(
         flops_per_query=sum(episode.flops_total for episode in episodes) / queries,
         prune_rate=sum(episode.prune_rate * episode.queries for episode in episodes) / queries,
@@ -200,7 +203,7 @@ class EpisodeLog:
             ValueError: if its seed is already in the log.
         """
         if episode.seed in self.episodes:
-            raise ValueError(f"{self.path}: seed {episode.seed} is already in the log")
+            raise InputError(f"{self.path}: seed {episode.seed} is already in the log")
         self._write(_told(episode))
         self.episodes[episode.seed] = episode
 
@@ -217,7 +220,7 @@ class EpisodeLog:
     def _check_identity(self, header: _Header) -> None:
         # Compared as JSON, so that tuples and lists, which the file cannot tell apart, are equal.
         if differing := describe_differences(header.identity, json.loads(json.dumps(self.identity))):
-            raise ValueError(
+            raise InputError(
                 f"{self.path}: holds other episodes: {differing}; choose another out or move it away"
             )
 
@@ -266,7 +269,7 @@ def _content(path: Path) -> bytes:
     with _opened(path) as file:
         content = file.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:
-        raise ValueError(f"{path}: expected at most {MAX_BYTES} bytes unpacked, got more")
+        raise InputError(f"{path}: expected at most {MAX_BYTES} bytes unpacked, got more")
     return content
 
 
@@ -284,6 +287,6 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         try:
             yield file
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-            raise ValueError(
+            raise InputError(
                 f"{path}: expected a whole compressed log, got one that is damaged: {error}"
             ) from error

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.seeds import whole_seed
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.rollouts.collectors import running_collector
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeLog, EpisodeResult
 from torchrl_sparse.runtime.backends import WorkerDied, backend_runtime
@@ -110,9 +111,11 @@ def rollout_episodes(
     """
     seeds = [whole_seed(seed) for seed in seeds]
     if len(set(seeds)) != len(seeds):
-        raise ValueError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
+        raise InputError(f"seeds: expected different ones, got {len(seeds) - len(set(seeds))} repeated")
     if num_envs < 1 or (max_steps is not None and max_steps < 1):
-        raise ValueError(f"expected num_envs >= 1 and max_steps >= 1 or None, got {num_envs}, {max_steps}")
+        raise InputError(
+            f"num_envs, max_steps: expected at least 1, or no max_steps, got {num_envs}, {max_steps}"
+        )
     runtime = backend_runtime(backend, workers)
     log = None
     finished: dict[int, EpisodeResult] = {}

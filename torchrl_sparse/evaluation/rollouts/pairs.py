@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.differences import Difference, TimeDifference
 from torchrl_sparse.evaluation.statistics.durations import restricted_times, time_ratio, time_z
@@ -84,7 +85,7 @@ def pair_episodes(
     ours, theirs = _by_seed(episodes), _by_seed(others)
     if ours.keys() != theirs.keys():
         odd = sorted(ours.keys() ^ theirs.keys())
-        raise ValueError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
+        raise InputError(f"{name}: expected the seeds of {other!r}, got others: {odd[:10]} are in one only")
     return EpisodePairs([*ours.values()], [theirs[seed] for seed in ours])
 
 
@@ -124,5 +125,5 @@ def _scores(episodes: Sequence[EpisodeResult]) -> NDArray[np.float64]:
 def _by_seed(episodes: Sequence[EpisodeResult]) -> dict[int, EpisodeResult]:
     by_seed = {episode.seed: episode for episode in episodes}
     if len(by_seed) != len(episodes):
-        raise ValueError(f"expected one episode per seed, got {len(episodes)} for {len(by_seed)} seeds")
+        raise InputError(f"episodes: expected one per seed, got {len(episodes)} for {len(by_seed)} seeds")
     return by_seed

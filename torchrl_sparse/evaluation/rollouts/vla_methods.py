@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, settings_of
 from torchrl_sparse.networks.fingerprint import full_fingerprint
 from torchrl_sparse.networks.vla.vision import center_crop
@@ -74,8 +75,8 @@ def matching_share(
 
     low, high = most * 2.0**-_HALVINGS, most
     if (least := keeps(low)) > kept:
-        raise ValueError(
-            f"expected a pruner that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
+        raise InputError(
+            f"pruner: expected one that can keep as few as {kept:.1f} visual tokens, got at least {least:.1f}"
         )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2

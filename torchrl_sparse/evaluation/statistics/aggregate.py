@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.statistics.durations import DEFAULT_TIME_MARGIN, one_seed
 from torchrl_sparse.evaluation.statistics.intervals import (
     DEFAULT_MARGIN,
@@ -111,7 +112,7 @@ def aggregate_tasks(
     """
     counts = {name: len(task.solved[0]) for name, task in tasks.items()}
     if len(counts) < 2 or min(counts.values()) < 2:
-        raise ValueError(f"tasks: expected at least two, of at least two pairs each, got {counts}")
+        raise InputError(f"tasks: expected at least two, of at least two pairs each, got {counts}")
     success, times = [], []
     for name, task in tasks.items():
         n, design = counts[name], task.design or Design(counts[name])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["median_ratio_interval"]
 
 _DRAWS = 4000
@@ -27,7 +29,7 @@ def median_ratio_interval(numerator: ArrayLike, denominator: ArrayLike) -> tuple
     """
     top, bottom = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
     if top.shape != bottom.shape or not top.size:
-        raise ValueError(
+        raise InputError(
             f"rounds: expected as many of both, and at least one, got {top.size} and {bottom.size}"
         )
     rounds = _draw(np.random.default_rng(0), len(top))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["Difference", "Interval", "TimeDifference", "Verdict", "check_interval", "require"]
 
 Interval = tuple[float, float]
@@ -69,4 +71,4 @@ def check_interval(interval: Interval) -> None:
 def require(condition: bool, key: str, expected: str, got: Any) -> None:
     """Raise ValueError naming the key unless the condition holds."""
     if not condition:
-        raise ValueError(f"{key}: expected {expected}, got {got!r}")
+        raise InputError(f"{key}: expected {expected}, got {got!r}")

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.statistics.differences import TimeDifference, Verdict
 from torchrl_sparse.evaluation.statistics.intervals import check_level, checked_pairs
 
@@ -57,7 +58,7 @@ def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: in
     """
     for solved, steps in zip(success, length, strict=True):
         if steps > horizon or not (solved or steps == horizon):
-            raise ValueError(
+            raise InputError(
                 f"horizon: expected at most {horizon} steps of an episode, fewer only of solved ones, got {steps}"
             )
     return np.asarray(length, dtype=np.float64)
@@ -150,7 +151,7 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
     ('non-inferior', 'inferior', 'undecided')
     """
     if not 0 < margin < 1:
-        raise ValueError(f"time margin must lie strictly between 0 and 1, got {margin}")
+        raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     low, high = ci
     if high < 1 + margin:
         return "non-inferior"

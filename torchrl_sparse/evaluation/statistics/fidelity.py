@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
@@ -31,7 +32,7 @@ def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
     (0.25, 0.5)
     """
     if chunks.shape != dense_chunks.shape:
-        raise ValueError(f"chunks: expected shape {tuple(dense_chunks.shape)}, got {tuple(chunks.shape)}")
+        raise InputError(f"chunks: expected shape {tuple(dense_chunks.shape)}, got {tuple(chunks.shape)}")
     difference = (chunks - dense_chunks).abs()
     return float(difference.mean()), float(difference.max())
 
@@ -54,7 +55,7 @@ def relative_error(features: Tensor, dense_features: Tensor) -> Tensor:
     """
     if features.shape != dense_features.shape:
         expected, got = tuple(dense_features.shape), tuple(features.shape)
-        raise ValueError(f"features: expected shape {expected}, got {got}")
+        raise InputError(f"features: expected shape {expected}, got {got}")
     dense = dense_features.double().flatten(3)
     difference = features.double().flatten(3) - dense
     norm = dense.norm(dim=-1).clamp_min(torch.finfo(torch.float64).tiny)

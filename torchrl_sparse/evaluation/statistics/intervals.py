@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import bdtr, ndtri
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.statistics.differences import Difference, Verdict
 
 __all__ = [
@@ -52,7 +53,7 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
     """
     check_level(confidence)
     if n < 1 or not 0 <= k <= n:
-        raise ValueError(f"a rate needs 0 <= k <= n and n >= 1, got k={k}, n={n}")
+        raise InputError(f"k: expected 0 <= k <= n and n >= 1, got k={k}, n={n}")
     z = float(ndtri((1 + confidence) / 2))
     centre, half = k + z**2 / 2, z * math.sqrt(k * (n - k) / n + z**2 / 4)
     low, high = (centre - half) / (n + z**2), (centre + half) / (n + z**2)
@@ -76,8 +77,8 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
     """
     check_level(confidence)
     if n < 1 or won < 0 or lost < 0 or won + lost > n:
-        raise ValueError(
-            f"pairs need won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
+        raise InputError(
+            f"pairs: expected won, lost >= 0 and won + lost <= n, n >= 1, got won={won}, lost={lost}, n={n}"
         )
     z2 = float(ndtri((1 + confidence) / 2)) ** 2
     # Where the estimated variance is zero, the equation below also holds at the estimate itself, which is
@@ -134,7 +135,7 @@ def mcnemar_p(won: int, lost: int) -> float:
     (0.0703125, 1.0, 1.0)
     """
     if won < 0 or lost < 0:
-        raise ValueError(f"discordant pairs: expected won, lost >= 0, got won={won}, lost={lost}")
+        raise InputError(f"discordant pairs: expected won, lost >= 0, got won={won}, lost={lost}")
     return min(2 * float(bdtr(min(won, lost), won + lost, 0.5)), 1.0)
 
 
@@ -148,7 +149,7 @@ def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
     ('non-inferior', 'inferior', 'undecided')
     """
     if not 0 < margin < 1:
-        raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
+        raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     low, high = ci
     if low > -margin:
         return "non-inferior"
@@ -197,8 +198,8 @@ def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray
     """Return both as f64 [n], or raise ValueError if they are no pairs."""
     method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
     if method.shape != other.shape or method.ndim != 1 or not len(method):
-        raise ValueError(
-            f"pairs need as many episodes of both, and at least one, got {method.size} and {other.size}"
+        raise InputError(
+            f"pairs: expected as many episodes of both, and at least one, got {method.size} and {other.size}"
         )
     return method, other
 
@@ -211,7 +212,7 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
     """
     check_level(confidence)
     if not 0 < margin < 1:
-        raise ValueError(f"margin must lie strictly between 0 and 1, got {margin}")
+        raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     z2 = float(ndtri((1 + confidence) / 2)) ** 2
     return math.floor(z2 * (1 - margin) / margin) + 1
 
@@ -219,4 +220,4 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
 def check_level(confidence: float) -> None:
     """Raise ValueError unless a level lies strictly between 0 and 1."""
     if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie strictly between 0 and 1, got {confidence}")
+        raise InputError(f"confidence: expected a number strictly between 0 and 1, got {confidence}")

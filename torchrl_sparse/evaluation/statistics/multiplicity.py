@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["ONE_SIDED_ERROR", "holm"]
 
 ONE_SIDED_ERROR = 0.025  # of a verdict, the tail of a 95 % interval
@@ -32,10 +34,10 @@ def holm(
     """
     family = len(p_values) if comparisons is None else comparisons
     if family < len(p_values):
-        raise ValueError(f"comparisons: expected at least {len(p_values)}, got {family}")
+        raise InputError(f"comparisons: expected at least {len(p_values)}, got {family}")
     for name, p in p_values.items():
         if not 0 <= p <= 1:
-            raise ValueError(f"{name}: expected a p-value of 0 to 1, got {p}")
+            raise InputError(f"{name}: expected a p-value of 0 to 1, got {p}")
     survivors: set[str] = set()
     for name, p in sorted(p_values.items(), key=lambda entry: entry[1]):
         if p > error / (family - len(survivors)):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri, stdtr, stdtrit
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.statistics.intervals import checked_pairs
 
 __all__ = ["difference_interval", "difference_z", "mean_interval"]
@@ -29,7 +30,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
     """
     values = np.asarray(values, np.float64)
     if values.ndim != 1 or len(values) < 2:
-        raise ValueError(f"values: expected at least two numbers, got shape {values.shape}")
+        raise InputError(f"values: expected at least two numbers, got shape {values.shape}")
     half, mean = _half_width(values, confidence), float(values.mean())
     if not np.ptp(values):
         return mean, (max(mean - half, 0.0), min(mean + half, 1.0))
@@ -54,7 +55,7 @@ def difference_interval(
     """
     gained = np.subtract(*checked_pairs(method, other))
     if len(gained) < 2:
-        raise ValueError(f"pairs: expected at least two, got {len(gained)}")
+        raise InputError(f"pairs: expected at least two, got {len(gained)}")
     difference, half = float(gained.mean()), _half_width(gained, confidence)
     return difference, (difference - half, difference + half)
 

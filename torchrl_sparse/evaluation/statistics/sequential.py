@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["Design"]
 
 _SHAPE = 0.25  # between Pocock's limits (0.5), which stop early, and O'Brien and Fleming's (0), which lose no power
@@ -55,7 +57,7 @@ class Design:
 
     def __post_init__(self) -> None:
         if not 1 <= self.looks <= self.max_episodes:
-            raise ValueError(f"looks: expected 1 to max_episodes = {self.max_episodes}, got {self.looks}")
+            raise InputError(f"looks: expected 1 to max_episodes = {self.max_episodes}, got {self.looks}")
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
@@ -69,7 +71,7 @@ class Design:
             ValueError: if there is no look after so many episodes.
         """
         if episodes not in self.ends:
-            raise ValueError(f"episodes: expected a look of the design ({self.ends}), got {episodes}")
+            raise InputError(f"episodes: expected a look of the design ({self.ends}), got {episodes}")
         return _constant(self._times) * self._time(episodes) ** (_SHAPE - 0.5)
 
     def confidence(self, episodes: int) -> float:

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from math import log2
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["count_levels", "way_entropy"]
 
 
@@ -26,7 +28,7 @@ def way_entropy(ways: Iterable[int]) -> float:
     """
     counts = Counter(way for way in ways if way >= 0)
     if not (total := counts.total()):
-        raise ValueError("ways: expected at least one episode that showed its way, got none")
+        raise InputError("ways: expected at least one episode that showed its way, got none")
     return sum(count / total * log2(total / count) for count in counts.values())
 
 

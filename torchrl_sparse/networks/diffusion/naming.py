@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.spacing import SPACINGS
 
 __all__ = ["CHAIN_PATTERN", "KINDS", "SamplerName"]
@@ -61,7 +62,7 @@ class SamplerName:
         """Raise ValueError unless ``text`` is written as the module says."""
         match = _NAME.fullmatch(text) if isinstance(text, str) else None
         if match is None:
-            raise ValueError(
+            raise InputError(
                 f"sampler: expected KIND[STEPS][_SPACING][_etaETA] or KIND_T_T...[_etaETA] of kind {', '.join(KINDS)} "
                 f"and spacing {', '.join(SPACINGS)}, got {reprlib.repr(text)}"
             )

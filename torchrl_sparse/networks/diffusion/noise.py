@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
+
 NOISE_STREAM = 2**32
 """Between the seeds of two noises that an episode could have had; no seed of an episode is as large."""
 
@@ -73,7 +75,7 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
 def check_whole(name: Any, tensor: Tensor) -> None:
     """Raise ValueError unless ``tensor`` holds whole numbers: of a fraction, a generator would take another seed."""
     if tensor.dtype not in _WHOLE:
-        raise ValueError(f"{name}: expected whole numbers, got {tensor.dtype}")
+        raise InputError(f"{name}: expected whole numbers, got {tensor.dtype}")
 
 
 def _mix(value: int) -> int:

@@ -18,10 +18,9 @@ fall. DDPM and DDIM equal diffusers' classes to the last bit; the solvers equal 
 diffusers' solvers never clip. The equations are in `torchrl_sparse.networks.diffusion.coefficients` and
 `torchrl_sparse.networks.diffusion.multistep`, the names in `torchrl_sparse.networks.diffusion.naming`.
 
-Two steps are not new: GDP (arXiv:2510.21991) gets by with two network calls for diffusion policies, choosing among a
-population of chains; MIP (arXiv:2512.01809) trains a policy as two steps of regression and finds that supervised steps
-and stochasticity, not the fit of a distribution, are what helps; Hydra-DP3 (arXiv:2605.01581) argues that the denoising
-error of smooth actions saturates after very few steps, and takes two of DDIM.
+Two steps are not new: GDP (arXiv:2510.21991) makes two network calls and chooses among a population of chains. MIP
+(arXiv:2512.01809) trains two steps of regression and finds that supervised steps and stochasticity help. Hydra-DP3
+(arXiv:2605.01581) argues that the denoising error of smooth actions saturates after very few steps, and takes two of DDIM.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import (
     Guide,
     StepCoefficients,
@@ -115,17 +115,17 @@ class Sampler:
         clip_sample_range: float = 1.0,
     ) -> None:
         if kind not in KINDS:
-            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+            raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
         if num_inference_steps is None:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
         check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
         check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
         if not isinstance(eta, Real) or not 0 <= eta <= 1 or (eta and kind != "ddim"):
-            raise ValueError(
+            raise InputError(
                 f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
         if not isinstance(clip_sample_range, Real) or not 0 < clip_sample_range <= _MAX_CLIP:
-            raise ValueError(
+            raise InputError(
                 f"clip_sample_range: expected a number above 0, at most {_MAX_CLIP:g}, got {clip_sample_range!r}"
             )
         alphas_cumprod = squared_cosine(num_train_timesteps)
@@ -135,7 +135,7 @@ class Sampler:
                 spacing, num_inference_steps, alphas_cumprod, without_last=kind in MULTISTEP
             )
         elif spacing != "leading":
-            raise ValueError(f"spacing: expected none beside timesteps, got {spacing!r}")
+            raise InputError(f"spacing: expected none beside timesteps, got {spacing!r}")
         else:
             order = check_timesteps(timesteps, num_inference_steps, num_train_timesteps)
         previous = (*order[1:], -1)
@@ -176,7 +176,7 @@ class Sampler:
         parts = SamplerName.parse(name)
         written, asked = parts.num_inference_steps, num_inference_steps
         if None not in (written, asked) and written != asked:
-            raise ValueError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
+            raise InputError(f"num_inference_steps: expected those of sampler {name!r}, got {asked}")
         options: dict[str, Any] = {"timesteps": parts.timesteps, "eta": parts.eta, "spacing": parts.spacing}
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
@@ -265,11 +265,11 @@ class Sampler:
         if not 0 <= k < self.num_inference_steps:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")
         if noise_k is None and self.coefficients.reads_noise(k):
-            raise ValueError(
-                f"{self.name} step k={k} (timestep {int(self.timesteps[k])}) needs noise_k, got None"
+            raise InputError(
+                f"noise_k: expected noise for step k={k} of {self.name} (timestep {int(self.timesteps[k])}), got None"
             )
         if len(cleans) < (needed := min(k, self.coefficients.history)):
-            raise ValueError(
+            raise InputError(
                 f"cleans: expected {needed} predictions before step k={k} of {self.name}, got {len(cleans)}"
             )
         return self.coefficients.update(k, sample, eps, noise_k, cleans, guide)

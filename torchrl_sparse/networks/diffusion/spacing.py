@@ -30,6 +30,8 @@ from numbers import Integral
 import numpy as np
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["SPACINGS", "check_timesteps", "falls_evenly", "spaced_timesteps", "timesteps_fall"]
 
 SPACINGS = ("leading", "trailing", "linspace", "logsnr")
@@ -65,7 +67,7 @@ def spaced_timesteps(
         ([91, 41], [91, 58, 24])
     """
     if spacing not in SPACINGS:
-        raise ValueError(f"spacing: expected one of {', '.join(SPACINGS)}, got {spacing!r}")
+        raise InputError(f"spacing: expected one of {', '.join(SPACINGS)}, got {spacing!r}")
     num_train, points = len(alphas_cumprod), num_steps + without_last
     rising: np.ndarray
     if spacing == "leading":
@@ -78,7 +80,7 @@ def spaced_timesteps(
         rising = np.arange(first, first - (num_steps - 0.5) * gap, -gap).round()[::-1] - 1
     found = rising[::-1][:num_steps].astype(int).tolist()
     if not timesteps_fall(found, num_train):
-        raise ValueError(
+        raise InputError(
             f"num_inference_steps: expected fewer, {spacing!r} has no {num_steps} falling timesteps of {num_train} here"
         )
     if num_train > 1 and (amplitude := alphas_cumprod[found[0]].item() ** 0.5) > _FAR_FROM_NOISE:
@@ -105,7 +107,7 @@ def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timestep
     chosen = list(timesteps)
     whole = all(isinstance(timestep, Integral) for timestep in chosen)
     if not whole or not timesteps_fall(chosen, num_train_timesteps) or len(chosen) != num_steps:
-        raise ValueError(
+        raise InputError(
             f"timesteps: expected {num_steps} (num_inference_steps) whole numbers that fall from at most "
             f"{num_train_timesteps - 1} to at least 0, got {reprlib.repr(chosen)}"
         )

@@ -19,6 +19,7 @@ from operator import attrgetter
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion"]
@@ -44,7 +45,7 @@ class SinusoidalPosEmb(nn.Module):
     def __init__(self, dim: int) -> None:
         super().__init__()
         if dim < 4 or dim % 2:
-            raise ValueError(f"dim must be an even number of at least 4, got {dim}")
+            raise InputError(f"dim: expected an even number of at least 4, got {dim}")
         self.dim = dim
 
     def forward(self, timestep: Tensor) -> Tensor:
@@ -194,8 +195,8 @@ class TransformerForDiffusion(nn.Module):
         self._check("cond", cond, (self.n_obs_steps, self.cond_dim))
         timestep = torch.as_tensor(timestep, device=cond.device)
         if timestep.shape not in ((), (1,), (cond.shape[0],)):
-            raise ValueError(
-                f"timestep must be a number or have shape [{cond.shape[0]}], got {list(timestep.shape)}"
+            raise InputError(
+                f"timestep: expected a number or shape [{cond.shape[0]}], got {list(timestep.shape)}"
             )
         time_token = self.time_emb(timestep.expand(cond.shape[0])).to(cond.dtype)[:, None]
         tokens = torch.cat((time_token, self.cond_obs_emb(cond)), dim=1)
@@ -252,8 +253,8 @@ class TransformerForDiffusion(nn.Module):
     @staticmethod
     def _check(name: str, value: Tensor, trailing: tuple[int, int]) -> None:
         if value.ndim != 3 or tuple(value.shape[1:]) != trailing:
-            raise ValueError(
-                f"{name} must have shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
+            raise InputError(
+                f"{name}: expected shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
             )
 
 
@@ -275,8 +276,6 @@ def _check_config(config: dict) -> None:
     check_size("n_layer", config["n_layer"], MAX_LAYERS)
     check_size("n_cond_layers", config["n_cond_layers"], MAX_LAYERS, least=0)
     if not isinstance(config["causal_attn"], bool):
-        raise ValueError(f"causal_attn: expected true or false, got {config['causal_attn']!r}")
+        raise InputError(f"causal_attn: expected true or false, got {config['causal_attn']!r}")
     if config["n_emb"] % config["n_head"]:
-        raise ValueError(
-            f"n_emb must be a multiple of n_head, got n_emb={config['n_emb']}, n_head={config['n_head']}"
-        )
+        raise InputError(f"n_emb: expected a multiple of n_head={config['n_head']}, got {config['n_emb']}")

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["CameraEncoder", "VisionEncoder", "crop_centre", "crop_random", "spatial_softmax"]
@@ -160,7 +161,7 @@ class VisionEncoder(nn.Module):
     def _encode(self, name: str, images: Tensor) -> Tensor:
         shape = (3, *self.image_size)
         if images.dtype != torch.uint8 or tuple(images.shape[-3:]) != shape:
-            raise ValueError(
+            raise InputError(
                 f"image {name!r}: expected uint8 [*B, {', '.join(map(str, shape))}], "
                 f"got {str(images.dtype).removeprefix('torch.')} {list(images.shape)}"
             )
@@ -199,22 +200,22 @@ def _group_norm(channels: int) -> nn.GroupNorm:
 def _check(cameras: list[str], image_size: list[int], crop_size: list[int], width: int) -> None:
     named = all(isinstance(name, str) and name and "." not in name for name in cameras)  # as modules are
     if not named or not 1 <= len(set(cameras)) == len(cameras) <= _MAX_CAMERAS:
-        raise ValueError(
+        raise InputError(
             f"cameras: expected different names, 1 to {_MAX_CAMERAS} of them, got {reprlib.repr(cameras)}"
         )
     for size in (*image_size, *crop_size):
         check_size("image_size, crop_size", size, _MAX_PIXELS)
     if min(crop_size, default=0) <= _STRIDE:
-        raise ValueError(
+        raise InputError(
             f"crop_size: expected more than {_STRIDE} pixels, which make a map of more than one place, got {crop_size}"
         )
     fits = len(image_size) == len(crop_size) == 2 and all(
         part <= whole for part, whole in zip(crop_size, image_size, strict=True)
     )
     if not fits:
-        raise ValueError(
+        raise InputError(
             f"crop_size: expected height and width within image_size {image_size}, got {crop_size}"
         )
     check_size("width", width, _MAX_WIDTH)
     if width % _CHANNELS_PER_GROUP:
-        raise ValueError(f"width: expected a multiple of {_CHANNELS_PER_GROUP}, got {width}")
+        raise InputError(f"width: expected a multiple of {_CHANNELS_PER_GROUP}, got {width}")

@@ -12,6 +12,7 @@ from typing import Any
 from tensordict import NestedKey
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 
@@ -54,7 +55,7 @@ class TransformerSize:
             check_size(name, getattr(self, name), _MAX_SIZE)
         check_size("layers", self.layers, _MAX_LAYERS)
         if self.dim % (2 * self.heads):
-            raise ValueError(
+            raise InputError(
                 f"dim: expected a multiple of 2 * heads = {2 * self.heads} (rotary embeddings), got {self.dim}"
             )
 
@@ -114,34 +115,34 @@ class VLAConfig:
             check_size(name, getattr(self, name), _MAX_PIXELS)
         check_size("chunk_size", self.chunk_size, _MAX_CHUNK)
         if self.image_size % self.patch_size:
-            raise ValueError(
+            raise InputError(
                 f"image_size: expected a multiple of patch_size={self.patch_size}, got {self.image_size}"
             )
         if min(self.dino.layers, self.siglip.layers) < 2:
-            raise ValueError(
-                f"expected towers of at least 2 layers, got dino {self.dino.layers}, siglip {self.siglip.layers}"
+            raise InputError(
+                f"dino, siglip: expected towers of at least 2 layers, got {self.dino.layers} and {self.siglip.layers}"
             )
         if self.dino.mlp % self.dino.dim:
-            raise ValueError(
+            raise InputError(
                 f"dino.mlp: expected a multiple of dino.dim={self.dino.dim}, got {self.dino.mlp}"
             )
         if not 1 <= len(self.cameras) <= 2 or not all(map(_is_key, self.cameras)):
-            raise ValueError(f"cameras: expected one or two keys, got {reprlib.repr(list(self.cameras))}")
+            raise InputError(f"cameras: expected one or two keys, got {reprlib.repr(list(self.cameras))}")
         if type(self.crop_area) not in (int, float) or not 0 < self.crop_area <= 1:
-            raise ValueError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
+            raise InputError(f"crop_area: expected a share in (0, 1], got {self.crop_area}")
         self._check_decoder()
 
     def _check_decoder(self) -> None:
         if self.kv_heads is not None:
             check_size("kv_heads", self.kv_heads, _MAX_SIZE)
             if self.llm.heads % self.kv_heads:
-                raise ValueError(
+                raise InputError(
                     f"kv_heads: expected a divisor of llm.heads={self.llm.heads}, got {self.kv_heads}"
                 )
         for name in ("rope_base", "norm_eps"):
             value = getattr(self, name)
             if type(value) not in (int, float) or not 0 < value < math.inf:
-                raise ValueError(f"{name}: expected a positive number, got {value}")
+                raise InputError(f"{name}: expected a positive number, got {value}")
 
     @classmethod
     def tiny(cls, **changes: Any) -> VLAConfig:
@@ -199,10 +200,10 @@ class VLAConfig:
         names = {field.name for field in dataclasses.fields(cls)}
         if not isinstance(fields, Mapping) or not names - _ADDED.keys() <= set(fields) <= names:
             found = sorted(fields) if isinstance(fields, Mapping) else type(fields).__name__
-            raise ValueError(f"expected the fields {sorted(names)}, got {found}")
+            raise InputError(f"expected the fields {sorted(names)}, got {found}")
         towers = {name: _size(name, fields[name]) for name in ("dino", "siglip", "llm")}
         if not isinstance(fields["cameras"], list):
-            raise ValueError(f"cameras: expected a list of keys, got {reprlib.repr(fields['cameras'])}")
+            raise InputError(f"cameras: expected a list of keys, got {reprlib.repr(fields['cameras'])}")
         cameras = tuple(tuple(key) if isinstance(key, list) else key for key in fields["cameras"])
         return cls(**{**fields, **towers, "cameras": cameras})
 
@@ -211,4 +212,4 @@ def _size(name: str, fields: Any) -> TransformerSize:
     try:
         return TransformerSize(**fields)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise InputError(f"{name}: {error}") from error

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.normalize import MIN_RANGE
 
 __all__ = ["QuantileNormalizer"]
@@ -48,7 +49,7 @@ class QuantileNormalizer(nn.Module):
         _check_range("state", state_low, state_high)
         _check_range("action", action_low, action_high)
         if gripper.dtype != torch.bool or gripper.shape != action_low.shape:
-            raise ValueError(
+            raise InputError(
                 f"gripper: expected bool {list(action_low.shape)}, got {gripper.dtype} {list(gripper.shape)}"
             )
         self.register_buffer("state_low", state_low.float().clone())
@@ -111,10 +112,10 @@ def _to_unit(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 def _check_range(name: str, low: Tensor, high: Tensor) -> None:
     if low.ndim != 1 or low.shape != high.shape:
-        raise ValueError(
+        raise InputError(
             f"{name}: expected two vectors of one size, got {list(low.shape)} and {list(high.shape)}"
         )
     if not (low.isfinite().all() and high.isfinite().all() and (low <= high).all()):
-        raise ValueError(
+        raise InputError(
             f"{name}: expected finite quantiles with low <= high, got {low.tolist()}, {high.tolist()}"
         )

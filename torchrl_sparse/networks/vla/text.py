@@ -12,6 +12,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["BOS_ID", "STOP_ID", "InstructionTokenizer", "LlamaTokenizer", "Prompts", "WordTokenizer"]
 
 BOS_ID, STOP_ID = 1, 2
@@ -110,7 +112,7 @@ class LlamaTokenizer:
         except (
             BaseException
         ) as error:  # the Rust library raises plain Exceptions, and panics that are not even those
-            raise ValueError(f"expected the text of a tokenizer.json, got: {error}") from error
+            raise InputError(f"expected the text of a tokenizer.json, got: {error}") from error
         # Prompts are padded here; what a file asks for could be any length.
         self._tokenizer.no_padding()
         self._tokenizer.no_truncation()
@@ -131,7 +133,7 @@ class LlamaTokenizer:
         try:
             return cls(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
+            raise InputError(f"{path}: {error}") from error
 
     def encode(self, instructions: Sequence[str]) -> Prompts:
         """Return the prompts of ``instructions``, in lower case, as OpenVLA was trained on them."""
@@ -167,7 +169,7 @@ def tokenizer_from_config(config: Any) -> InstructionTokenizer:
             return LlamaTokenizer(json.dumps(definition))
         case {"kind": "llama", "definition": dict(definition), "closing": None, **rest} if not rest:
             return LlamaTokenizer(json.dumps(definition), closing=None)
-    raise ValueError(f"tokenizer: expected kind 'words' or 'llama' and its field, got {str(config)[:80]}")
+    raise InputError(f"tokenizer: expected kind 'words' or 'llama' and its field, got {str(config)[:80]}")
 
 
 def _are_words(values: list[Any]) -> bool:

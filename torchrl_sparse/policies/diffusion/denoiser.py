@@ -13,6 +13,7 @@ from torchrl_sparse.blocks.engine.factory import EngineName, EngineSlot, check_e
 from torchrl_sparse.blocks.engine.reference import denoise
 from torchrl_sparse.blocks.mask import NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.blocks.planner import Planner
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.philox import philox_noise
@@ -30,7 +31,7 @@ NOISES = {"torch": sample_noise, "philox": philox_noise}
 def check_noise(name: str) -> str:
     """Return ``name``, or raise ValueError unless it is in :data:`NOISES`."""
     if name not in NOISES:
-        raise ValueError(f"noise: expected one of {list(NOISES)}, got {name!r}")
+        raise InputError(f"noise: expected one of {list(NOISES)}, got {name!r}")
     return name
 
 
@@ -143,7 +144,7 @@ class ActionDenoiser(TensorDictModuleBase):
         if steps is None or start is None or numbers in ([], [whole]):
             return self.run(noise, cond, mask, self.reuse, None, guide), mask_flops(sizes, mask)
         if not 1 <= numbers[0] <= numbers[-1] <= whole:
-            raise ValueError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
+            raise InputError(f"{keys.NUM_STEPS}: expected 1 to {whole} steps, got {numbers}")
         actions, flops = torch.empty_like(noise[:, 0]), cond.new_empty(len(cond))
         for number in numbers:
             rows = steps == number

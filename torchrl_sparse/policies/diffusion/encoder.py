@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -99,7 +100,7 @@ class ObservationEncoder(TensorDictModuleBase):
         features = 0 if vision is None else vision.feature_dim
         state = len(normalizer.state_scale)
         if features + state != network.cond_dim:
-            raise ValueError(
+            raise InputError(
                 f"network: expected cond_dim {features + state} (image features {features}, state {state}), "
                 f"got {network.cond_dim}"
             )
@@ -127,17 +128,17 @@ class ObservationEncoder(TensorDictModuleBase):
 
     def _check(self, state: Tensor) -> None:
         if tuple(state.shape[-2:]) != self.state_shape:
-            raise ValueError(
+            raise InputError(
                 f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self.state_shape[0]}, "
                 f"{self.state_shape[1]}], got {list(state.shape)}"
             )
         if state.is_meta or state.is_complex() or state.layout != torch.strided:
-            raise ValueError(
+            raise InputError(
                 f"{keys.HISTORY_STATE}: expected real numbers in memory, got {state.dtype} {state.layout} on {state.device}"
             )
         if not state.isfinite().all():
             bad = (~state.isfinite()).nonzero()[0].tolist()
-            raise ValueError(
+            raise InputError(
                 f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
             )
 

@@ -19,6 +19,7 @@ from torchrl_sparse.blocks.engine.native.tsp import ExportedPlan, write_tsp
 from torchrl_sparse.blocks.mask import num_buffers
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.blocks.sag.planner import SAGPruner
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
@@ -58,16 +59,16 @@ def export_policy(
     """
     network, normalizer, sampler = denoise.network, denoise.normalizer, denoise.sampler
     if (vision := encode.condition.vision) is not None:
-        raise ValueError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
+        raise InputError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
     if start.name:
-        raise ValueError(f"start: expected queries that begin from noise, got {start.name}")
+        raise InputError(f"start: expected queries that begin from noise, got {start.name}")
     supported, reason = native_supports(network)
     if not supported:
-        raise ValueError(f"export: {reason}")
+        raise InputError(f"export: {reason}")
     if weights == "int8":
-        raise ValueError("weights: expected one of ['float32', 'float16', 'bfloat16'] in a file, got 'int8'")
+        raise InputError("weights: expected one of ['float32', 'float16', 'bfloat16'] in a file, got 'int8'")
     if network.horizon < network.n_obs_steps:
-        raise ValueError(
+        raise InputError(
             f"export: expected horizon >= n_obs_steps, got {network.horizon} and {network.n_obs_steps}"
         )
     with torch.no_grad():
@@ -91,11 +92,11 @@ def _exported_plan(plan: Planner, network: TransformerForDiffusion) -> ExportedP
         mask = plan.masks(torch.zeros(1, network.n_obs_steps, network.cond_dim))[0]
         return ExportedPlan(slots, mask if mask.any() else None)
     if not isinstance(plan, SAGPruner):
-        raise ValueError(
+        raise InputError(
             f"plan: expected one that does not look at the observation, or a SAGPruner, got {type(plan).__name__}"
         )
     if plan.network.fuse_obs.out_features > MAX_HIDDEN:
-        raise ValueError(
+        raise InputError(
             f"plan: expected at most {MAX_HIDDEN} hidden activations, got {plan.network.fuse_obs.out_features}"
         )
     rate = plan.rate if plan.network.rate_input else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 
 __all__ = ["check_kinds", "check_trained"]
@@ -18,20 +19,20 @@ def check_kinds(**parts: tuple[Any, type]) -> None:
     >>> check_kinds(plan=("bac", dict))
     Traceback (most recent call last):
     ...
-    ValueError: plan: expected a dict, got str 'bac'
+    torchrl_sparse.errors.InputError: plan: expected a dict, got str 'bac'
     """
     for name, (part, kind) in parts.items():
         if not isinstance(part, kind):
             got = (
                 f"the class {part.__name__}" if isinstance(part, type) else f"{type(part).__name__} {part!r}"
             )
-            raise ValueError(f"{name}: expected a {kind.__name__}, got {got}")
+            raise InputError(f"{name}: expected a {kind.__name__}, got {got}")
 
 
 def check_trained(sampler: Sampler, own: Sampler) -> None:
     """Raise ValueError unless ``sampler`` is one of the network that the policy's ``own`` is of, see `Sampler.trained`."""
     if sampler.trained != own.trained:
-        raise ValueError(
+        raise InputError(
             f"sampler: expected {own.trained}, with which the policy was trained, got {sampler.trained}; "
             "policy.sampler.variant(...) makes one that fits"
         )

@@ -22,6 +22,7 @@ from torchrl_sparse.blocks.engine.factory import EngineName
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
 from torchrl_sparse.blocks.saved import load_planner, save_beside
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -65,8 +66,7 @@ class DiffusionPolicy(FreezablePolicy):
     Attributes:
         plan: the planner. Assign another to change the method, or None for the dense policy, which then reads as `Dense`.
         sampler: the sampler. Assign another of the same training steps to change it: ``policy.sampler = Sampler("ddim", 10)``.
-        start: what queries begin from: noise, the last chunk after ``policy.start = WarmStart(1)``, or noise that is drawn to
-            the last chunk after ``policy.start = RealtimeChunking()``.
+        start: what calls begin from: noise, the last chunk (`WarmStart`), or noise guided toward it (`RealtimeChunking`).
         source: where an imported policy comes from and how to feed it, see `StoredPolicy`; else empty.
 
     Examples:
@@ -234,7 +234,7 @@ class DiffusionPolicy(FreezablePolicy):
             latency = torch.zeros(*tensordict.batch_size, 1, device=device)
             tensordict = super().forward(tensordict)
         except MaskError as error:
-            raise ValueError(f"{type(self.plan).__name__}: {error}") from error
+            raise InputError(f"{type(self.plan).__name__}: {error}") from error
         return tensordict.set(keys.LATENCY, latency.fill_(synchronised_clock(device) - start))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:

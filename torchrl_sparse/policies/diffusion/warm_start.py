@@ -30,6 +30,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
@@ -107,7 +108,7 @@ class WarmStart(ColdStart):
     def __init__(self, num_steps: int) -> None:
         super().__init__()
         if num_steps < 1:
-            raise ValueError(f"num_steps: expected at least 1, got {num_steps}")
+            raise InputError(f"num_steps: expected at least 1, got {num_steps}")
         self.num_steps = num_steps
 
     @property
@@ -116,7 +117,7 @@ class WarmStart(ColdStart):
 
     def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
         if self.num_steps >= sampler.num_inference_steps:
-            raise ValueError(
+            raise InputError(
                 f"num_steps: expected fewer than the sampler's {sampler.num_inference_steps}, got {self.num_steps}"
             )
         self._parts = network, normalizer, sampler  # in a tuple: they stay modules of the policy alone
@@ -145,5 +146,5 @@ def stored_start(start: ColdStart) -> int | None:
     (2, None)
     """
     if type(start) not in (ColdStart, WarmStart):
-        raise ValueError(f"start: expected None or a WarmStart, to save it, got {type(start).__name__}")
+        raise InputError(f"start: expected None or a WarmStart, to save it, got {type(start).__name__}")
     return start.num_steps if isinstance(start, WarmStart) else None

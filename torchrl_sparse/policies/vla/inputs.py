@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 
 __all__ = ["read_images", "read_instructions", "read_keep_mask", "read_state"]
 
@@ -38,7 +39,7 @@ def read_state(td: TensorDictBase, key: NestedKey, size: int) -> Tensor:
     _check(key, state, torch.float32, (size,))
     if not state.isfinite().all():
         row = state[~state.isfinite().all(1)][0].tolist()
-        raise ValueError(f"{key}: expected finite numbers, got {row}")
+        raise InputError(f"{key}: expected finite numbers, got {row}")
     return state
 
 
@@ -77,6 +78,6 @@ def _texts(value: Any) -> list:
 
 def _check(key: NestedKey, value: Tensor, dtype: torch.dtype, shape: tuple[int, ...]) -> None:
     if value.dtype != dtype or tuple(value.shape[1:]) != shape:
-        raise ValueError(
+        raise InputError(
             f"{key}: expected {dtype} [*B, {', '.join(map(str, shape))}], got {value.dtype} {list(value.shape)}"
         )

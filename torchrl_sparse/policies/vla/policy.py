@@ -14,6 +14,7 @@ from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import dense
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.decoder import Decoded
@@ -49,8 +50,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     Attributes:
         source: what it was trained for.
         base: the language model whose adapters are trained; None where there are none.
-        pruner: the `TokenPruner`. Assign another to change the method, ``policy.pruner = pruner``, or None for the dense
-            policy.
+        pruner: the `TokenPruner`. Assign another to change the method, or None for the dense policy.
 
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
@@ -90,7 +90,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         )
         self.tokenizer = WordTokenizer(()) if tokenizer is None else tokenizer
         if self.tokenizer.vocab_size > config.vocab_size:
-            raise ValueError(
+            raise InputError(
                 f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
             )
         self.pruner, self.source = None, VLASource()
@@ -164,7 +164,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         """Return what a query reads, [B]."""
         rows = tensordict.batch_size.numel()
         if not rows:
-            raise ValueError(
+            raise InputError(
                 f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
             )
         return dense(tensordict.select(*self.in_keys, strict=False), self).reshape(rows)
@@ -243,7 +243,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         """
         ours = {name: given for name, given in (("base", base), ("config", config)) if given is not None}
         if unread := ours if (released := is_openvla_oft(path)) else published:
-            raise ValueError(f"{', '.join(unread)}: expected none for {path}, whose own files tell")
+            raise InputError(f"{', '.join(unread)}: expected none for {path}, whose own files tell")
         if released:
             return cls.from_openvla_oft(path, **published)
         stored = read_vla(Path(path), config, None if base is None else Path(base))

@@ -10,6 +10,7 @@ import re
 from functools import partial
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.published.inert_pickle import PLAIN, Name, Record
 
 __all__ = ["KNOWN_NAMES", "PublishedConfig"]
@@ -57,7 +58,7 @@ class PublishedConfig:
         self._tree = _plain(tree, {}, _MAX_DEPTH)
         self._found: dict[str, Any] = {}
         if not isinstance(self._tree, dict):
-            raise ValueError(f"cfg: expected a configuration, got {type(tree).__name__}")
+            raise InputError(f"cfg: expected a configuration, got {type(tree).__name__}")
 
     def get(self, path: str, kind: type, default: Any = _REQUIRED) -> Any:
         """Return the entry at ``path``, references followed.
@@ -73,17 +74,17 @@ class PublishedConfig:
         value = self._find(path, _MAX_DEPTH)
         if value is None:
             if default is _REQUIRED:
-                raise ValueError(f"cfg: expected an entry {path}, got none")
+                raise InputError(f"cfg: expected an entry {path}, got none")
             return default
         if isinstance(value, str) and "${" in value:
-            raise ValueError(
+            raise InputError(
                 f"cfg: {path}: expected a value, got the expression {value[:80]!r}: none is evaluated"
             )
         if isinstance(value, str) and len(value) > _MAX_TEXT:
-            raise ValueError(f"cfg: {path}: expected at most {_MAX_TEXT} characters, got {len(value)}")
+            raise InputError(f"cfg: {path}: expected at most {_MAX_TEXT} characters, got {len(value)}")
         accepted = (int, float) if kind is float else kind
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"cfg: {path}: expected {kind.__name__}, got {type(value).__name__}")
+            raise InputError(f"cfg: {path}: expected {kind.__name__}, got {type(value).__name__}")
         return value
 
     def names(self, path: str) -> list[str] | None:
@@ -97,7 +98,7 @@ class PublishedConfig:
             return None
         plain = isinstance(found, (list, dict)) and len(found) <= _MAX_NAMES and all(map(_is_name, found))
         if not plain:
-            raise ValueError(f"cfg: {path}: expected at most {_MAX_NAMES} names, got {type(found).__name__}")
+            raise InputError(f"cfg: {path}: expected at most {_MAX_NAMES} names, got {type(found).__name__}")
         return list(found)
 
     def literal(self, path: str, kind: type) -> Any:
@@ -112,7 +113,7 @@ class PublishedConfig:
     def _find(self, path: str, depth: int) -> Any:
         """Return the entry at ``path``; what was found is kept, or references to references would multiply."""
         if path.count(".") > _MAX_DEPTH:
-            raise ValueError(f"cfg: {path[:80]}: expected a path of at most {_MAX_DEPTH} levels")
+            raise InputError(f"cfg: {path[:80]}: expected a path of at most {_MAX_DEPTH} levels")
         if path not in self._found:
             node: Any = self._tree
             for key in path.split("."):
@@ -125,7 +126,7 @@ class PublishedConfig:
         if reference is None:
             return node
         if depth == 0:
-            raise ValueError(f"cfg: {path}: expected a value, got references that go round in a circle")
+            raise InputError(f"cfg: {path}: expected a value, got references that go round in a circle")
         return self._find(reference.group(1), depth - 1)
 
 
@@ -136,7 +137,7 @@ def _is_name(value: Any) -> bool:
 def _plain(node: Any, done: dict[int, Any], depth: int) -> Any:
     """Unfold dicts, lists and values; ``done`` keeps a node that is mentioned many times from being unfolded each time."""
     if depth == 0:
-        raise ValueError(f"cfg: expected a configuration of at most {_MAX_DEPTH} levels")
+        raise InputError(f"cfg: expected a configuration of at most {_MAX_DEPTH} levels")
     if id(node) not in done:
         if isinstance(node, Record):
             inner = _content(node)
@@ -148,7 +149,7 @@ def _plain(node: Any, done: dict[int, Any], depth: int) -> Any:
         elif isinstance(node, (str, int, float, type(None))):
             return node
         else:
-            raise ValueError(f"cfg: expected plain values, got {type(node).__name__}")
+            raise InputError(f"cfg: expected plain values, got {type(node).__name__}")
     return done[id(node)]
 
 
@@ -159,5 +160,5 @@ def _content(record: Record) -> Any:
     content = record.state.get("_content")
     # A container can also be None or, as a whole, a reference.
     if kind is None or not isinstance(content, (kind, str, type(None))):
-        raise ValueError(f"cfg: expected containers and values of OmegaConf, got {record.name}")
+        raise InputError(f"cfg: expected containers and values of OmegaConf, got {record.name}")
     return content

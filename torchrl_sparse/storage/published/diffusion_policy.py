@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
@@ -59,7 +60,7 @@ def _read(archive: TorchArchive, ignore: frozenset[str]) -> StoredPolicy:
     config = PublishedConfig(payload.get("cfg"))
     kind = config.get("policy._target_", str).rpartition(".")[2]
     if kind not in _READERS:
-        raise ValueError(f"cfg: policy._target_: expected one of {sorted(_READERS)}, got {kind}")
+        raise InputError(f"cfg: policy._target_: expected one of {sorted(_READERS)}, got {kind}")
     check_policy_entries(config, cameras=kind == _IMAGES, ignore=ignore)
     state_keys, abs_action = check_task_entries(config, ignore)
     weights, tensors = _weights(config, payload)
@@ -85,7 +86,7 @@ def _read_low_dim(
 ) -> _Parts:
     target = config.get("policy.model._target_", str)
     if target.rpartition(".")[2] != "TransformerForDiffusion":
-        raise ValueError(f"cfg: policy.model._target_: expected TransformerForDiffusion, got {target}")
+        raise InputError(f"cfg: policy.model._target_: expected TransformerForDiffusion, got {target}")
     network = read_network(archive, config, "policy.model", take(tensors, "model."))
     entries = take(tensors, "normalizer.params_dict.")
     normalizer = Normalizer(
@@ -103,7 +104,7 @@ def _read_images(
     network = read_network(archive, config, "policy", take(tensors, "model."))
     vision = read_vision(archive, config, layout, take(tensors, "obs_encoder.obs_nets."))
     if layout.features != network.cond_dim:
-        raise ValueError(
+        raise InputError(
             f"cfg: shape_meta has {layout.features} features, the tensors say {network.cond_dim}"
         )
     with torch.no_grad():
@@ -112,7 +113,7 @@ def _read_images(
     for key in layout.cameras.values():
         scale, offset = read_affine(archive, entries, key, 1)
         if (scale.item(), offset.item()) != (2.0, -1.0):
-            raise ValueError(
+            raise InputError(
                 f"normalizer: {key}: expected scale 2, offset -1, got {scale.item()}, {offset.item()}"
             )
     states = [read_affine(archive, entries, key, size) for key, size in layout.states.items()]
@@ -132,7 +133,7 @@ def _executed_steps(config: PublishedConfig) -> int:
     steps = config.get("n_action_steps", int)
     for place in ("policy.n_action_steps", "task.env_runner.n_action_steps"):
         if (said := config.literal(place, int)) not in (None, steps):
-            raise ValueError(f"cfg: {place}: expected {steps}, as n_action_steps, got {said}")
+            raise InputError(f"cfg: {place}: expected {steps}, as n_action_steps, got {said}")
     return steps
 
 
@@ -150,7 +151,7 @@ def _epoch(payload: Mapping) -> int | None:
     data = _mapping("pickles", payload.get("pickles", {})).get("epoch")
     epoch = read_pickle(data) if isinstance(data, bytes) else data
     if epoch is not None and type(epoch) is not int:
-        raise ValueError(f"pickles: epoch: expected a whole number, got {type(epoch).__name__}")
+        raise InputError(f"pickles: epoch: expected a whole number, got {type(epoch).__name__}")
     return epoch
 
 
@@ -160,23 +161,23 @@ def _weights(config: PublishedConfig, payload: Mapping) -> tuple[str, dict[str, 
     averaged = config.get("training.use_ema", bool, "ema_model" in states)
     name = "ema_model" if averaged else "model"
     if name not in states:
-        raise ValueError(
+        raise InputError(
             f"state_dicts: expected {name}, since cfg.training.use_ema is {str(averaged).lower()}, got {sorted(states)}"
         )
     tensors = dict(_mapping(f"state_dicts: {name}", states[name]))
     for key, value in tensors.items():
         if not isinstance(key, str) or not isinstance(value, StoredTensor):
-            raise ValueError(f"state_dicts: {name}: {key}: expected a tensor, got {type(value).__name__}")
+            raise InputError(f"state_dicts: {name}: {key}: expected a tensor, got {type(value).__name__}")
     tensors = {key: value for key, value in tensors.items() if not key.endswith("_dummy_variable")}
     return name, without_wrappers(f"state_dicts: {name}", tensors)
 
 
 def _mapping(where: str, value: Any) -> Mapping:
     if not isinstance(value, dict):
-        raise ValueError(f"{where}: expected a dict, got {type(value).__name__}")
+        raise InputError(f"{where}: expected a dict, got {type(value).__name__}")
     return value
 
 
 def _nothing_left(tensors: Mapping[str, StoredTensor]) -> None:
     if tensors:
-        raise ValueError(f"expected no further tensors, got {sorted(tensors)[:5]}")
+        raise InputError(f"expected no further tensors, got {sorted(tensors)[:5]}")

@@ -13,6 +13,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.published.config import PublishedConfig
 
 __all__ = ["Section", "check_policy_entries", "check_sizes", "check_task_entries"]
@@ -42,12 +43,12 @@ class Section:
         for name in config.names(path) or ():
             place = f"{path}.{name}"
             if name not in read | self.unused | _HYDRA and place not in ignore:
-                raise ValueError(
+                raise InputError(
                     f"cfg: {place}: expected no entry of this name, whose effect is not known here; "
                     f"import with ignore=[{place!r}] if the policy does not depend on it"
                 )
             if name in read - self.nullable and config.value(place) is None:
-                raise ValueError(f"cfg: {place}: expected a value, got null")
+                raise InputError(f"cfg: {place}: expected a value, got null")
         for name, (default, supported) in self.fixed.items():
             check_value(config, f"{path}.{name}", default, supported)
 
@@ -56,7 +57,7 @@ def check_value(config: PublishedConfig, path: str, default: Any, supported: Any
     """Raise ValueError unless the entry at ``path``, or the ``default`` where there is none, is ``supported``."""
     found = config.value(path) if supported is None else config.get(path, type(supported), default)
     if found != supported:
-        raise ValueError(f"cfg: {path}: expected {_written(supported)}, got {_written(found)}")
+        raise InputError(f"cfg: {path}: expected {_written(supported)}, got {_written(found)}")
 
 
 def _written(value: Any) -> str:
@@ -201,7 +202,7 @@ def _agreed(said: Mapping[str, Any]) -> Any:
     first = next(iter(said))
     for place, value in said.items():
         if value != said[first]:
-            raise ValueError(
+            raise InputError(
                 f"cfg: {place}: expected {_written(said[first])}, as {first}, got {_written(value)}"
             )
     return said[first]
@@ -225,4 +226,4 @@ def check_sizes(config: PublishedConfig, section: str, sizes: Any, *, cameras: b
                 continue
             said, found = config.literal(place + name, int), getattr(sizes, attribute)
             if said is not None and said != found:
-                raise ValueError(f"cfg: {place}{name} is {said}, the tensors say {found}")
+                raise InputError(f"cfg: {place}{name} is {said}, the tensors say {found}")

@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["CheckpointError", "naming_faults"]
 
 _MAX_TEXT = 600
 
 
-class CheckpointError(ValueError):
+class CheckpointError(InputError):
     """A file is no checkpoint that can be read; the message names the file, what was expected and what came."""
 
 

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["PLAIN", "Name", "Record", "read_pickle"]
 
 _KEYS = (str, int, float, bytes, type(None))
@@ -37,7 +39,7 @@ class Record:
 def _encode(text: str, encoding: str) -> bytes:
     """Decode bytes as protocol 2 spells them."""
     if encoding != "latin1":
-        raise ValueError(f"expected bytes spelled in latin1, got {encoding!r}")
+        raise InputError(f"expected bytes spelled in latin1, got {encoding!r}")
     return text.encode("latin1")
 
 
@@ -73,20 +75,20 @@ def read_pickle(
         >>> read_pickle(pickle.dumps(print))
         Traceback (most recent call last):
             ...
-        ValueError: expected plain data, got a pickle that asks for builtins.print
+        torchrl_sparse.errors.InputError: expected plain data, got a pickle that asks for builtins.print
     """
     machine = _Machine(known, persistent, len(data))
     try:
         for number, operation in enumerate(_operations(data)):
             if number == _MAX_OPERATIONS:
-                raise ValueError(
+                raise InputError(
                     f"expected a pickle of at most {_MAX_OPERATIONS} operations, got a longer one"
                 )
             machine.execute(*operation)
         return machine.result()
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
         # A damaged program underflows the stack, or applies operations to values that do not have them.
-        raise ValueError(f"expected a complete pickle, got a damaged one: {error}") from error
+        raise InputError(f"expected a complete pickle, got a damaged one: {error}") from error
 
 
 def _operations(data: bytes) -> Iterator[tuple[str, Any]]:
@@ -94,7 +96,7 @@ def _operations(data: bytes) -> Iterator[tuple[str, Any]]:
         for opcode, argument, _ in pickletools.genops(data):
             yield opcode.name, argument
     except ValueError as error:
-        raise ValueError(f"expected a complete pickle, got a damaged one: {error}") from error
+        raise InputError(f"expected a complete pickle, got a damaged one: {error}") from error
 
 
 class _Machine:
@@ -118,11 +120,11 @@ class _Machine:
         elif opcode in _OPERATIONS:
             _OPERATIONS[opcode](self, argument)
         elif opcode not in _NOTHING:
-            raise ValueError(f"expected plain data, got a pickle with the operation {opcode}")
+            raise InputError(f"expected plain data, got a pickle with the operation {opcode}")
 
     def result(self) -> Any:
         if len(self._stack) != 1 or self._below_marks:
-            raise ValueError("expected a complete pickle, got one that leaves values over")
+            raise InputError("expected a complete pickle, got one that leaves values over")
         return self._stack[0]
 
     def _pop(self, count: int) -> tuple:
@@ -145,28 +147,28 @@ class _Machine:
 
     def _push_literal(self, value: Any) -> None:
         if isinstance(value, int) and value.bit_length() > _MAX_BITS:
-            raise ValueError(
+            raise InputError(
                 f"expected whole numbers of at most {_MAX_BITS} bits, got one of {value.bit_length()}"
             )
         self._push(value)
 
     def _extend(self, items: list[Any]) -> None:
         if not isinstance(self._stack[-1], list):
-            raise ValueError(f"expected a list to append to, got {type(self._stack[-1]).__name__}")
+            raise InputError(f"expected a list to append to, got {type(self._stack[-1]).__name__}")
         self._stack[-1].extend(items)
 
     def _update(self, items: list[Any]) -> None:
         target, keys = self._stack[-1], items[::2]
         if not isinstance(target, dict) or len(items) % 2:
-            raise ValueError(f"expected pairs for a dict, got {len(items)} for {type(target).__name__}")
+            raise InputError(f"expected pairs for a dict, got {len(items)} for {type(target).__name__}")
         for key in keys:
             if not isinstance(key, _KEYS):  # hashing anything else could run deep into a nested value
-                raise ValueError(f"expected plain keys of a dict, got {type(key).__name__}")
+                raise InputError(f"expected plain keys of a dict, got {type(key).__name__}")
         target.update(zip(keys, items[1::2], strict=True))
 
     def _name(self, path: str) -> None:
         if path not in self._known:
-            raise ValueError(f"expected plain data, got a pickle that asks for {path}")
+            raise InputError(f"expected plain data, got a pickle that asks for {path}")
         self._push(Name(path))
 
     def _stack_name(self) -> None:
@@ -177,7 +179,7 @@ class _Machine:
         name, arguments = self._pop(2)
         make = self._known.get(name.path) if isinstance(name, Name) else None
         if make is None or not isinstance(arguments, tuple):
-            raise ValueError(
+            raise InputError(
                 f"expected plain data, got a pickle that calls {getattr(name, 'path', 'a value')}"
             )
         made = make(*arguments)
@@ -186,7 +188,7 @@ class _Machine:
         ):  # of one string that it remembers, a pickle could have them made again and again
             self._room -= len(made)
             if self._room < 0:
-                raise ValueError("expected plain data, got a pickle that makes more bytes than it has")
+                raise InputError("expected plain data, got a pickle that makes more bytes than it has")
         self._push(made)
 
     def _set_state(self) -> None:
@@ -195,12 +197,12 @@ class _Machine:
         if isinstance(target, Record) and isinstance(state, dict):
             target.state = state
         elif not isinstance(target, dict):  # the attributes of a state dict are its modules' versions
-            raise ValueError(f"expected plain data, got a pickle that changes a {type(target).__name__}")
+            raise InputError(f"expected plain data, got a pickle that changes a {type(target).__name__}")
 
     def _push_persistent(self) -> None:
         (identity,) = self._pop(1)
         if self._persistent is None:
-            raise ValueError("expected plain data, got a pickle that refers to storages")
+            raise InputError("expected plain data, got a pickle that refers to storages")
         self._push(self._persistent(identity))
 
 

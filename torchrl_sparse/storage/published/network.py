@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.storage.published.config import PublishedConfig
 from torchrl_sparse.storage.published.entries import check_sizes
@@ -51,12 +52,12 @@ def read_network(
     check_shapes("model", shapes_of(stored), shapes_of(declared.state_dict()))
     check_sizes(config, section, declared, cameras=cameras)
     if (said := config.get(f"{section}.causal_attn", bool, causal)) != declared.causal_attn:
-        raise ValueError(f"cfg: {section}.causal_attn is {said}, the tensors say {declared.causal_attn}")
+        raise InputError(f"cfg: {section}.causal_attn is {said}, the tensors say {declared.causal_attn}")
     tensors = read_tensors(archive, "model", stored)
     network = TransformerForDiffusion(**arguments)
     for name, value in masks.items():
         if not torch.equal(archive.tensor(value), network.get_buffer(name)):
-            raise ValueError(f"model.{name}: expected the causal mask, got another")
+            raise InputError(f"model.{name}: expected the causal mask, got another")
     network.load_state_dict(tensors)
     return network.eval()
 
@@ -64,7 +65,7 @@ def read_network(
 def _sizes(stored: Mapping[str, StoredTensor]) -> dict[str, int]:
     def size(name: str, axis: int) -> int:
         if name not in stored or len(stored[name].shape) <= axis:
-            raise ValueError(
+            raise InputError(
                 f"model: expected a tensor {name} with {axis + 1} axes, got {_describe(stored, name)}"
             )
         return stored[name].shape[axis]
@@ -110,7 +111,7 @@ def read_tensors(archive: TorchArchive, where: str, stored: Mapping[str, StoredT
     tensors = {}
     for name, value in stored.items():
         if not value.storage.dtype.is_floating_point:
-            raise ValueError(f"{where}: {name}: expected floating-point numbers, got {value.storage.dtype}")
+            raise InputError(f"{where}: {name}: expected floating-point numbers, got {value.storage.dtype}")
         tensors[name] = archive.tensor(value).float()
     check_finite(where, tensors)
     return tensors

@@ -24,6 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.sizes import check_size
 from torchrl_sparse.networks.vla.config import TransformerSize, VLAConfig
 from torchrl_sparse.networks.vla.network import make_network, network_of
@@ -102,7 +103,7 @@ class Unsaid:
     def __post_init__(self) -> None:
         check_size("cameras", self.cameras, len(VLAConfig().cameras))
         if len(self.heads) != 3:
-            raise ValueError(f"heads: expected those of DINOv2, SigLIP and the decoder, got {self.heads!r}")
+            raise InputError(f"heads: expected those of DINOv2, SigLIP and the decoder, got {self.heads!r}")
 
 
 def read_openvla_oft(
@@ -120,13 +121,13 @@ def read_openvla_oft(
 
 def _read(path: Path, unnorm_key: str | None, unsaid: Unsaid, dtype: torch.dtype | None) -> StoredVLA:
     if list(path.glob("vision_backbone*checkpoint*")):
-        raise ValueError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
+        raise InputError(f"{path}: expected a checkpoint without FiLM, got vision_backbone*checkpoint* files")
     if list(path.glob("noisy_action_projector*checkpoint*")):
-        raise ValueError(f"{path}: {_DIFFUSION}: noisy_action_projector*checkpoint*")
+        raise InputError(f"{path}: {_DIFFUSION}: noisy_action_projector*checkpoint*")
     image_size = _image_size(path / "config.json", unsaid.heads[2])
     tensors = _read_shards(path) | _read_part(path, _HEAD) | _read_part(path, _PROPRIO)
     if any(name.startswith(f"{_HEAD}noise_predictor.") for name in tensors):
-        raise ValueError(f"{path}: {_DIFFUSION}: {_HEAD}noise_predictor")
+        raise InputError(f"{path}: {_DIFFUSION}: {_HEAD}noise_predictor")
     config = _config(path, tensors, image_size, unsaid)
     statistics = path / "dataset_statistics.json"
     data_set, normalizer = read_normalizer(statistics, unnorm_key, unsaid.normalization)
@@ -146,16 +147,16 @@ def _read(path: Path, unnorm_key: str | None, unsaid: Unsaid, dtype: torch.dtype
 def _image_size(path: Path, heads: int) -> int:
     config = read_json(path, dict[str, Any])
     if config.get("model_type") != "openvla":
-        raise ValueError(f"{path}: model_type: expected 'openvla', got {config.get('model_type')!r}")
+        raise InputError(f"{path}: model_type: expected 'openvla', got {config.get('model_type')!r}")
     text = config.get("text_config", {})
     fixed = _FIXED_TEXT | {"num_attention_heads": heads, "num_key_value_heads": heads}
     for where, found, values in (("", config, _FIXED), ("text_config.", text, fixed)):
         for name, value in values.items():
             if found.get(name, value) != value:
-                raise ValueError(f"{path}: {where}{name}: expected {value}, got {found[name]}")
+                raise InputError(f"{path}: {where}{name}: expected {value}, got {found[name]}")
     sizes = config.get("image_sizes")
     if not isinstance(sizes, list) or len({*sizes}) != 1:
-        raise ValueError(f"{path}: image_sizes: expected one size for both towers, got {sizes}")
+        raise InputError(f"{path}: image_sizes: expected one size for both towers, got {sizes}")
     return sizes[0]
 
 
@@ -164,13 +165,13 @@ def _read_shards(path: Path) -> dict[str, Tensor]:
     weight_map = read_json(index, dict[str, Any]).get("weight_map") or {}
     shards = sorted({*weight_map.values()})
     if not shards or any(Path(name).name != name for name in shards):
-        raise ValueError(f"{index}: weight_map: expected file names in this folder, got {shards}")
+        raise InputError(f"{index}: weight_map: expected file names in this folder, got {shards}")
     tensors: dict[str, Tensor] = {}
     for name in shards:
         tensors |= read_tensors(path / name)
     missing = sorted(weight_map.keys() - tensors.keys())
     if missing:
-        raise ValueError(f"{index}: expected tensors in {shards} that are not there: {missing}")
+        raise InputError(f"{index}: expected tensors in {shards} that are not there: {missing}")
     return tensors
 
 
@@ -181,12 +182,12 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
     if len(files) != 1:
         found = [file.name for file in files]
         needed = "; a policy without is not supported" if not files else ""
-        raise ValueError(f"{path}: expected exactly one file {pattern}, got {found}{needed}")
+        raise InputError(f"{path}: expected exactly one file {pattern}, got {found}{needed}")
     try:
         with TorchArchive(files[0]) as archive:
             tensors = {name: archive.tensor(value) for name, value in archive.contents().items()}
     except (AttributeError, ValueError) as error:  # AttributeError: it holds anything but tensors by name
-        raise ValueError(f"{files[0]}: expected a file of tensors, got: {error}") from error
+        raise InputError(f"{files[0]}: expected a file of tensors, got: {error}") from error
     return {prefix + name: value for name, value in without_wrappers(str(files[0]), tensors).items()}
 
 
@@ -198,7 +199,7 @@ def _config(path: Path, tensors: dict[str, Tensor], image_size: int, unsaid: Uns
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in tensors:
-            raise ValueError(f"{path}: expected a tensor {name}, got none of that name")
+            raise InputError(f"{path}: expected a tensor {name}, got none of that name")
         return tuple(tensors[name].shape)
 
     def size(prefix: str, blocks: str, mlp: str, dim: int, heads: int) -> TransformerSize:
@@ -210,7 +211,7 @@ def _config(path: Path, tensors: dict[str, Tensor], image_size: int, unsaid: Uns
     patch = shape(_DINO + "patch_embed.proj.weight")
     found = shape(_PROPRIO + "fc1.weight")[1], shape(_HEAD + "model.fc2.weight")[0]
     if found != (STATE_DIM, ACTION_DIM):
-        raise ValueError(
+        raise InputError(
             f"{path}: expected a policy of LIBERO's {STATE_DIM} numbers of the state and {ACTION_DIM} of an action, got one of "
             f"{found[0]} and {found[1]}"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.spacing import falls_evenly
 from torchrl_sparse.storage.published.config import PublishedConfig
@@ -50,7 +51,7 @@ def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampl
     target = config.get(f"{_PLACE}._target_", str)
     package, _, name = target.rpartition(".")
     if package.partition(".")[0] != "diffusers" or name not in _KINDS:
-        raise ValueError(f"cfg: {_PLACE}._target_: expected diffusers' {' or '.join(_KINDS)}, got {target}")
+        raise InputError(f"cfg: {_PLACE}._target_: expected diffusers' {' or '.join(_KINDS)}, got {target}")
     kind = _KINDS[name]
     _SECTIONS[kind].check(config, _PLACE, ignore)
     trained = {
@@ -60,11 +61,11 @@ def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampl
     steps = config.get("policy.num_inference_steps", int, trained["num_train_timesteps"])
     spacing = config.get(f"{_PLACE}.timestep_spacing", str, "leading")
     if spacing not in _SPACINGS:
-        raise ValueError(f"cfg: {_PLACE}.timestep_spacing: expected one of {_SPACINGS}, got {spacing!r}")
+        raise InputError(f"cfg: {_PLACE}.timestep_spacing: expected one of {_SPACINGS}, got {spacing!r}")
     offset = config.get(f"{_PLACE}.steps_offset", int, 0) if spacing == "leading" else 0
     eta = config.get("policy.eta", float, 0.0)
     if eta and kind == "ddpm":
-        raise ValueError(f"cfg: policy.eta: expected none of DDPM, whose step does not take it, got {eta}")
+        raise InputError(f"cfg: policy.eta: expected none of DDPM, whose step does not take it, got {eta}")
     try:
         sampler = Sampler(kind, steps, eta=eta, spacing=spacing, **trained)
         if offset:
@@ -72,10 +73,10 @@ def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampl
             sampler = Sampler(kind, steps, timesteps=timesteps, eta=eta, **trained)
     except ValueError as error:
         place = f"{_PLACE}.steps_offset" if offset else _PLACE
-        raise ValueError(f"cfg: {place}: {error}") from error
+        raise InputError(f"cfg: {place}: {error}") from error
     if kind == "ddim" and not falls_evenly(sampler.timesteps.tolist(), sampler.num_train_timesteps):
         gap = sampler.num_train_timesteps // steps
-        raise ValueError(
+        raise InputError(
             f"cfg: {_PLACE}.timestep_spacing: expected timesteps {gap} apart that end within {gap} of the clean sample, where "
             f"diffusers' DDIM leads whatever its spacing, got {spacing!r} with steps_offset {offset} in {steps} steps"
         )

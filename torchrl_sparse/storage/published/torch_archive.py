@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.storage.published.inert_pickle import PLAIN, Name, read_pickle
 
 __all__ = ["StoredTensor", "TorchArchive"]
@@ -85,7 +86,7 @@ class TorchArchive:
         try:
             self._zip = zipfile.ZipFile(path)
         except _DAMAGED as error:
-            raise ValueError(
+            raise InputError(
                 f"expected a complete zip archive, as torch.save writes it, got: {error}"
             ) from error
         pickles = [
@@ -93,7 +94,7 @@ class TorchArchive:
         ]
         if len(pickles) != 1:
             self._zip.close()
-            raise ValueError(f"expected one entry <name>/data.pkl in the archive, got {len(pickles)}")
+            raise InputError(f"expected one entry <name>/data.pkl in the archive, got {len(pickles)}")
         self._folder = pickles[0].removesuffix("data.pkl")
         self._size = path.stat().st_size
         self._unread = _READS * self._size
@@ -116,7 +117,7 @@ class TorchArchive:
         if f"{self._folder}byteorder" in self._zip.namelist():
             order = self._read("byteorder")
             if order != b"little":
-                raise ValueError(f"byteorder: expected little, got {order[:20]!r}")
+                raise InputError(f"byteorder: expected little, got {order[:20]!r}")
         names = {"torch._utils._rebuild_tensor_v2": _rebuild, **dict.fromkeys(_DTYPES)}
         return read_pickle(self._read("data.pkl"), {**known, **names}, self._storage)
 
@@ -137,39 +138,39 @@ class TorchArchive:
         entry = self._entry(record)
         self._unread -= entry.file_size
         if self._unread < 0:
-            raise ValueError(
+            raise InputError(
                 f"{record}: expected tensors with storages of their own, got some that share {entry.file_size} bytes"
             )
         try:
             return self._zip.read(entry)
         except _DAMAGED as error:
-            raise ValueError(f"{record}: cannot be read: {error}") from error
+            raise InputError(f"{record}: cannot be read: {error}") from error
 
     def _entry(self, record: str) -> zipfile.ZipInfo:
         """Return the entry of a record, checked to be stored as it is and to lie within the file."""
         try:
             entry = self._zip.getinfo(self._folder + record)
         except KeyError as error:
-            raise ValueError(f"{record}: expected an entry of this name, got none") from error
+            raise InputError(f"{record}: expected an entry of this name, got none") from error
         # torch stores; a compressed entry could unfold into more than there is memory for.
         if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
-            raise ValueError(f"{record}: expected an entry that is not compressed")
+            raise InputError(f"{record}: expected an entry that is not compressed")
         if entry.file_size > self._size:
-            raise ValueError(
+            raise InputError(
                 f"{record}: expected at most the file's {self._size} bytes, got {entry.file_size}"
             )
         return entry
 
     def _storage(self, identity: Any) -> _Storage:
         if not isinstance(identity, tuple) or len(identity) != 5 or identity[0] != "storage":
-            raise ValueError("expected references to storages, got another persistent id")
+            raise InputError("expected references to storages, got another persistent id")
         _, kind, record, _, numel = identity
         dtype = _DTYPES.get(kind.path) if isinstance(kind, Name) else None
         if dtype is None or not isinstance(record, str) or not _is_size(numel):
-            raise ValueError("expected a storage of a known type, with the name of its record and its size")
+            raise InputError("expected a storage of a known type, with the name of its record and its size")
         length = self._entry(f"data/{record}").file_size
         if length != numel * dtype.itemsize:
-            raise ValueError(f"data/{record}: expected {numel * dtype.itemsize} bytes, got {length}")
+            raise InputError(f"data/{record}: expected {numel * dtype.itemsize} bytes, got {length}")
         return _Storage(record, dtype, numel)
 
 
@@ -181,10 +182,10 @@ def _rebuild(storage: Any, offset: Any, shape: Any, stride: Any, *_: Any) -> Sto
         or len(shape) > _MAX_AXES
         or not all(map(_is_size, (offset, *shape, *stride)))
     ):
-        raise ValueError("expected a tensor as storage, offset, shape and stride")
+        raise InputError("expected a tensor as storage, offset, shape and stride")
     last = offset + sum((size - 1) * step for size, step in zip(shape, stride, strict=True))
     if math.prod(shape) and (last >= storage.numel or math.prod(shape) > storage.numel):
-        raise ValueError(f"expected a tensor within its storage of {storage.numel}, got shape {shape}")
+        raise InputError(f"expected a tensor within its storage of {storage.numel}, got shape {shape}")
     return StoredTensor(storage, offset, shape, stride)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.storage.published.config import PublishedConfig
 from torchrl_sparse.storage.published.network import read_tensors
@@ -54,7 +55,7 @@ class ImageLayout:
             shape = _sizes(config, f"policy.shape_meta.obs.{key}.shape")
             kind = config.get(f"policy.shape_meta.obs.{key}.type", str, "low_dim")
             if kind not in ("rgb", "low_dim"):
-                raise ValueError(f"cfg: shape_meta: {key}: type: expected rgb or low_dim, got {kind}")
+                raise InputError(f"cfg: shape_meta: {key}: type: expected rgb or low_dim, got {kind}")
             if kind == "rgb":
                 cameras[_camera_name(key, cameras)] = key
                 sizes.add(shape)
@@ -62,10 +63,10 @@ class ImageLayout:
             elif len(shape) == 1:
                 order[key] = shape[0]
             else:
-                raise ValueError(f"cfg: shape_meta: {key}: expected an image or one axis, got shape {shape}")
+                raise InputError(f"cfg: shape_meta: {key}: expected an image or one axis, got shape {shape}")
         states = {key: size for key, size in order.items() if key not in cameras.values()}
         if not states or len(sizes) != 1 or len(size := sizes.pop()) != 3 or size[0] != 3:
-            raise ValueError(
+            raise InputError(
                 f"cfg: shape_meta: expected states and RGB images of one size, got {list(order)}"
             )
         return cls(order, cameras, states, (size[1], size[2]))
@@ -103,7 +104,7 @@ def read_vision(
     )  # null is none, and nothing is the published default
     cropped = not said or config.get("policy.crop_shape", list, None) is not None
     if cropped and not config.get("policy.eval_fixed_crop", bool, False):
-        raise ValueError(
+        raise InputError(
             "cfg: policy.eval_fixed_crop: expected true, got false: crops would be random in use"
         )
     crop: tuple[int, ...] = layout.image_size
@@ -116,7 +117,7 @@ def read_vision(
         widths.add(camera["trunk.0.weight"].shape[0] if "trunk.0.weight" in camera else 0)
         tensors |= {f"encoders.{name}.{part}": value for part, value in camera.items()}
     if stored or len(widths) != 1:
-        raise ValueError(
+        raise InputError(
             f"obs_encoder: expected cameras {list(layout.cameras.values())}, got {sorted(stored)[:5]}"
         )
     arguments: dict[str, Any] = {"image_size": layout.image_size, "crop_size": crop, "width": widths.pop()}
@@ -131,7 +132,7 @@ def read_vision(
 def _sizes(config: PublishedConfig, path: str) -> tuple[int, ...]:
     sizes = config.get(path, list)
     if not all(type(size) is int for size in sizes):
-        raise ValueError(
+        raise InputError(
             f"cfg: {path}: expected whole numbers, got {[type(size).__name__ for size in sizes]}"
         )
     return tuple(sizes)
@@ -165,14 +166,14 @@ def _check_pool(key: str, pool: Mapping[str, Tensor | None]) -> None:
     """Refuse coordinates of keypoints other than those of `spatial_softmax`, and temperatures other than 1."""
     temperature, x, y = (pool[name] for name in ("temperature", "pos_x", "pos_y"))
     if temperature is None or x is None or y is None:
-        raise ValueError(f"obs_encoder: {key}: expected a spatial softmax, got none")
+        raise InputError(f"obs_encoder: {key}: expected a spatial softmax, got none")
     if temperature.numel() != 1 or temperature.item() != 1:
-        raise ValueError(
+        raise InputError(
             f"obs_encoder: {key}: expected temperature 1, got {temperature.flatten()[:3].tolist()}"
         )
     height, width = len(y.unique()), len(x.unique())
     if height * width != x.numel():  # the grid could be as large as the square of what the file holds
-        raise ValueError(
+        raise InputError(
             f"obs_encoder: {key}: expected a regular grid from -1 to 1, got {height} x {width} in {x.numel()}"
         )
     grid = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
@@ -180,4 +181,4 @@ def _check_pool(key: str, pool: Mapping[str, Tensor | None]) -> None:
         if found.shape != (1, expected.numel()) or not torch.allclose(
             found, expected.reshape(1, -1), atol=1e-6
         ):
-            raise ValueError(f"obs_encoder: {key}: {name}: expected a regular grid from -1 to 1")
+            raise InputError(f"obs_encoder: {key}: {name}: expected a regular grid from -1 to 1")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeVar
 
+from torchrl_sparse.errors import InputError
+
 __all__ = ["without_wrappers"]
 
 T = TypeVar("T")
@@ -25,7 +27,7 @@ def without_wrappers(where: str, tensors: Mapping[str, T]) -> dict[str, T]:
     for name, value in tensors.items():
         plain = ".".join(part for part in name.split(".") if part not in _WRAPPERS)
         if plain in renamed:
-            raise ValueError(
+            raise InputError(
                 f"{where}: expected one tensor {plain}, got one of a wrapped module, {name}, too"
             )
         renamed[plain] = value

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sparse.envs.contract import continued_source, policy_contract
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -79,7 +80,7 @@ def continued_policy(
 
 def _check(option: str, asked: Any, own: Any, path: str | Path) -> None:
     if asked is not None and asked != own:
-        raise ValueError(f"{option}: expected {own}, as of the policy in {path}, got {asked}")
+        raise InputError(f"{option}: expected {own}, as of the policy in {path}, got {asked}")
 
 
 def _own_crop(vision: Mapping[str, Any], asked: float | None) -> float:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -87,7 +88,7 @@ class DiffusionLoss(LossModule):
         action = tensordict.get(keys.ACTION)
         chunk = (self.network.horizon, self.network.input_dim)
         if action.ndim != 3 or tuple(action.shape[1:]) != chunk:
-            raise ValueError(
+            raise InputError(
                 f"{keys.ACTION}: expected shape [B, {chunk[0]}, {chunk[1]}], got {list(action.shape)}"
             )
         action = self.normalizer.normalize_action(action)

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
 from torchrl_sparse.envs.contract import check_contract
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.storage.atomic import atomic_path
 from torchrl_sparse.storage.json import describe_differences, parse_json
@@ -69,11 +70,11 @@ def make_targets(
     network, normalizer = policy.network, policy.normalizer
     check_contract(policy, demos.contract)
     if source not in ("teacher", "data"):
-        raise ValueError(f"source: expected 'teacher' or 'data', got {source!r}")
+        raise InputError(f"source: expected 'teacher' or 'data', got {source!r}")
     rows = demos.window_rows(network.horizon, network.n_obs_steps, n_action_steps)
     size = round(share * len(rows))
     if not 0 < size <= len(rows):
-        raise ValueError(
+        raise InputError(
             f"share: expected at least one of {len(rows)} windows and not more than all, got {share}"
         )
     generator = torch.Generator().manual_seed(seed)
@@ -174,7 +175,7 @@ def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
             )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict
     except (SafetensorError, ValueError) as error:
-        raise ValueError(f"{path}: expected a complete safetensors file, got: {error}") from error
+        raise InputError(f"{path}: expected a complete safetensors file, got: {error}") from error
     if differing := describe_differences(found, made_for):
-        raise ValueError(f"{path}: made with other settings: {differing}; choose another out or move it away")
+        raise InputError(f"{path}: made with other settings: {differing}; choose another out or move it away")
     return TensorDict(tensors, batch_size=[len(tensors["target"])]).unflatten_keys("/")

@@ -20,6 +20,7 @@ from functools import cache
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.spacing import timesteps_fall
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
@@ -56,7 +57,7 @@ def search_timesteps(
     """
     best = tuple(start)
     if not timesteps_fall(best, num_train_timesteps):
-        raise ValueError(
+        raise InputError(
             f"start: expected timesteps that fall from below {num_train_timesteps} to at least 0, got {list(start)}"
         )
     tried = {best: error(best)}

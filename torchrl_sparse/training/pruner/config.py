@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from torchrl_sparse.blocks.mask import Reuse, check_reuse
 from torchrl_sparse.blocks.sag.planner import check_rates
+from torchrl_sparse.errors import InputError
 
 __all__ = ["Cost", "PrunerConfig"]
 
@@ -93,24 +94,24 @@ class PrunerConfig:
             ("gradient", ("chain", "step")),
         ):
             if (value := getattr(self, name)) not in allowed:
-                raise ValueError(f"{name}: expected one of {list(allowed)}, got {value!r}")
+                raise InputError(f"{name}: expected one of {list(allowed)}, got {value!r}")
         check_reuse(self.reuse)
         if self.objective == "noise" and self.reuse != "block":
-            raise ValueError(f"reuse: expected 'block' with objective 'noise', got {self.reuse!r}")
+            raise InputError(f"reuse: expected 'block' with objective 'noise', got {self.reuse!r}")
         check_rates(self.rate, self.rate_range)
         if self.rate_range is not None:  # YAML brings a list
             object.__setattr__(self, "rate_range", tuple(self.rate_range))
             if self.cost != "blocks":
-                raise ValueError(f"cost: expected 'blocks' with a rate_range, got {self.cost!r}")
+                raise InputError(f"cost: expected 'blocks' with a rate_range, got {self.cost!r}")
         for name in ("epochs", "batch_size", "lr", "temperature", "final_temperature"):
             if (value := getattr(self, name)) is not None and not value > 0:
-                raise ValueError(f"{name}: expected a positive number, got {value}")
+                raise InputError(f"{name}: expected a positive number, got {value}")
         if not self.variety >= 0:
-            raise ValueError(f"variety: expected a weight >= 0, got {self.variety}")
+            raise InputError(f"variety: expected a weight >= 0, got {self.variety}")
         if self.information is not None and not 0 < self.information <= 1:
-            raise ValueError(f"information: expected bits in (0, 1], or None, got {self.information}")
+            raise InputError(f"information: expected bits in (0, 1], or None, got {self.information}")
         if self.information is not None and self.variety == 0:
-            raise ValueError(f"information: expected None without variety, got {self.information}")
+            raise InputError(f"information: expected None without variety, got {self.information}")
 
     def temperature_at(self, progress: float) -> float:
         """Return the temperature at a share of the training, 0 to 1.

@@ -12,6 +12,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.mask import prune_rate
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.training.pruner.gates import Gates
 
 __all__ = ["fit_to_masks", "spread_logits"]
@@ -53,7 +54,7 @@ def fit_to_masks(
     """
     if not masks or (len(masks) > 1 and not gates.rate_input):
         expected = "at least one" if gates.rate_input else "one for gates that do not read the rate"
-        raise ValueError(f"masks: expected {expected}, got {len(masks)}")
+        raise InputError(f"masks: expected {expected}, got {len(masks)}")
     torch.manual_seed(seed)
     optimizer = torch.optim.Adam(gates.parameters(), lr)
     total = updates * len(masks)
@@ -64,7 +65,7 @@ def fit_to_masks(
         rate = given if gates.rate_input else None
         logits = gates.prune_logits(cond, rate)
         if (shape := logits.shape[1:]) != mask.shape:
-            raise ValueError(f"mask: expected [K, 3L] = {[*shape]} as the gates have, got {[*mask.shape]}")
+            raise InputError(f"mask: expected [K, 3L] = {[*shape]} as the gates have, got {[*mask.shape]}")
         target = (0.25 + 0.5 * mask.to(logits)).expand_as(logits)
         loss = binary_cross_entropy_with_logits(logits[:, 1:], target[:, 1:])  # step 0 is never pruned
         optimizer.zero_grad()

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchrl_sparse.blocks.l2c import StaticGates
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = ["GATES", "Gates", "make_gates"]
@@ -33,7 +34,7 @@ class Gates(Protocol):
 
 def _sag(policy: DiffusionPolicy, rate_input: bool, *, reads: str = "all", **sizes: Any) -> PrunerNetwork:
     if reads not in ("all", "state"):
-        raise ValueError(f"reads: expected 'all' or 'state', got {reads!r}")
+        raise InputError(f"reads: expected 'all' or 'state', got {reads!r}")
     features = 0 if policy.vision is None else policy.vision.feature_dim
     return PrunerNetwork(
         policy.sampler.timesteps.tolist(),
@@ -47,7 +48,7 @@ def _sag(policy: DiffusionPolicy, rate_input: bool, *, reads: str = "all", **siz
 
 def _l2c(policy: DiffusionPolicy, rate_input: bool, **sizes: Any) -> StaticGates:
     if sizes:
-        raise ValueError(f"network: expected nothing of l2c, which has no network, got {', '.join(sizes)}")
+        raise InputError(f"network: expected nothing of l2c, which has no network, got {', '.join(sizes)}")
     return StaticGates(policy.num_inference_steps, policy.num_blocks)
 
 
@@ -78,6 +79,6 @@ def make_gates(
         torch.Size([2, 100, 24])
     """
     if method not in GATES:
-        raise ValueError(f"method: expected one of {', '.join(GATES)}, got {method!r}")
+        raise InputError(f"method: expected one of {', '.join(GATES)}, got {method!r}")
     torch.manual_seed(seed)
     return GATES[method](policy, rate_input, **sizes).to(policy.device)

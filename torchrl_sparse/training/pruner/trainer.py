@@ -24,6 +24,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.blocks.l2c import noise_errors
 from torchrl_sparse.blocks.sag.planner import rate_threshold
 from torchrl_sparse.blocks.sag.relaxed import denoise_relaxed, gumbel_gate, step_errors, straight_through_gate
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.targets import ANSWER_BATCH
 from torchrl_sparse.training.pruner.config import PrunerConfig
@@ -61,7 +62,7 @@ class PrunerTrainer(Trainer):
         self, gates: Gates, policy: DiffusionPolicy, targets: TensorDict, config: PrunerConfig
     ) -> None:
         if gates.rate_input != (config.rate_range is not None):
-            raise ValueError(
+            raise InputError(
                 f"rate_range: expected one if and only if the gates read the rate, "
                 f"got {config.rate_range} and rate_input={gates.rate_input}"
             )
@@ -71,9 +72,9 @@ class PrunerTrainer(Trainer):
         highest = self._may_prune.double().mean().item()
         if (asked := max(config.rate_range or (config.rate,))) > highest:
             kept = "every other step" if config.objective == "noise" else "the first step"
-            raise ValueError(f"rate: expected at most {highest:g}, since {kept} is kept, got {asked}")
+            raise InputError(f"rate: expected at most {highest:g}, since {kept} is kept, got {asked}")
         if len(targets) < 2:
-            raise ValueError(f"targets: expected at least 2 observations, got {len(targets)}")
+            raise InputError(f"targets: expected at least 2 observations, got {len(targets)}")
         self.gates, self.policy = gates, policy
         policy.network.requires_grad_(False)
         held_out = max(1, len(targets) // 10)

@@ -18,6 +18,7 @@ from tensordict import NonTensorStack, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.normalize import MIN_RANGE
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
@@ -43,8 +44,8 @@ class GroundingConfig:
 
     def __post_init__(self) -> None:
         if min(self.locate_steps, self.refer_steps) < 0:
-            raise ValueError(
-                f"expected locate_steps >= 0 and refer_steps >= 0, got {self.locate_steps} and {self.refer_steps}"
+            raise InputError(
+                f"locate_steps, refer_steps: expected at least 0, got {self.locate_steps} and {self.refer_steps}"
             )
 
 
@@ -70,7 +71,7 @@ class ObjectPositions:
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 3 or self.positions.shape[1:] != (len(self.instructions), 3):
-            raise ValueError(
+            raise InputError(
                 f"positions: expected [N, {len(self.instructions)}, 3], one object for each instruction, "
                 f"got {list(self.positions.shape)}"
             )
@@ -85,7 +86,7 @@ class ObjectPositions:
         centred = positions - positions.mean((0, 1))
         size = centred.std((0, 1), correction=0).max()
         if not size > MIN_RANGE:
-            raise ValueError(
+            raise InputError(
                 f"object_positions: expected some that vary by more than {MIN_RANGE} m, got a deviation of {size:.1e} m; "
                 "locate_steps=0 and refer_steps=0 train without them"
             )

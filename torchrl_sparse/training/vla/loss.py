@@ -7,6 +7,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 
 __all__ = ["VLALoss", "chunk_l1"]
@@ -61,7 +62,7 @@ class VLALoss(LossModule):
         chunk = keys.read(tensordict, keys.CHUNK)
         expected = (self.policy.chunk_size, self.policy.action_dim)
         if tuple(chunk.shape[1:]) != expected:
-            raise ValueError(
+            raise InputError(
                 f"{keys.CHUNK}: expected [B, {expected[0]}, {expected[1]}], got {list(chunk.shape)}"
             )
         predicted, _ = self.policy.predict(tensordict.select(*self.policy.in_keys, strict=False))

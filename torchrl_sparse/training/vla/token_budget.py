@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.transforms import twists
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.token_budget import BudgetPoint
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.base import TokenPruner
@@ -135,7 +136,7 @@ def measure_errors(
         ValueError: if no episode has a second query.
     """
     if not any(len(queries) > 1 for queries in episodes):
-        raise ValueError(
+        raise InputError(
             f"episodes: expected one with at least two queries, got {[len(q) for q in episodes]}"
         )
     normalize = policy.normalizer.normalize_action

@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from torchrl_sparse import keys
 from torchrl_sparse.data.robomimic import Demonstrations
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.vla import trained_state
@@ -52,7 +53,7 @@ class InstructedDemonstrations:
 
     def __post_init__(self) -> None:
         if len(self.instructions) != len(self.episodes):
-            raise ValueError(
+            raise InputError(
                 f"instructions: expected one for each of {len(self.episodes)} episodes, got {len(self.instructions)}"
             )
 
@@ -103,7 +104,7 @@ class VLATrainer(DemonstrationTrainer):
         parts = {"network": policy.network}
         if self.stages != GroundingConfig():
             if demos.objects is None:
-                raise ValueError("grounding: expected the objects' positions in the demonstrations, got none")
+                raise InputError("grounding: expected the objects' positions in the demonstrations, got none")
             device = next(policy.network.parameters()).device
             parts["grounding"] = Grounding(policy, len(demos.objects.instructions)).to(device)
         module = nn.ModuleDict(parts)

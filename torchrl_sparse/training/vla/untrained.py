@@ -11,6 +11,7 @@ import torch
 from omegaconf import OmegaConf
 
 from torchrl_sparse import keys
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.adapters import add_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.network import VLANetwork
@@ -80,14 +81,14 @@ def check_sizes(
         size, rank, changes: as of `untrained_policy`; None for the policy's own.
     """
     if size is not None:
-        raise ValueError(f"size: expected null, since sizes are those of the policy in {path}, got {size}")
+        raise InputError(f"size: expected null, since sizes are those of the policy in {path}, got {size}")
     own = None if policy.base is None else policy.base.rank
     if rank not in (None, own):
-        raise ValueError(f"rank: expected {own}, as of the policy in {path}, got {rank}")
+        raise InputError(f"rank: expected {own}, as of the policy in {path}, got {rank}")
     sizes = policy.network.config.to_dict()
     asked = OmegaConf.to_container(OmegaConf.merge(sizes, changes), resolve=True)
     if differing := describe_differences(sizes, asked):
-        raise ValueError(f"network: expected sizes of the policy in {path}, got others: {differing}")
+        raise InputError(f"network: expected sizes of the policy in {path}, got others: {differing}")
 
 
 def _adapting(
@@ -104,7 +105,7 @@ def _fitting_config(
     demos: InstructedDemonstrations, size: str, cameras: Sequence[str], changes: Mapping[str, Any]
 ) -> VLAConfig:
     if size not in _SIZES:
-        raise ValueError(f"size: expected one of {', '.join(_SIZES)}, got {size!r}")
+        raise InputError(f"size: expected one of {', '.join(_SIZES)}, got {size!r}")
     data, camera_keys = demos.episodes.data, [["observation", name] for name in cameras]
     decided = {
         "cameras": camera_keys,

@@ -6,6 +6,7 @@ import pickle
 import pytest
 import torch
 
+from tests.refusals import refused
 from torchrl_sparse.blocks.engine.native import library
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.engine.native.pruner import MAX_HIDDEN, NativePruner
@@ -82,9 +83,7 @@ def test_a_rate_of_another_type_is_converted_and_a_missing_one_refused():
     with torch.no_grad():
         expected = network.prune_logits(observations(), rate)
         assert torch.equal(network.prune_logits(observations(), rate.double()), expected)
-        with pytest.raises(
-            ValueError, match=r"features: expected .* \[B, 47\] on cpu, got .* \[5, 46\] on cpu"
-        ):
+        with refused("features"):
             network.prune_logits(observations())
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Matrix
+from torchrl_sparse.errors import InputError
 
 __all__ = ["PANEL", "Arena", "pack_panels", "padded", "quantise"]
 
@@ -44,7 +45,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """
     rounded = weight.to(dtype)
     if not rounded.isfinite().all():
-        raise ValueError(
+        raise InputError(
             f"weights: expected finite numbers within the range of {dtype}, got {weight.abs().max():g}"
         )
     if dtype in _TOGETHER:

@@ -25,6 +25,7 @@ from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -91,7 +92,7 @@ class NativeEngine:
     ) -> None:
         supported, reason = native_supports(network)
         if not supported:
-            raise ValueError(f"native engine: {reason}")
+            raise InputError(f"native engine: {reason}")
         if threads is not None:
             check_size("threads", threads, MAX_THREADS)
         self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
@@ -265,6 +266,6 @@ class NativeEngine:
 
     def _check(self, mask: Tensor | None) -> None:
         if self._network.training:
-            raise ValueError("network: expected eval mode, got training mode (call network.eval())")
+            raise InputError("network: expected eval mode, got training mode (call network.eval())")
         if mask is not None and not mask.is_cpu:
-            raise ValueError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")
+            raise InputError(f"mask: expected {mask.dtype} on cpu, got {mask.device}")

@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from torchrl_sparse.blocks.engine.native.layout import layout_hash
+from torchrl_sparse.errors import InputError
 
 __all__ = ["INSTRUCTION_SETS", "instruction_level", "library", "loaded", "native_available"]
 
@@ -105,7 +106,7 @@ def instruction_level(instruction_set: str | None = None) -> int:
     if instruction_set is None:
         return len(available) - 1
     if instruction_set not in available:
-        raise ValueError(
+        raise InputError(
             f"instruction_set: expected one of {list(available)} on this CPU, got {instruction_set!r}"
         )
     return available.index(instruction_set)

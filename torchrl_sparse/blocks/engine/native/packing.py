@@ -30,6 +30,7 @@ from torchrl_sparse.blocks.engine.folding import (
 )
 from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena, padded
 from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Layer, Matrix, Model, Units
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
@@ -171,7 +172,7 @@ class PackedNetwork:
         """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a query have the sizes that were packed."""
         for name, tensor in query.items():
             if tuple(tensor.shape[1:]) != self._sizes[name]:
-                raise ValueError(
+                raise InputError(
                     f"{name}: expected [B, *{self._sizes[name]}] as it was packed, got {list(tensor.shape)}"
                 )
 
@@ -190,7 +191,7 @@ class PackedNetwork:
 def weight_type(name: str) -> torch.dtype:
     """Return the type of weights of that name, or raise ValueError if there is none."""
     if name not in _WEIGHTS:
-        raise ValueError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
+        raise InputError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
     return getattr(torch, name)
 
 

@@ -16,6 +16,7 @@ from torch.nn import functional
 from torchrl_sparse.blocks.engine.native.arena import PANEL, Arena
 from torchrl_sparse.blocks.engine.native.layout import CONSTANTS, Pruner
 from torchrl_sparse.blocks.engine.native.library import instruction_level, loaded
+from torchrl_sparse.errors import InputError
 
 __all__ = ["MAX_HIDDEN", "NativePruner", "PrunerWeights"]
 
@@ -116,7 +117,7 @@ class NativePruner:
     def _run(self, features: Tensor, logits: int | None, masks: int | None) -> None:
         shape, kind = (len(features), self._features), (features.dtype, features.device.type)
         if tuple(features.shape) != shape or kind != (torch.float32, "cpu"):
-            raise ValueError(
+            raise InputError(
                 f"features: expected torch.float32 [B, {self._features}] on cpu, "
                 f"got {features.dtype} {list(features.shape)} on {features.device}"
             )

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.native.library import loaded
 from torchrl_sparse.blocks.engine.native.packing import PackedWeights
 from torchrl_sparse.blocks.engine.weights import WeightWatch
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["NativeWatch", "SharedWeights"]
@@ -23,7 +24,7 @@ class NativeWatch(WeightWatch):
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
         for sample in samples:
             if not sample.is_cpu or sample.dtype != torch.float32:
-                raise ValueError(
+                raise InputError(
                     f"native engine: it reads float32 weights on the CPU, the network was changed to {sample.dtype} on "
                     f"{sample.device}"
                 )
