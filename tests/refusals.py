@@ -12,11 +12,17 @@ from torchrl_sparse.errors import InputError
 
 @contextmanager
 def refused(entry: str, kind: type[Exception] = InputError) -> Iterator[pytest.ExceptionInfo[Exception]]:
-    """Expect one line that names ``entry``: an option, an argument or a key, or a file; what leads to it may be left out."""
+    """Expect one line that names ``entry``: an option, an argument or a key, or a file; what leads to it may be left out.
+
+    An error of another ``kind``, such as that of a missing file, has no entry of its own: its message has to name it.
+    """
     with pytest.raises(kind) as raised:
         yield raised
     message = str(raised.value)
-    named = InputError(message).entry
     assert "\n" not in message
+    if not isinstance(raised.value, InputError):
+        assert entry in message
+        return
+    named = raised.value.entry
     assert named.endswith(entry), message
     assert not named.removesuffix(entry)[-1:].isalnum(), message

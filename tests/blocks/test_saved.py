@@ -76,5 +76,5 @@ def test_a_file_without_a_format_is_named(tmp_path, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with refused("expected a file nowhere, got none", FileNotFoundError):
+    with refused("nowhere", FileNotFoundError):
         load_planner(tmp_path / "nowhere")

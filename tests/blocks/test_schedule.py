@@ -126,7 +126,7 @@ def test_binary_rubbish_and_a_missing_file_are_refused(tmp_path):
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00\x80")
     with refused("binary"):
         CacheSchedule.from_pretrained(tmp_path / "binary")
-    with refused("expected a file nowhere.json, got none", FileNotFoundError):
+    with refused("nowhere.json", FileNotFoundError):
         SchedulePlanner.from_pretrained(tmp_path / "nowhere.json")
 
 

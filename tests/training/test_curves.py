@@ -38,5 +38,5 @@ def test_missing_curves_and_folders_are_named(folder, tmp_path):
     (folder / "scalars" / "train" / "rate_CA.csv").unlink()
     with refused("curves"):
         plot_pruner_curves(read_scalars(folder), folder / "curves.png", rate=0.9)
-    with refused("expected a folder scalars, got none", FileNotFoundError):
+    with refused("scalars", FileNotFoundError):
         read_scalars(tmp_path / "nowhere")

@@ -80,8 +80,9 @@ class ChunkExecutor(TensorDictModuleBase):
     ):
         super().__init__()
         if num_samples < 1 or (num_samples > 1) != (selector is not None):
+            chosen = "none" if selector is None else type(selector).__name__
             raise InputError(
-                f"num_samples: expected 1, or more with a selector, got {num_samples} and selector {selector}"
+                f"num_samples: expected 1, or more with a selector, got {num_samples} and {chosen}"
             )
         if n_action_steps < 1:
             raise InputError(f"n_action_steps: expected at least 1, got {n_action_steps}")

@@ -23,9 +23,8 @@ Eq.    function                          defines
 
 The numbers of Eqs. 3 and 4 are inferred. What the paper leaves open is settled so: the carried score is the mean of Eq. 1 over
 two deep layers, 0 for tokens that were gone there. It contributes as many tokens as one layer does, and changes at most as many
-(K_G = K_D = K). The threshold of Eq. 2 and a dynamic layer's share are the release's. An episode's first call keeps all.
-Where the four sets of a coarse call do not overlap, that keeps 192 of 512 visual tokens after two layers and 80 after the last
-dynamic one: 320 and 112 of some 600 are pruned, beside the 315 (52.5 %) and 19 % that are reported of the paper.
+(K_G = K_D = K). The threshold of Eq. 2 and a dynamic layer's share are the release's. An episode's first call keeps all. Where
+the four sets of a coarse call do not overlap, 192 of 512 visual tokens stay after two layers and 80 after the last dynamic one.
 """
 
 from __future__ import annotations

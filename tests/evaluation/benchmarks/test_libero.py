@@ -69,7 +69,7 @@ def test_a_published_folder_plays_a_suite(made, published, tmp_path, monkeypatch
         ("task=libero_90", "task"),
         ("episodes=501", "seed"),
         ("policy=assets/vla", "policy"),
-        ("policy=assets/lift", "assetsconfig.json: format"),
+        ("policy=assets/lift", "config.json: format"),
     ],
 )
 def test_what_cannot_be_played_is_refused(made, published, tmp_path, monkeypatch, option, message):  # noqa: F811

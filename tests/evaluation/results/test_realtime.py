@@ -83,7 +83,7 @@ def test_late_points_are_compared_from_their_logs_wherever_those_lie(tmp_path):
     assert (row["difference, points"], row["time ratio"]) == (own["vs dense, points"], own["time vs dense"])
     with refused("pairs"):
         late_pair_rows(path, [("bac +0", "dense +3")])
-    with refused("jsonl, got none", FileNotFoundError):
+    with refused("jsonl", FileNotFoundError):
         late_pair_rows(path, [("bac +3", "dense +3")])
 
 

@@ -123,7 +123,7 @@ def test_a_damaged_compressed_log_is_named(path, packed, damage):
 
 
 def test_a_log_that_is_not_there_is_named(path):
-    with refused("expected a log of episodes bac.jsonl, got none", FileNotFoundError):
+    with refused("bac.jsonl", FileNotFoundError):
         next(read_episodes(path))
 
 

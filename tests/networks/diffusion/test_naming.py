@@ -107,7 +107,7 @@ def test_steps_say_what_they_need():
     sampler, sample = Sampler(), torch.zeros(SHAPE)
     with refused("noise_k"):
         sampler.step(sample, 3, sample)
-    with refused("noise_k", IndexError):
+    with refused("k must be in 0..99", IndexError):
         sampler.step(sample, 100, sample)
     with refused("cleans"):
         Sampler("unipc", 5).step(sample, 3, sample, cleans=(sample,))

@@ -153,7 +153,7 @@ def test_bad_inputs_are_named(make_network):
     sample, timestep, cond = inputs(network)
     with refused("sample"):
         network(sample[:, :5], timestep, cond)
-    with refused("sample"):
+    with refused("cond"):
         network(sample, timestep, cond[..., :4])
     with refused("timestep"):
         network(sample, timestep[:2], cond)

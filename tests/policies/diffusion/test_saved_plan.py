@@ -100,5 +100,5 @@ def test_a_planner_elsewhere_is_refused(fast):
 
 def test_a_missing_planner_is_named(fast):
     (fast / "plan.json").unlink()
-    with refused("expected a file plan.json, got none", FileNotFoundError):
+    with refused("plan.json", FileNotFoundError):
         DiffusionPolicy.from_pretrained(fast)

@@ -187,7 +187,7 @@ def test_stages_without_positions_are_refused(make_trainer):
         make_trainer(grounding=GroundingConfig(locate_steps=5))
     with refused("locate_steps, refer_steps"):
         GroundingConfig(locate_steps=-1)
-    with refused("locate_steps, refer_steps"):
+    with refused("positions"):
         ObjectPositions(torch.zeros(5, 3, 3), ["lift", "lower"])
 
 
