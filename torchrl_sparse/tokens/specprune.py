@@ -17,14 +17,13 @@ Eq.    function                          defines
 9      `confidence`                      of the layer
 10     `updated_score`                   moving average over the layers that are scored: the first two, the dynamic ones
                                          and those whose scores are carried, 0, 1, 5, 10, 15 and 20 of 32
-11, 12 `translation_speed`,              the controller, `control.action_aware`, which grants the budget
-       `rotation_speed`
+11, 12 `translation_speed`, `rotation_…` the controller, `control.action_aware`, which grants the budget
 ====== ================================= =============================================================================
 
 The numbers of Eqs. 3 and 4 are inferred. What the paper leaves open is settled so: the carried score is the mean of Eq. 1 over
 two deep layers, 0 for tokens that were gone there. It contributes as many tokens as one layer does, and changes at most as many
-(K_G = K_D = K). The threshold of Eq. 2 and a dynamic layer's share are the release's. An episode's first call keeps all. Where
-the four sets of a coarse call do not overlap, 192 of 512 visual tokens stay after two layers and 80 after the last dynamic one.
+(K_G = K_D = K). The threshold of Eq. 2 and a dynamic layer's share are the release's. An episode's first call keeps all.
+Of 512 visual tokens 192 stay after two layers and 80 after the last where the four sets of a coarse call do not overlap.
 """
 
 from __future__ import annotations
