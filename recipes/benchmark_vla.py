@@ -42,14 +42,14 @@ from torchrl_sparse.evaluation.results.tracking import log_benchmark
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity
-from torchrl_sparse.methods.vla import TokenMethodName, check_matches, make_controller, make_pruner
+from torchrl_sparse.methods.vla import check_matches, make_controller, make_pruner, parse_token_method
 from torchrl_sparse.runtime.backends import backend_runtime
 
 
 @recipe("benchmark_vla")
 def main(config: DictConfig) -> None:
     out, methods = Path(config.out), [*dict.fromkeys(["dense", *config.methods])]
-    check_names(config, TokenMethodName.parse)
+    check_names(config, parse_token_method)
     check_matches(methods)
     filmed = filmed_methods(config.videos, methods)
     options = token_settings(OmegaConf.to_container(config, resolve=True))
@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
     settings = {"task": config.task, "horizon": config.horizon, "n_action_steps": config.n_action_steps}
     probed = {"seeds": seeds[: config.probe_episodes], "n_action_steps": config.n_action_steps}
     recorded = record_methods(methods, dense, make_env, **probed, settings=options)
-    if any(TokenMethodName.parse(name).name == "efficientvla_layers" for name in methods):
+    if any(parse_token_method(name).name == "efficientvla_layers" for name in methods):
         skipped = skipped_layers(dense, recorded["dense"], config.skipped_layers)
         options["efficientvla"] = {"skipped": skipped}
 

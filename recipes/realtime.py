@@ -36,7 +36,7 @@ from torchrl_sparse.evaluation.results.build import Terms
 from torchrl_sparse.evaluation.results.realtime import RealtimeRun, build_realtime, format_realtime
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import check_method
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.backends import backend_runtime
 from torchrl_sparse.storage.json import write_json
@@ -101,7 +101,7 @@ def main(config: DictConfig) -> None:
 
 def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy) -> StateModel | None:
     """Fit what methods named ``_ahead`` roll the policy's state forward with; None if there are none."""
-    if not any(MethodName.parse(name).ahead for name in config.methods):
+    if not any(MethodSpec.parse(name).ahead for name in config.methods):
         return None
     if config.demos is None:
         raise ValueError("demos: expected demonstrations to fit the _ahead methods' model to, got null")

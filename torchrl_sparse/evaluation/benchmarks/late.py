@@ -15,7 +15,7 @@ from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log, evaluate
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.methods.executor import make_realtime_executor
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.trainer import checksum
 
@@ -23,7 +23,7 @@ __all__ = ["evaluate_late"]
 
 
 def evaluate_late(
-    name: str,
+    name: MethodSpec | str,
     policy: DiffusionPolicy,
     delay_steps: int,
     make_env: Callable[..., EnvBase],
@@ -60,7 +60,7 @@ def evaluate_late(
         model=model,
     )
     late = {"n_action_steps": actor.n_action_steps, "delay_steps": delay_steps}
-    if MethodName.parse(name).ahead:
+    if MethodSpec.parse(name).ahead:
         late["state_model"] = checksum(model.weight)
     log = episode_log(out, f"{name}_delay{delay_steps}")
     identity = {**method_identity(name, policy), **settings, **late}
