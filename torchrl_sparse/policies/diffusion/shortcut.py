@@ -38,7 +38,7 @@ def answer_directly(
         return False
     network, sampler, normalizer = denoise.network, denoise.sampler, denoise.normalizer
     engine = denoise.current_engine()
-    state = tensordict.get(keys.HISTORY_STATE, None)
+    state = tensordict.get(encode.condition.state_key, None)
     if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
         return False
     batch = tensordict.batch_size
