@@ -69,14 +69,9 @@ constant                          shape, dtype           meaning
 ================================  =====================  ===========================================================
 """
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
-from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase, unravel_key
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
-
-from torchrl_sparse.runtime.names import did_you_mean
 
 STATE = ("observation", "state")
 IMAGE = ("observation", "image")
@@ -189,27 +184,3 @@ def recall(
         rows = [recall(row, key, shape, fill, dtype) for row in tensordict.tensordicts]
         return torch.stack(rows, tensordict.stack_dim)
     return torch.full((*tensordict.batch_size, *shape), fill, dtype=dtype, device=tensordict.device)
-
-
-class TensorKeys:
-    """Has a module read or write keys of other names, as a loss of TorchRL does.
-
-    Attributes:
-        tensor_keys: what may be renamed, and the key that each has.
-    """
-
-    tensor_keys: ClassVar[Mapping[str, NestedKey]]
-
-    def set_keys(self, **names: NestedKey | None) -> None:
-        """Give keys other names; None is the default's.
-
-        Raises:
-            ValueError: for what has no key here; nothing is changed.
-        """
-        defaults = type(self).tensor_keys
-        for name in names:
-            if name not in defaults:
-                guess = did_you_mean(name, defaults)
-                raise ValueError(f"set_keys: expected some of {', '.join(defaults)}, got {name!r}{guess}")
-        given = {name: unravel_key(key or defaults[name]) for name, key in names.items()}
-        vars(self)["tensor_keys"] = {**self.tensor_keys, **given}

@@ -16,6 +16,7 @@ from torchrl_sparse.carried import (
     COUNT,
     FLAG,
     Entry,
+    TensorKeys,
     carried_entries,
     carried_keys,
     check_carried,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 _HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 
 
-class ChunkExecutor(keys.TensorKeys, TensorDictModuleBase):
+class ChunkExecutor(TensorKeys, TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
 
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import TensorKeys
 from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
@@ -19,7 +20,7 @@ from torchrl_sparse.policies.diffusion.cameras import CameraSlot
 __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
 
-class ConditionEncoder(keys.TensorKeys, nn.Module):
+class ConditionEncoder(TensorKeys, nn.Module):
     """Computes the condition f32 [*B, To, D] of observations; D is the features' size and the state's together.
 
     Args:
