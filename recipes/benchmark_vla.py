@@ -24,13 +24,13 @@ from torchrl_sparse.evaluation.benchmarks.vla import filmed_methods, token_setti
 from torchrl_sparse.evaluation.benchmarks.vla_benchmark import VLABenchmark
 from torchrl_sparse.evaluation.results.short_table import print_results
 from torchrl_sparse.evaluation.results.tracking import log_benchmark
-from torchrl_sparse.methods.vla import TokenMethodName, check_matches
+from torchrl_sparse.methods.vla import check_matches, parse_token_method
 
 
 @recipe("benchmark_vla")
 def main(config: DictConfig) -> None:
     out, methods = Path(config.out), [*dict.fromkeys(["dense", *config.methods])]
-    check_names(config, TokenMethodName.parse)
+    check_names(config, parse_token_method)
     check_matches(methods)
     filmed_methods(
         config.videos, methods

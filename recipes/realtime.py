@@ -26,7 +26,7 @@ from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.benchmarks.late import RealtimeBenchmark
 from torchrl_sparse.evaluation.results.realtime import format_realtime
 from torchrl_sparse.methods.diffusion import check_method
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.calibration import lazy_calibration
 from torchrl_sparse.training.diffusion.published import executed_steps
@@ -58,7 +58,7 @@ def main(config: DictConfig) -> None:
 
 def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy) -> StateModel | None:
     """Fit what methods named ``_ahead`` roll the policy's state forward with; None if there are none."""
-    if not any(MethodName.parse(name).ahead for name in config.methods):
+    if not any(MethodSpec.parse(name).ahead for name in config.methods):
         return None
     if config.demos is None:
         raise InputError("demos: expected demonstrations to fit the _ahead methods' model to, got null")

@@ -34,6 +34,7 @@ from .evaluation import (
 from .methods import (
     METHODS as METHODS,
     Method as Method,
+    MethodSpec as MethodSpec,
     TokenBudget as TokenBudget,
     make_method as make_method,
 )

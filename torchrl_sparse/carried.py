@@ -12,7 +12,7 @@ and `ChunkExecutor.make_tensordict_primer` makes of all of them the transform th
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase, unravel_key
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from torchrl_sparse import keys
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.runtime.names import did_you_mean
 
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
@@ -29,6 +30,7 @@ __all__ = [
     "COUNT",
     "FLAG",
     "Entry",
+    "TensorKeys",
     "carried_entries",
     "carried_keys",
     "check_carried",
@@ -130,3 +132,27 @@ def _lacks(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         return torch.stack([_lacks(row, key) for row in rows], tensordict.stack_dim)
     missing = tensordict.get(key, None) is None
     return torch.full((*tensordict.batch_size, 1), missing, device=tensordict.device)
+
+
+class TensorKeys:
+    """Has a module read or write keys of other names, as a loss of TorchRL does.
+
+    Attributes:
+        tensor_keys: what may be renamed, and the key that each has.
+    """
+
+    tensor_keys: ClassVar[Mapping[str, NestedKey]]
+
+    def set_keys(self, **names: NestedKey | None) -> None:
+        """Give keys other names; None is the default's.
+
+        Raises:
+            ValueError: for what has no key here; nothing is changed.
+        """
+        defaults = type(self).tensor_keys
+        for name in names:
+            if name not in defaults:
+                guess = did_you_mean(name, defaults)
+                raise InputError(f"set_keys: expected some of {', '.join(defaults)}, got {name!r}{guess}")
+        given = {name: unravel_key(key or defaults[name]) for name, key in names.items()}
+        vars(self)["tensor_keys"] = {**self.tensor_keys, **given}

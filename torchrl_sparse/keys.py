@@ -137,6 +137,15 @@ def history(name: str) -> tuple[str, str]:
     return ("history", name)
 
 
+def history_of(key: NestedKey) -> tuple[str, str]:
+    """Return the key of the last entries of an environment's observation, which has that observation's last name.
+
+    >>> history_of(("robot", "proprio")), history_of("proprio")
+    (('history', 'proprio'), ('history', 'proprio'))
+    """
+    return history(key if isinstance(key, str) else key[-1])
+
+
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """Return the entry under ``key``.
 

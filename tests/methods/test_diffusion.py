@@ -26,7 +26,7 @@ from torchrl_sparse.methods.diffusion import (
     method_identity,
 )
 from torchrl_sparse.methods.executor import make_executor
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 
 LAYERS = 2
 QUERY = TensorDict({"history": {"state": torch.zeros(1, 2, SIZES["cond_dim"])}}, [1])
@@ -96,7 +96,7 @@ def test_how_often_and_for_how_many_chunks_is_written_behind_any_method(make):
         assert (actor.n_action_steps, actor.num_samples) == (every, samples)
         assert (actor.selector is not None) == (samples > 1)
     assert make("ddpm_82_14_every2_of8").sampler.name == "ddpm_82_14"
-    assert MethodName.parse("sag_every2:int8@0.9") == MethodName("sag", (0.9,), "int8", every=2)
+    assert MethodSpec.parse("sag_every2:int8@0.9") == MethodSpec("sag", rates=(0.9,), weights="int8", every=2)
 
 
 def test_a_chunk_is_not_executed_beyond_its_end(make):

@@ -49,8 +49,10 @@ def test_controls_are_made_as_they_are_named():
     [
         ("fastw", "one of dense, specprune, .*"),
         ("dense@0.5", "dense"),
-        ("fastv@", "fastv or fastv@NUMBER or fastv@METHOD"),
-        ("fastv@-1", "fastv or fastv@NUMBER or fastv@METHOD"),
+        ("fastv@", "NAME, NAME@RATE, NAME@COARSE-FINE or NAME@METHOD, .*"),
+        ("fastv@0.3-0.4", "fastv or fastv@NUMBER or fastv@METHOD"),
+        ("fastv_every2", "fastv or fastv@NUMBER or fastv@METHOD"),
+        ("fastv@-1", "NAME, .*"),
         ("sparsevlm@specprune", "sparsevlm or sparsevlm@NUMBER"),
         ("specprune@fastv", "specprune or specprune@NUMBER"),
     ],

@@ -29,7 +29,11 @@ from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.evaluation.statistics.sequential import Design
 from torchrl_sparse.methods.diffusion import make_controller, make_method
 from torchrl_sparse.methods.token_budget import TokenBudget
-from torchrl_sparse.methods.vla import TokenMethodName, make_controller as make_token_controller, make_pruner
+from torchrl_sparse.methods.vla import (
+    make_controller as make_token_controller,
+    make_pruner,
+    parse_token_method,
+)
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.storage.json import to_plain
@@ -129,7 +133,7 @@ def vla_actor(folder: Path, name: str, recorded: Sequence[TensorDictBase], kept:
         pruner = TokenBudget.from_pretrained(folder / name).pruner()
         return ChunkExecutor(_vla(folder).with_pruner(pruner), 1)
     number = None
-    if TokenMethodName.parse(name).like is not None:
+    if parse_token_method(name).like is not None:
         number = matching_share(lambda share: make_pruner(name, number=share), _vla(folder), [recorded], kept)
     return ChunkExecutor(
         _vla(folder).with_pruner(make_pruner(name, number=number)), 1, make_token_controller(name)

@@ -16,6 +16,7 @@ from torchrl_sparse.carried import (
     COUNT,
     FLAG,
     Entry,
+    TensorKeys,
     carried_entries,
     carried_keys,
     check_carried,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 _HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 
 
-class ChunkExecutor(TensorDictModuleBase):
+class ChunkExecutor(TensorKeys, TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
 
     A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
@@ -69,6 +70,8 @@ class ChunkExecutor(TensorDictModuleBase):
         (torch.Size([2, 7]), True)
     """
 
+    tensor_keys = {"action": keys.ACTION}  # may be named otherwise by `set_keys`
+
     def __init__(
         self,
         policy: TensorDictModuleBase,
@@ -94,21 +97,16 @@ class ChunkExecutor(TensorDictModuleBase):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        return _unique(
-            [
-                keys.IS_INIT,
-                *(self.controller.in_keys if self.controller is not None else ()),
-                *(key for key in self.policy.in_keys if key not in _HANDED_OVER),
-            ]
-        )
+        controlled = [] if self.controller is None else self.controller.in_keys
+        asked = [key for key in self.policy.in_keys if key not in _HANDED_OVER]
+        return list(dict.fromkeys([keys.IS_INIT, *controlled, *asked]))
 
     @property
     def out_keys(self) -> list[NestedKey]:
         chosen = [keys.CHOSEN] if self.selector is not None else []
-        own = [keys.ACTION, keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
-        return _unique(
-            [*own, *(self.controller.out_keys if self.controller is not None else ()), *self.policy.out_keys]
-        )
+        own = [self.tensor_keys["action"], keys.AGE, keys.UNTIL_QUERY, keys.QUERIED, *chosen]
+        controlled = [] if self.controller is None else self.controller.out_keys
+        return list(dict.fromkeys([*own, *controlled, *self.policy.out_keys]))
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -125,7 +123,7 @@ class ChunkExecutor(TensorDictModuleBase):
         tensordict.set(keys.AGE, age)
         tensordict.set(keys.UNTIL_QUERY, self._until_query(age))
         tensordict.set(keys.QUERIED, due)
-        return tensordict.set(keys.ACTION, self._serve(tensordict, age))
+        return tensordict.set(self.tensor_keys["action"], self._serve(tensordict, age))
 
     def make_tensordict_primer(self, chunk_shape: tuple[int, int] | None = None) -> TensorDictPrimer:
         """Return the transform that gives all that this actor carries from step to step its place in an environment's spec.
@@ -293,7 +291,3 @@ def action_at(chunk: Tensor, age: Tensor) -> Tensor:
     """Return the action [*B, A] at position ``age`` [*B, 1] of ``chunk`` [*B, n, A]."""
     index = age[..., None].expand(*age.shape, chunk.shape[-1])
     return chunk.gather(-2, index).squeeze(-2)
-
-
-def _unique(nested_keys: list) -> list:
-    return list(dict.fromkeys(nested_keys))

@@ -64,7 +64,7 @@ class PlainLoop:
         device = self._policy.normalizer.state_scale.device
         self._carried = self._executor(td.to(device)).detach()
         self._step += 1
-        return self._carried[keys.ACTION].cpu().numpy()
+        return self._carried[self._executor.tensor_keys["action"]].cpu().numpy()
 
     def _read(self, name: str, value: np.ndarray) -> Tensor:
         if name in ("image", "wrist_image"):

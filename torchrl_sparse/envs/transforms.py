@@ -35,13 +35,14 @@ def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEn
     return TransformedEnv(env, Compose(InitTracker(), *histories))
 
 
-def state_history(n_obs_steps: int) -> list[Transform]:
-    """Return transforms that write ``("history", "state")``, f32 [*B, n_obs_steps, Ds], oldest first."""
+def state_history(n_obs_steps: int, state: NestedKey = keys.STATE) -> list[Transform]:
+    """Return transforms that write the history of ``state``, f32 [*B, n_obs_steps, Ds], oldest first, under its last name."""
+    history = keys.history_of(state)
     if n_obs_steps < 1:
         raise InputError(f"n_obs_steps: expected at least 1, got {n_obs_steps}")
     return [
-        UnsqueezeTransform(dim=-2, in_keys=[keys.STATE], out_keys=[keys.HISTORY_STATE]),
-        CatFrames(N=n_obs_steps, dim=-2, in_keys=[keys.HISTORY_STATE]),
+        UnsqueezeTransform(dim=-2, in_keys=[state], out_keys=[history]),
+        CatFrames(N=n_obs_steps, dim=-2, in_keys=[history]),
     ]
 
 

@@ -13,37 +13,37 @@ from torchrl_sparse.control.selectors import CoherentChunk
 from torchrl_sparse.control.temporal_ensemble import TemporalEnsemble
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.methods.diffusion import make_controller
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 
 __all__ = ["execution_options", "executed_every", "make_executor", "make_realtime_executor"]
 
 
-def executed_every(text: str, policy: DiffusionPolicy, n_action_steps: int) -> int:
+def executed_every(method: MethodSpec | str, policy: DiffusionPolicy, n_action_steps: int) -> int:
     """Return the environment steps from one query of a method to the next.
 
     Args:
-        text: the method, such as ``"ddpm3_logsnr_every2"``.
+        method: such as ``"ddpm3_logsnr_every2"``.
         policy: whose chunks they are.
         n_action_steps: of methods that do not say.
 
     Raises:
         ValueError: if a chunk has fewer actions than the method says.
     """
-    every, length = MethodName.parse(text).every, policy.horizon - policy.n_obs_steps + 1
+    every, length = MethodSpec.parse(method).every, policy.horizon - policy.n_obs_steps + 1
     if every is not None and every > length:
-        raise InputError(f"methods: {text}: expected at most the {length} actions of a chunk, got {every}")
+        raise InputError(f"methods: {method}: expected at most the {length} actions of a chunk, got {every}")
     return every or n_action_steps
 
 
-def execution_options(text: str) -> dict[str, Any]:
+def execution_options(method: MethodSpec | str) -> dict[str, Any]:
     """Return ``num_samples`` and ``selector`` of an executor: backward coherence alone, where several chunks are sampled."""
-    samples = MethodName.parse(text).samples
+    samples = MethodSpec.parse(method).samples
     selector: TensorDictModuleBase | None = CoherentChunk() if samples > 1 else None
     return {"num_samples": samples, "selector": selector}
 
 
-def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> ChunkExecutor:
+def make_executor(method: MethodSpec | str, policy: DiffusionPolicy, n_action_steps: int) -> ChunkExecutor:
     """Return what executes the chunks of a method; the arguments are those of `executed_every`.
 
     Raises:
@@ -55,14 +55,16 @@ def make_executor(text: str, policy: DiffusionPolicy, n_action_steps: int) -> Ch
         >>> actor.n_action_steps, actor.num_samples
         (2, 4)
     """
-    if MethodName.parse(text).ahead:
-        raise InputError(f"methods: {text}: expected no _ahead where the world waits for an answer")
-    steps = executed_every(text, policy, n_action_steps)
-    return ChunkExecutor(_averaged(text, policy), steps, make_controller(text), **execution_options(text))
+    if MethodSpec.parse(method).ahead:
+        raise InputError(f"methods: {method}: expected no _ahead where the world waits for an answer")
+    steps = executed_every(method, policy, n_action_steps)
+    return ChunkExecutor(
+        _averaged(method, policy), steps, make_controller(method), **execution_options(method)
+    )
 
 
 def make_realtime_executor(
-    text: str,
+    method: MethodSpec | str,
     policy: DiffusionPolicy,
     n_action_steps: int,
     *,
@@ -74,7 +76,7 @@ def make_realtime_executor(
     """Return what executes the chunks of a method in a world that does not wait.
 
     Args:
-        text, policy, n_action_steps: of `executed_every`.
+        method, policy, n_action_steps: of `executed_every`.
         hold, latency, control_freq: of `RealtimeExecutor`.
         model: what methods named ``_ahead`` roll the state forward with.
 
@@ -82,17 +84,17 @@ def make_realtime_executor(
         ValueError: as `executed_every`, and for an ``_ahead`` without a model.
     """
     asked: TensorDictModuleBase = policy
-    if MethodName.parse(text).ahead:
+    if MethodSpec.parse(method).ahead:
         if model is None:
             raise InputError(
-                f"methods: {text}: expected demos, to which the model of the state is fitted, got none"
+                f"methods: {method}: expected demos, to which the model of the state is fitted, got none"
             )
         asked = RollForward(policy, model.to(policy.device))
-    every = executed_every(text, policy, n_action_steps)
-    averaged, options = _averaged(text, asked), execution_options(text)
+    every = executed_every(method, policy, n_action_steps)
+    averaged, options = _averaged(method, asked), execution_options(method)
     return RealtimeExecutor(averaged, hold, every, latency=latency, control_freq=control_freq, **options)
 
 
-def _averaged(text: str, policy: TensorDictModuleBase) -> TensorDictModuleBase:
+def _averaged(method: MethodSpec | str, policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """Return the policy, its chunks averaged over queries where the method says so."""
-    return TemporalEnsemble(policy) if MethodName.parse(text).ensembled else policy
+    return TemporalEnsemble(policy) if MethodSpec.parse(method).ensembled else policy

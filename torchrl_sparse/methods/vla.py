@@ -1,6 +1,7 @@
 """The methods of a vision-language-action policy by name: pruner, controller, and colour in figures.
 
-A method is written ``NAME``, ``NAME@NUMBER`` or ``NAME@METHOD``. NAME is a key of :data:`TOKEN_METHODS`; NUMBER is the argument
+A method is a `MethodSpec` or its label: ``NAME``, ``NAME@NUMBER`` or ``NAME@METHOD``.
+NAME is a key of :data:`TOKEN_METHODS`; NUMBER is the argument
 that the method is tuned by, such as SpecPrune's alpha or the share of tokens that stays; METHOD is another method, of which as
 many tokens are kept: ``fastv@specprune@0.4``.
 
@@ -11,9 +12,8 @@ A method of one's own is one line, executed before its name is used::
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_sparse.control.action_aware import ActionAwareController
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.runtime.names import did_you_mean
 from torchrl_sparse.tokens.base import TokenPruner
 from torchrl_sparse.tokens.dense_first import DenseFirst
@@ -35,10 +36,10 @@ from torchrl_sparse.tokens.vla_cache import VLACachePruner
 __all__ = [
     "TOKEN_METHODS",
     "TokenMethod",
-    "TokenMethodName",
     "check_matches",
     "make_controller",
     "make_pruner",
+    "parse_token_method",
 ]
 
 Settings = Mapping[str, Mapping[str, Any]]
@@ -135,42 +136,26 @@ layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``
 ``sparsevlm_embeddings`` once, as the authors' release."""
 
 
-@dataclass(frozen=True)
-class TokenMethodName:
-    """A method as it is written: ``NAME``, ``NAME@NUMBER`` or ``NAME@METHOD``.
+def parse_token_method(method: MethodSpec | str) -> MethodSpec:
+    """Return a method that is in the table; ValueError if it is not, or is asked for what it does not take.
 
-    Attributes:
-        name: key of :data:`TOKEN_METHODS`.
-        number: see the module; None for the method's default.
-        like: the method whose tokens are matched, as it is written; None for none.
+    >>> parse_token_method("random@specprune@0.4").like
+    'specprune@0.4'
     """
-
-    name: str
-    number: float | None = None
-    like: str | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> TokenMethodName:
-        """Raise ValueError unless ``text`` is written as above.
-
-        >>> TokenMethodName.parse("fastv@0.3")
-        TokenMethodName(name='fastv', number=0.3, like=None)
-        >>> TokenMethodName.parse("random@specprune@0.4").like
-        'specprune@0.4'
-        """
-        name, at, rest = text.partition("@")
-        method = TOKEN_METHODS.get(name)
-        if method is None:
-            guess = did_you_mean(name, TOKEN_METHODS)
-            raise InputError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {text!r}{guess}")
-        if not at:
-            return cls(name)
-        if method.number is not None and re.fullmatch(r"\d*\.?\d+", rest):
-            return cls(name, number=float(rest))
-        if method.matches and rest.partition("@")[0] in TOKEN_METHODS:
-            return cls(name, like=rest)
-        forms = [name, *([f"{name}@NUMBER"] if method.number else []), *([f"{name}@METHOD"] * method.matches)]
-        raise InputError(f"methods: expected {' or '.join(forms)}, got {text!r}")
+    written = MethodSpec.parse(method)
+    name, rates, like = written.name, written.rates, written.like
+    if (known := TOKEN_METHODS.get(name)) is None:
+        guess = did_you_mean(name, TOKEN_METHODS)
+        raise InputError(f"methods: expected one of {', '.join(TOKEN_METHODS)}, got {str(method)!r}{guess}")
+    takes = [] if known.number is None else [f"{name}@NUMBER"], [f"{name}@METHOD"] * known.matches
+    executed = replace(written, rates=(), like=None) != MethodSpec.parse(name)
+    if executed or len(rates) > len(takes[0]) or (like is not None and not known.matches):
+        raise InputError(
+            f"methods: expected {' or '.join([name, *takes[0], *takes[1]])}, got {str(method)!r}"
+        )
+    if like is not None:
+        parse_token_method(like)
+    return written
 
 
 def check_matches(texts: Iterable[str]) -> None:
@@ -181,7 +166,7 @@ def check_matches(texts: Iterable[str]) -> None:
     ...
     torchrl_sparse.errors.InputError: methods: fastv@specprune: expected one of dense after @, got 'specprune'
     """
-    like = {text: TokenMethodName.parse(text).like for text in texts}
+    like = {text: parse_token_method(text).like for text in texts}
     plain = [text for text, matched in like.items() if matched is None]
     for text, matched in like.items():
         if matched is not None and matched not in plain:
@@ -189,12 +174,12 @@ def check_matches(texts: Iterable[str]) -> None:
 
 
 def make_pruner(
-    text: str, *, number: float | None = None, settings: Settings | None = None
+    method: MethodSpec | str, *, number: float | None = None, settings: Settings | None = None
 ) -> TokenPruner | None:
     """Return the pruner of a method, None for the dense policy.
 
     Args:
-        text: the method, as the module says.
+        method: as the module says.
         number: takes the place of the one that is written, where another method is matched.
         settings: sections of further arguments, see `TokenMethod`.
 
@@ -205,33 +190,33 @@ def make_pruner(
         >>> make_pruner("specprune@0.8", settings={"specprune": {"budget": 20.0}}).options.alpha
         0.8
     """
-    written = TokenMethodName.parse(text)
-    method = TOKEN_METHODS[written.name]
-    number = written.number if number is None else number
-    arguments = settings_of(text, settings)
-    if number is not None:
-        if method.number is None:
-            raise InputError(f"number: expected none for {written.name}, got {number}")
-        arguments[method.number] = number
-    return method.make(**arguments)
+    written = parse_token_method(method)
+    entry, arguments = TOKEN_METHODS[written.name], settings_of(written, settings)
+    for value in written.rates if number is None else (number,):
+        if entry.number is None:
+            raise InputError(f"number: expected none for {written.name}, got {value}")
+        arguments[entry.number] = value
+    return entry.make(**arguments)
 
 
-def make_controller(text: str, settings: Settings | None = None) -> TensorDictModuleBase | None:
+def make_controller(
+    method: MethodSpec | str, settings: Settings | None = None
+) -> TensorDictModuleBase | None:
     """Return the controller of a method, None where it has none.
 
     Args:
-        text: the method.
+        method: as the module says.
         settings: with its arguments under ``controller``.
 
     Examples:
         >>> make_controller("specprune", {"controller": {"fine": 36.0}}).budgets
         (24.0, 36.0)
     """
-    make = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
+    make = TOKEN_METHODS[parse_token_method(method).name].controller
     return None if make is None else make(**(settings or {}).get("controller", {}))
 
 
-def settings_of(text: str, settings: Settings | None) -> dict[str, Any]:
+def settings_of(method: MethodSpec | str, settings: Settings | None) -> dict[str, Any]:
     """Return the section of ``settings`` that a method reads; empty where it reads none."""
-    section = TOKEN_METHODS[TokenMethodName.parse(text).name].settings
+    section = TOKEN_METHODS[parse_token_method(method).name].settings
     return {} if section is None else dict((settings or {}).get(section, {}))

@@ -39,7 +39,7 @@ from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
 from torchrl_sparse.evaluation.results.schema import DENSE, load_results
 from torchrl_sparse.evaluation.results.tables import markdown_table
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.diffusion.published import executed_steps
 from torchrl_sparse.training.diffusion.targets import make_targets
@@ -94,11 +94,11 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
         if results.task != task:
             raise InputError(f"results: {path}: expected a table of {task}, got one of {results.task}")
         found = outcomes(results).items()
-        played[path] = {name: outcome for name, outcome in found if answers_alone(MethodName.parse(name))}
+        played[path] = {name: outcome for name, outcome in found if answers_alone(MethodSpec.parse(name))}
     return played
 
 
-def answers_alone(name: MethodName) -> bool:
+def answers_alone(name: MethodSpec) -> bool:
     """Tell whether episodes follow from the method's answers, not from how often or for how many it is asked."""
     return name.every is None and name.samples == 1 and not name.ensembled and not name.ahead
 

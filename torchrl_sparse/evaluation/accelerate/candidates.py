@@ -21,7 +21,7 @@ from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.accelerate.stages import Search, read_or_make
 from torchrl_sparse.evaluation.results.acceleration import Family
 from torchrl_sparse.evaluation.results.schema import DENSE
-from torchrl_sparse.methods.names import WEIGHTS
+from torchrl_sparse.methods.spec import WEIGHTS
 from torchrl_sparse.networks.diffusion.naming import SamplerName
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy

@@ -33,8 +33,9 @@ from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.schema import DENSE, Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, totals
 from torchrl_sparse.evaluation.statistics.fidelity import block_errors
-from torchrl_sparse.methods.diffusion import MethodName, make_method, method_identity
+from torchrl_sparse.methods.diffusion import make_method, method_identity
 from torchrl_sparse.methods.executor import make_executor
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 
@@ -146,7 +147,7 @@ def settle_rates(
 ) -> None:
     """Set the rate of each method whose controller moves it to the mean of its episodes, at which it is then timed."""
     for name, method in methods.items():
-        rates = MethodName.parse(name).rates
+        rates = MethodSpec.parse(name).rates
         if len(rates) == 2:
             method.plan.rate = min(max(totals(episodes[name]).prune_rate, min(rates)), max(rates))
 
@@ -162,7 +163,7 @@ def time_methods(
         repeats: queries that are timed under each method.
         threads: of PyTorch while timing.
     """
-    samples = {name: MethodName.parse(name).samples for name in methods}
+    samples = {name: MethodSpec.parse(name).samples for name in methods}
     timed = {name: method for name, method in methods.items() if name not in _SAME_COMPUTATION}
     with progress("latency", "round", repeats) as show:
         latency = time_queries(
@@ -197,8 +198,8 @@ def measure_methods(
             latency[name],
             error_to_dense(method, answers[name], queries),
             planning.get(name),
-            MethodName.parse(name).every,
-            MethodName.parse(name).samples * flops_executed(method, answers[name]),
+            MethodSpec.parse(name).every,
+            MethodSpec.parse(name).samples * flops_executed(method, answers[name]),
         )
         for name, method in methods.items()
     }

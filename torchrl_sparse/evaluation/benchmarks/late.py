@@ -23,7 +23,7 @@ from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log
 from torchrl_sparse.methods.diffusion import method_identity
 from torchrl_sparse.methods.executor import make_realtime_executor
-from torchrl_sparse.methods.names import MethodName
+from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.trainer import checksum
 
@@ -114,7 +114,7 @@ class RealtimeBenchmark(Benchmark):
     def identity(self, name: str) -> dict[str, Any]:
         method, steps = _delayed(name)
         late = {"n_action_steps": self.actor(name).n_action_steps, "delay_steps": steps}
-        if MethodName.parse(method).ahead:
+        if MethodSpec.parse(method).ahead:
             late["state_model"] = checksum(self.model.weight)
         return method_identity(method, self.methods[method]) | self.settings | late
 

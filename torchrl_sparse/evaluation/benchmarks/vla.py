@@ -16,7 +16,13 @@ from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult, tokens_kept
 from torchrl_sparse.evaluation.rollouts.vla_methods import matching_share
 from torchrl_sparse.methods.token_budget import TokenBudget
-from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, make_controller, make_pruner
+from torchrl_sparse.methods.vla import (
+    TOKEN_METHODS,
+    Settings,
+    make_controller,
+    make_pruner,
+    parse_token_method,
+)
 from torchrl_sparse.networks.vla.hooks import VisualSpec
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.tokens.efficientvla import SIMILARITY, LayerSimilarity, redundant_layers
@@ -63,7 +69,7 @@ def record_methods(
     """
     recorded, by_controller = {}, {}
     for text in texts:
-        controller = TOKEN_METHODS[TokenMethodName.parse(text).name].controller
+        controller = TOKEN_METHODS[parse_token_method(text).name].controller
         if controller not in by_controller:
             actor = ChunkExecutor(dense, n_action_steps, make_controller(text, settings))
             episodes = recorded_queries(dense, actor, make_env, seeds)
@@ -115,7 +121,7 @@ def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) ->
         ValueError: naming the method.
     """
     for text in texts:
-        if TokenMethodName.parse(text).like is None and (pruner := make_pruner(text, settings=settings)):
+        if parse_token_method(text).like is None and (pruner := make_pruner(text, settings=settings)):
             budgets = getattr(make_controller(text, settings), "budgets", ())
             for budget in budgets if isinstance(pruner, SpecPrune) else ():
                 check_budget(f"methods: {text}: alpha * budget", pruner.options.alpha * budget, spec)
@@ -133,7 +139,7 @@ def filmed_methods(videos: Iterable[str], methods: Sequence[str]) -> dict[str, s
     """
     filmed = {}
     for video in videos:
-        meant = [name for name in methods if video in (name, TokenMethodName.parse(name).name)]
+        meant = [name for name in methods if video in (name, parse_token_method(name).name)]
         if video not in meant and len(meant) != 1:
             raise InputError(f"videos: expected one of {', '.join(methods)}, got {video!r}")
         filmed[video] = video if video in meant else meant[0]
@@ -156,9 +162,9 @@ def matched_number(
         episodes: name -> episodes, those of the method that is matched among them.
         settings: see `make_pruner`.
     """
-    written = TokenMethodName.parse(text)
+    written = parse_token_method(text)
     if written.like is None:
-        return written.number
+        return next(iter(written.rates), None)
     kept = tokens_kept(episodes[written.like]).kept_mean
     budgets = getattr(make_controller(text, settings), "budgets", (1.0,))
     fits = dense.network.config.visual_spec.per_camera / max(budgets)  # of an alpha, which multiplies them
@@ -173,4 +179,4 @@ def matched_number(
 
 def matches_last(texts: Iterable[str]) -> list[str]:
     """Return methods in the order in which they can run: those that match another after all others."""
-    return sorted(texts, key=lambda text: TokenMethodName.parse(text).like is not None)
+    return sorted(texts, key=lambda text: parse_token_method(text).like is not None)

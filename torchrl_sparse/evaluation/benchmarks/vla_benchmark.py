@@ -36,7 +36,7 @@ from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.schema import DENSE, Results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.vla_methods import method_identity, prepared_queries
-from torchrl_sparse.methods.vla import Settings, TokenMethodName, make_controller, make_pruner
+from torchrl_sparse.methods.vla import Settings, make_controller, make_pruner, parse_token_method
 from torchrl_sparse.policies.vla.policy import VLAPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.training.vla.token_budget import replay
@@ -85,7 +85,7 @@ class VLABenchmark(Benchmark):
         dense, probed = self._dense, self.seeds[: self.options.probe_episodes]
         asked = {"n_action_steps": self.options.n_action_steps, "settings": self.pruning}
         self.recorded = record_methods(self.methods, dense, self.make_env, probed, **asked)
-        if any(TokenMethodName.parse(name).name == "efficientvla_layers" for name in self.methods):
+        if any(parse_token_method(name).name == "efficientvla_layers" for name in self.methods):
             skipped = skipped_layers(dense, self.recorded[DENSE], self.skipped)
             self.pruning["efficientvla"] = {"skipped": skipped}
         return super().play()

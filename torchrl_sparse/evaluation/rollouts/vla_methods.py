@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl_sparse import keys
 from torchrl_sparse.blocks.planner import tensors_fingerprint
 from torchrl_sparse.errors import InputError
-from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, TokenMethodName, settings_of
+from torchrl_sparse.methods.spec import MethodSpec
+from torchrl_sparse.methods.vla import TOKEN_METHODS, Settings, parse_token_method, settings_of
 from torchrl_sparse.networks.fingerprint import full_fingerprint
 from torchrl_sparse.networks.vla.vision import center_crop
 from torchrl_sparse.policies.vla.policy import VLAPolicy
@@ -25,7 +26,9 @@ __all__ = ["matching_share", "method_identity", "prepared_queries", "seen_images
 _HALVINGS = 10
 
 
-def method_identity(text: str, number: float | None, policy: VLAPolicy, settings: Settings) -> dict[str, Any]:
+def method_identity(
+    text: MethodSpec | str, number: float | None, policy: VLAPolicy, settings: Settings
+) -> dict[str, Any]:
     """Return what tells the episodes of one method from others', as JSON values for an `EpisodeLog`.
 
     Args:
@@ -37,8 +40,8 @@ def method_identity(text: str, number: float | None, policy: VLAPolicy, settings
     # sizes that no tensor shows, as the share of an image that is cropped and the number of heads
     sizes = json.dumps(policy.network.config.to_dict(), sort_keys=True).encode()
     fingerprint = full_fingerprint(tensors_fingerprint(policy.state_dict()), sizes)
-    identity = {"method": text, "number": number, "policy": fingerprint}
-    method = TOKEN_METHODS[TokenMethodName.parse(text).name]
+    identity = {"method": str(text), "number": number, "policy": fingerprint}
+    method = TOKEN_METHODS[parse_token_method(text).name]
     if method.settings is not None:
         identity["options"] = settings_of(text, settings)
         if number is not None:  # which takes the place of a calibrated one

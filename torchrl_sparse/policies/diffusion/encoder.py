@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import TensorKeys
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -20,7 +21,7 @@ from torchrl_sparse.policies.diffusion.cameras import CameraSlot
 __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
 
-class ConditionEncoder(nn.Module):
+class ConditionEncoder(TensorKeys, nn.Module):
     """Computes the condition f32 [*B, To, D] of observations; D is the features' size and the state's together.
 
     Args:
@@ -34,14 +35,24 @@ class ConditionEncoder(nn.Module):
             ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there.
     """
 
+    tensor_keys = {"state": keys.STATE}
+
     def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
         super().__init__()
         self.normalizer, self.vision = normalizer, vision
         self.cameras, self.bf16 = CameraSlot(), False
-        self.in_keys: list[NestedKey] = [keys.HISTORY_STATE]
-        if vision is not None:
-            self.in_keys += [keys.history(name) for name in vision.cameras]
-            self.in_keys += [keys.ELAPSED, keys.FRAME_FEATURES]
+
+    @property
+    def state_key(self) -> NestedKey:
+        """Where the last states are: the history of the environment's key."""
+        return keys.history_of(self.tensor_keys["state"])
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self.vision is None:
+            return [self.state_key]
+        cameras = [keys.history(name) for name in self.vision.cameras]
+        return [self.state_key, *cameras, keys.ELAPSED, keys.FRAME_FEATURES]
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """Encode one batch.
@@ -50,7 +61,7 @@ class ConditionEncoder(nn.Module):
             KeyError: if an observation is missing.
             ValueError: if images do not fit the encoder.
         """
-        state = self.normalizer.normalize_state(keys.read(tensordict, keys.HISTORY_STATE))
+        state = self.normalizer.normalize_state(keys.read(tensordict, self.state_key))
         if self.vision is None:
             return state
         images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
@@ -95,7 +106,6 @@ class ObservationEncoder(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.condition = ConditionEncoder(normalizer, vision)
-        self.in_keys = [*self.condition.in_keys, keys.EPISODE_SEED, keys.EPISODE_STEP]
         self.out_keys = [keys.COND, keys.SEED, *(() if vision is None else (keys.FRAME_FEATURES,))]
         features = 0 if vision is None else vision.feature_dim
         state = len(normalizer.state_scale)
@@ -107,8 +117,12 @@ class ObservationEncoder(TensorDictModuleBase):
         self.state_shape = (network.n_obs_steps, state)
         self.noise_stream = 0
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        return [*self.condition.in_keys, keys.EPISODE_SEED, keys.EPISODE_STEP]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._check(keys.read(tensordict, keys.HISTORY_STATE))
+        self._check(keys.read(tensordict, self.condition.state_key))
         # In use, weights of the cameras' networks are no reason to keep a graph; observations still are.
         encoder = self.condition.vision
         frozen = encoder is not None and not self.training
@@ -119,7 +133,8 @@ class ObservationEncoder(TensorDictModuleBase):
         return tensordict.set(keys.SEED, self.seed(tensordict))
 
     def take_over(self, other: ObservationEncoder) -> None:
-        """Draw the noise that ``other`` does, and share what it has made of the cameras' weights."""
+        """Draw the noise that ``other`` does, read its keys, and share what it has made of the cameras' weights."""
+        self.condition.set_keys(**other.condition.tensor_keys)
         self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
 
     def refresh(self) -> None:
@@ -127,20 +142,19 @@ class ObservationEncoder(TensorDictModuleBase):
         self.condition.cameras.refresh()
 
     def _check(self, state: Tensor) -> None:
+        key = self.condition.state_key
         if tuple(state.shape[-2:]) != self.state_shape:
             raise InputError(
-                f"{keys.HISTORY_STATE}: expected [*B, n_obs_steps, state] = [*B, {self.state_shape[0]}, "
+                f"{key}: expected [*B, n_obs_steps, state] = [*B, {self.state_shape[0]}, "
                 f"{self.state_shape[1]}], got {list(state.shape)}"
             )
         if state.is_meta or state.is_complex() or state.layout != torch.strided:
             raise InputError(
-                f"{keys.HISTORY_STATE}: expected real numbers in memory, got {state.dtype} {state.layout} on {state.device}"
+                f"{key}: expected real numbers in memory, got {state.dtype} {state.layout} on {state.device}"
             )
         if not state.isfinite().all():
             bad = (~state.isfinite()).nonzero()[0].tolist()
-            raise InputError(
-                f"{keys.HISTORY_STATE}: expected finite numbers, got {state[tuple(bad)]} at {bad}"
-            )
+            raise InputError(f"{key}: expected finite numbers, got {state[tuple(bad)]} at {bad}")
 
     def seed(self, tensordict: TensorDictBase) -> Tensor:
         """Return the seed of each query's noise, i64 [*B, 1]."""

@@ -160,8 +160,8 @@ class DiffusionPolicy(FreezablePolicy):
         same: dict[str, Any] = {"vision": self.vision, "sampler": self.sampler, "engine": self.engine}
         policy = DiffusionPolicy(self.network, self.normalizer, **same)
         policy.source = self.source
-        policy._install(plan, sampler or self.sampler, start)
         policy.module["encode"].take_over(self.module["encode"])
+        policy._install(plan, sampler or self.sampler, start)
         policy.noise = self.noise
         return policy.freeze() if self.frozen else policy
 

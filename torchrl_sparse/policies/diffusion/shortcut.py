@@ -94,7 +94,7 @@ def answer_directly(
         parts.frozen.check()
     network, sampler, scales = parts.network, denoise.sampler, parts.scales
     engine = denoise.engine.get(network, sampler)
-    state = tensordict.get(keys.HISTORY_STATE, None)
+    state = tensordict.get(encode.condition.state_key, None)
     if type(engine) is not NativeEngine or type(state) is not Tensor or not _is_plain(state):
         return False
     batch = tensordict.batch_size

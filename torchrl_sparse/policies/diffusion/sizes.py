@@ -67,6 +67,23 @@ class PolicySizes:
         """(n, A) of a chunk."""
         return self.horizon - self.n_obs_steps + 1, self.network.input_dim
 
+    def set_keys(self, **names: NestedKey | None) -> None:
+        """Read an environment that has other names, as losses of TorchRL do.
+
+        Args:
+            names: ``state``, the environment's key, ``("observation", "state")`` where none is set. The policy reads its
+                history, such as ``("history", "proprio")``, which `state_history` writes. Files do not keep names.
+
+        Examples:
+            >>> from torchrl_sparse import DiffusionPolicy
+            >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
+            >>> policy.set_keys(state=("observation", "proprio"))
+            >>> policy.in_keys[0]
+            ('history', 'proprio')
+        """
+        self.module["encode"].condition.set_keys(**names)
+        self.sampler = self.sampler  # which lists the keys anew
+
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
         """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
         frames = (self.n_obs_steps, 0 if self.vision is None else self.vision.feature_dim)
