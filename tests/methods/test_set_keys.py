@@ -11,6 +11,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from tests.fixtures.diffusion import SIZES
+from tests.refusals import refused
 from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Normalizer, Sampler, keys
 from torchrl_sparse.blocks.planner import Dense
 from torchrl_sparse.envs.transforms import state_history
@@ -97,10 +98,8 @@ def test_every_copy_keeps_the_names(renamed):
 
 
 def test_unknown_names_are_refused(renamed):
-    with pytest.raises(
-        ValueError, match=r"^set_keys: expected some of state, got 'stat', did you mean state\?$"
-    ):
+    with refused("set_keys"):
         renamed.policy.set_keys(state="other", stat="x")
-    with pytest.raises(ValueError, match=r"^set_keys: expected some of action, got 'state'"):
+    with refused("set_keys"):
         renamed.set_keys(state="x")
     assert ("history", "proprio") in renamed.policy.in_keys

@@ -69,7 +69,7 @@ OTHER_KINDS = {
 @pytest.mark.parametrize("case", OTHER_KINDS)
 def test_what_is_refused(engine, query, case):
     change, message = OTHER_KINDS[case]
-    with pytest.raises(ValueError, match=f"^{message}"):
+    with refused(message.partition(": ")[0]):
         engine.denoise(**{"noise": query[0], "cond": query[1], "mask": None} | change)
 
 

@@ -134,7 +134,7 @@ def test_chosen_timesteps_are_kept(policy, tmp_path):
 def test_truncated_and_missing_files_are_named(folder, name):
     file = folder / name
     file.write_bytes(file.read_bytes()[:60])
-    with pytest.raises(ValueError, match=f"{name}: expected a complete"):
+    with refused(name):
         DiffusionPolicy.from_pretrained(folder)
     file.unlink()
     with refused(name, FileNotFoundError):

@@ -173,7 +173,7 @@ def test_nothing_in_a_checkpoint_is_executed(make_trainer, tmp_path, monkeypatch
     (tmp_path / "pickle.pt").write_bytes(pickle.dumps(Bomb(), protocol=2))
     torch.save({"step": Bomb()}, tmp_path / "torch.pt")
     for name in ("pickle.pt", "torch.pt"):
-        with pytest.raises(ValueError, match=f"{name}: expected a training checkpoint"):
+        with refused(name):
             make_trainer().load(tmp_path / name)
     assert not (tmp_path / "exploded").exists()
 
@@ -185,7 +185,7 @@ def test_damaged_checkpoints_are_named(make_trainer, tmp_path):
     (tmp_path / "half.pt").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     torch.save({"step": 1}, tmp_path / "other.pt")
     for name in ("half.pt", "other.pt"):
-        with pytest.raises(ValueError, match=f"{name}: expected a training checkpoint"):
+        with refused(name):
             trainer.load(tmp_path / name)
     with pytest.raises(FileNotFoundError):
         trainer.load(tmp_path / "missing.pt")
