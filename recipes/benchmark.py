@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
         config.methods = default_methods(planners)
         print(f"methods: {', '.join(config.methods)}")
     check_names(config, partial(check_method, planners=planners))
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device).freeze()
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     config.n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     make_env = diffusion_env(task.name, policy, config.horizon)
     calibration = lazy_calibration(policy, make_env, config.calibration_samples)

@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
     find_task(config.task)  # before a policy is looked for under its name
     demonstrated = demonstrated_ways(config)
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device).freeze()
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     if config.sampler is not None:
         policy.sampler = policy.sampler.variant(**config.sampler)
     episodes = play(policy, config)

@@ -38,7 +38,7 @@ def main(config: DictConfig) -> None:
     task, planners = find_robosuite_task(config.task), Path(config.planners)
     for name in config.methods:
         check_method(name, planners)
-    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device).freeze()
+    policy = DiffusionPolicy.from_pretrained(config.policy, engine=config.engine).to(config.device)
     seen = policy_contract(task.name, policy).state_keys
     if seen != task.state_keys:  # from which the pose to hold is read
         raise InputError(

@@ -66,7 +66,7 @@ def fail(monkeypatch, capsys):
         ("calibrate_bac", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["task=juggle"], "task: expected one of Lift, "),
         ("evaluate_policy", ["policy=assets/can"], "policy: expected one of 19 observed numbers"),
-        ("train_pruner", ["init=nope.json"], "nope.json"),
+        ("train_pruner", ["init=nope.json"], "expected a file nope.json, got none"),
         ("train_pruner", ["method=l2c", "spread=1"], "spread: expected null with an init or with method=l2c"),
         ("profile_policy", ["device=abacus"], "device: expected one that this machine and PyTorch have"),
         ("train_policy", ["device=cuda:99"], "device: expected one that this machine and PyTorch have"),

@@ -19,7 +19,14 @@ from tests.torture.report import Verdict
 
 PART = "a malformed file is read"
 _TORN = ("cut", "empty", "two documents")
-REFUSALS = ("ValueError", "FileNotFoundError", "IsADirectoryError", "CheckpointError", "MaskError")
+REFUSALS = (
+    "InputError",
+    "ValueError",
+    "FileNotFoundError",
+    "IsADirectoryError",
+    "CheckpointError",
+    "MaskError",
+)
 
 
 @dataclass(frozen=True)

@@ -47,9 +47,9 @@ def read_checkpoint(
     except FileNotFoundError:
         raise
     except Exception as error:
-        # torch reports damaged and unsafe files through many exception types.
+        # torch reports damaged and unsafe files through many exception types, and advises to run what is in them.
         raise InputError(
-            f"{path}: expected a training checkpoint, got a file that torch cannot read: {error}"
+            f"{path}: expected a training checkpoint, got a file that torch cannot read: {str(error).partition('. ')[0]}"
         ) from error
     if not isinstance(state, dict) or not fields - optional <= set(state) <= fields:
         found = sorted(state) if isinstance(state, dict) else type(state).__name__

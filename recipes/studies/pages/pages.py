@@ -150,8 +150,10 @@ def _make_table(text: str, root: Path, where: str) -> str:
         tables = _read(directive, root)
         rows = _rows(directive, tables, root)
         return "\n\n".join(filter(None, (markdown_table(rows), _family(tables, rows))))
-    except (FileNotFoundError, ValueError) as error:
-        raise type(error)(f"{where}: {error}") from error
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{where}: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _read(directive: _Directive, root: Path) -> list[Table]:

@@ -34,6 +34,7 @@ class FreezablePolicy(PolicySizes, TensorDictSequential):
         seen are writes around PyTorch: to a storage, or to an address. Plan, sampler, start, engine and noise may change.
 
         ``copy.deepcopy(policy)``, a pickle, a worker of a collector and a saved policy are not frozen: freeze them again.
+        TorchRL's collectors exchange weights for a while where their ``policy_device`` is not the policy's. That is refused.
 
         Examples:
             >>> from torchrl_sparse import DiffusionPolicy
