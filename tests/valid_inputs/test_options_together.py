@@ -24,7 +24,7 @@ def test_a_film_of_what_is_not_measured_is_not_made_and_that_is_said(tmp_path):
     """Own: a name among `videos` that is a method but not among `methods` was passed over."""
     run = play(benchmark.TestOptions, tmp_path, ["videos=[uniform,saved]", "methods=[uniform]"])
     assert "no video of saved: not among the methods" in run.printed
-    assert [call["name"] for call in run.calls["film_masks"]] == ["uniform"]
+    assert [call["name"] for call in run.calls[benchmark.FILMED]] == ["uniform"]
 
 
 def test_one_episode_has_no_standard_error(tmp_path):
