@@ -120,7 +120,7 @@ def test_acs_finds_the_phases_of_a_block():
 
 
 @pytest.mark.parametrize(
-    ("similarity", "num_updates", "message"),
+    ("similarity", "num_updates", "entry"),
     [
         (torch.ones(4, 5), 2, "similarity"),
         (torch.ones(3, 4, 4), 2, "similarity"),
@@ -129,8 +129,8 @@ def test_acs_finds_the_phases_of_a_block():
         (torch.ones(4, 4), 5, "num_updates"),
     ],
 )
-def test_acs_refuses_wrong_input(similarity, num_updates, message):
-    with refused(message):
+def test_acs_refuses_wrong_input(similarity, num_updates, entry):
+    with refused(entry):
         acs(similarity, num_updates)
 
 
@@ -179,7 +179,7 @@ def test_upstream_blocks_are_the_highest_scores_and_the_shallower_of_equals():
 
 
 @pytest.mark.parametrize(
-    ("errors", "top_k", "message"),
+    ("errors", "top_k", "entry"),
     [
         ([1.0, 2.0], 1, "errors"),
         ([1.0, float("nan"), 2.0], 1, "errors"),
@@ -187,8 +187,8 @@ def test_upstream_blocks_are_the_highest_scores_and_the_shallower_of_equals():
         ([1.0, 2.0, 3.0], -1, "top_k"),
     ],
 )
-def test_bua_is_never_skipped_silently(errors, top_k, message):
-    with refused(message):
+def test_bua_is_never_skipped_silently(errors, top_k, entry):
+    with refused(entry):
         bubbling_union([[0], [0], [0]], errors, top_k)
 
 

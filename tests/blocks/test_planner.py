@@ -92,7 +92,7 @@ def test_dense_prunes_nothing_and_its_rows_can_be_written_one_by_one():
 
 
 @pytest.mark.parametrize(
-    ("masks", "message"),
+    ("masks", "entry"),
     [
         (torch.zeros(3, NUM_STEPS, 6), "Returns.masks: prune mask"),
         (torch.zeros(1, NUM_STEPS, 6, dtype=torch.bool), "Returns.masks: prune mask"),
@@ -100,10 +100,10 @@ def test_dense_prunes_nothing_and_its_rows_can_be_written_one_by_one():
         (None, "Returns.masks: prune mask"),
     ],
 )
-def test_what_a_planner_returns_is_checked(masks, message):
+def test_what_a_planner_returns_is_checked(masks, entry):
     planner = Returns(masks)
     planner.bind(SPEC)
-    with refused(message):
+    with refused(entry):
         planner(observations(3))
 
 

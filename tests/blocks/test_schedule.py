@@ -65,7 +65,7 @@ def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("damage", "entry"),
     [
         (lambda text: text[: len(text) // 2], "schedule.json"),
         (lambda text: "", "schedule.json"),
@@ -114,11 +114,11 @@ def test_saving_replaces_a_file_whole_and_leaves_nothing_else(schedule, path):
         ),
     ],
 )
-def test_a_damaged_file_is_refused_naming_file_and_field(path, damage, message):
+def test_a_damaged_file_is_refused_naming_file_and_field(path, damage, entry):
     before = path.read_text()
     path.write_text(damage(before))
     assert path.read_text() != before
-    with refused(message):
+    with refused(entry):
         CacheSchedule.from_pretrained(path)
 
 

@@ -27,7 +27,7 @@ def test_it_acts_as_in_the_environment(policy):
 
 
 @pytest.mark.parametrize(
-    ("observation", "message"),
+    ("observation", "entry"),
     [
         ({}, "observation"),
         ({"state": np.zeros(19), "force": np.zeros(3)}, "observation"),
@@ -37,10 +37,10 @@ def test_it_acts_as_in_the_environment(policy):
         ({"state": np.array(["a"] * 19)}, "state"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name_and_not_kept(policy, observation, message):
+def test_what_does_not_fit_is_refused_by_name_and_not_kept(policy, observation, entry):
     actor = ChunkExecutor(policy)
     actor.reset(seed=1)
-    with refused(message):
+    with refused(entry):
         actor.act(observation)
     good = {"state": np.zeros(19)}
     after = actor.act(good)

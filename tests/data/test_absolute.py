@@ -63,8 +63,8 @@ def replay(path, task):
 
 
 def test_deltas_are_not_read_as_poses(published):
-    message = "low_dim_v15.hdf5"
-    with refused(message):
+    entry = "low_dim_v15.hdf5"
+    with refused(entry):
         read_demos(published, ["robot0_eef_pos"])
 
 
@@ -209,7 +209,7 @@ def sawyer():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         (
             shift_hand,
@@ -233,12 +233,12 @@ def sawyer():
         (set_env_args(sawyer()), "changed.hdf5, env_args.env_kwargs.robots"),
     ],
 )
-def test_what_cannot_be_converted_is_named_and_leaves_no_file(published, tmp_path, change, message):
+def test_what_cannot_be_converted_is_named_and_leaves_no_file(published, tmp_path, change, entry):
     path = tmp_path / "changed.hdf5"
     path.write_bytes(published.read_bytes())
     with h5py.File(path, "r+") as file:
         change(file)
-    with refused(message) as error:
+    with refused(entry) as error:
         convert_demos(path, tmp_path / "out.h5")
     assert str(error.value).startswith(str(path))
     assert not (tmp_path / "out.h5").exists()

@@ -93,7 +93,7 @@ def replaced(value):
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("value", "entry"),
     [
         (None, "demos.h5, demo_1"),
         (
@@ -110,12 +110,12 @@ def replaced(value):
         ),
     ],
 )
-def test_a_wrong_file_names_the_demonstration(path, value, message):
+def test_a_wrong_file_names_the_demonstration(path, value, entry):
     with h5py.File(path, "r+") as file:
         replaced(value)(file)
-    with refused(message):
+    with refused(entry):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS)
-    with refused(message):
+    with refused(entry):
         read_demos(path, ["robot0_eef_pos"], cameras=CAMERAS, image_folder=path.parent / "images")
     assert not list((path.parent / "images").glob("*agentview*"))
 

@@ -71,7 +71,7 @@ def test_the_simulator_observes_the_same(source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"action": None}, "human.npz"),
         ({"action": np.zeros((7, 3))}, "human.npz, action"),
@@ -85,9 +85,9 @@ def test_the_simulator_observes_the_same(source, tmp_path):
         ({"keypoint": np.zeros((7, 9, 2))}, "human.npz, keypoint"),
     ],
 )  # fmt: skip
-def test_a_wrong_file_is_refused_by_name(source, tmp_path, changes, message):
+def test_a_wrong_file_is_refused_by_name(source, tmp_path, changes, entry):
     np.savez(source, **recording(**changes))
-    with refused(message):
+    with refused(entry):
         convert_pusht(source, tmp_path / "human.h5")
     assert not (tmp_path / "human.h5").exists()
 

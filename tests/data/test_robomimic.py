@@ -142,7 +142,7 @@ def resample(file):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         (delete("data"), "demos.h5"),
         (delete("data/demo_1/actions"), "demos.h5, demo_1"),
@@ -171,10 +171,10 @@ def resample(file):
         (resample, "demos.h5, demo_1, actions"),
     ],
 )
-def test_malformed_file_names_the_demonstration(path, change, message):
+def test_malformed_file_names_the_demonstration(path, change, entry):
     with h5py.File(path, "r+") as file:
         change(file)
-    with refused(message) as error:
+    with refused(entry) as error:
         read_demos(path, STATE_KEYS)
     assert "demos.h5" in str(error.value)
 

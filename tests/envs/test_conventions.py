@@ -89,7 +89,7 @@ def test_an_imported_policy_gets_the_environment_that_it_was_trained_in():
 
 
 @pytest.mark.parametrize(
-    ("source", "message"),
+    ("source", "entry"),
     [
         ({"task": "can_lowdim"}, "policy"),
         ({"task": "tool_hang_lowdim_abs"}, "policy"),
@@ -101,10 +101,10 @@ def test_an_imported_policy_gets_the_environment_that_it_was_trained_in():
         ({"weights": "model", "robosuite": "newest"}, "policy.source['robosuite']"),
     ],
 )
-def test_a_policy_of_something_else_is_refused_with_both_named(source, message):
+def test_a_policy_of_something_else_is_refused_with_both_named(source, entry):
     policy = DiffusionPolicy.from_pretrained("assets/lift")
     policy.source = source
-    with refused(message):
+    with refused(entry):
         diffusion_env("lift", policy)
 
 

@@ -53,7 +53,7 @@ def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         ({"method": "mine"}, "budget.json: method"),
         ({"method": "dense"}, "budget.json: method"),
@@ -68,11 +68,11 @@ def test_a_budget_is_read_back_and_makes_its_pruner(tmp_path):
         ({"settings": {"keep_share": 2}}, "budget.json: keep_share"),
     ],
 )
-def test_wrong_files_are_named(tmp_path, change, message):
+def test_wrong_files_are_named(tmp_path, change, entry):
     path = tmp_path / "budget.json"
     TokenBudget("specprune", 0.5, "action_error", 0.03, POINTS).save_pretrained(path)
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with refused(message) as error:
+    with refused(entry) as error:
         TokenBudget.from_pretrained(path)
     assert str(path) in str(error.value)
     with refused("none.json", FileNotFoundError):

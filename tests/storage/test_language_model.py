@@ -62,7 +62,7 @@ def test_the_package_gguf_reads_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"architecture": "gemma"}, "other.gguf: general.architecture"),
         ({"pre": "llama-bpe"}, "other.gguf: tokenizer.ggml.pre"),
@@ -76,9 +76,9 @@ def test_the_package_gguf_reads_the_same(tmp_path):
         ({"merges": ["no such"]}, "other.gguf: tokenizer.ggml"),
     ],
 )
-def test_other_models_are_named(tmp_path, changes, message):
+def test_other_models_are_named(tmp_path, changes, entry):
     file = write_llama(tmp_path / "other.gguf", **changes)
-    with refused(message) as caught:
+    with refused(entry) as caught:
         read_language_model(file)
     assert str(caught.value).startswith(str(file))
     assert "\n" not in str(caught.value)

@@ -79,7 +79,7 @@ def test_a_search_that_goes_on_asks_nothing_twice_and_ends_as_if_it_had_not_stop
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"budget": 1.0}, "budget"),
         ({"lengths": (1,)}, "lengths"),
@@ -88,8 +88,8 @@ def test_a_search_that_goes_on_asks_nothing_twice_and_ends_as_if_it_had_not_stop
         ({"weights": [1.0, 0.0, 1.0]}, "weights"),
     ],
 )
-def test_what_is_no_space_is_refused(changes, message):
-    with refused(message):
+def test_what_is_no_space_is_refused(changes, entry):
+    with refused(entry):
         ChainSpace(**{"weights": WEIGHTS, "budget": 2.0, "lengths": (3,), **changes})
 
 

@@ -164,7 +164,7 @@ def test_other_files_of_results_have_their_tables():
 
 
 @pytest.mark.parametrize(
-    ("directive", "message"),
+    ("directive", "entry"),
     [
         ("results.json methods=magic", "page:3: methods"),
         ("results.json columns=magic", "page:3: columns"),
@@ -177,8 +177,8 @@ def test_other_files_of_results_have_their_tables():
         ('results.json methods="bac', "page:3"),
     ],
 )
-def test_what_cannot_be_followed_is_named_with_page_and_line(root, directive, message):
-    with refused(message):
+def test_what_cannot_be_followed_is_named_with_page_and_line(root, directive, entry):
+    with refused(entry):
         write_tables(page(directive), root)
 
 

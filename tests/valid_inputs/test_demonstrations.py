@@ -111,9 +111,9 @@ REFUSED = {
 def test_what_changes_the_meaning_of_an_action_or_a_step_is_refused_by_name(tmp_path, name):
     """Sources: the entries that robosuite 1.2 to 1.5 read, and files at 10 actions a second (huggingface/lerobot#3368); each
     gives other motions than this library's environments."""
-    env_args, message = REFUSED[name]
+    env_args, entry = REFUSED[name]
     path = poses(tmp_path / "demos.hdf5", env_args)
-    with refused(message) as refusal:
+    with refused(entry) as refusal:
         convert_demos(path, tmp_path / "out.h5")
     assert str(refusal.value).startswith(str(path))
     with pytest.raises(InputError, match=r"demos\.hdf5"):

@@ -36,7 +36,7 @@ def saved(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("name", "asked", "message"),
+    ("name", "asked", "entry"),
     [
         (
             "states",
@@ -51,9 +51,9 @@ def saved(tmp_path_factory):
         ("image", {"crop": 0.5}, "vision.crop"),
     ],
 )
-def test_what_the_policy_has_not_is_refused(saved, name, asked, message):
+def test_what_the_policy_has_not_is_refused(saved, name, asked, entry):
     """An option of the command line that is not read is refused unless it says what the policy has."""
-    with refused(message):
+    with refused(entry):
         begun_policy(saved / name, **({"sizes": OPEN} | asked))
 
 
@@ -77,7 +77,7 @@ def test_dropout_is_what_is_asked_for(saved):
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("asked", "entry"),
     [
         ({"size": "small"}, "size"),
         ({"rank": 16}, "rank"),
@@ -88,12 +88,12 @@ def test_dropout_is_what_is_asked_for(saved):
         ({"changes": {"llm": {"layers": 9}}}, "network"),
     ],
 )
-def test_sizes_that_a_vla_has_not_are_refused(asked, message):
+def test_sizes_that_a_vla_has_not_are_refused(asked, entry):
     config = VLAConfig.tiny()
     policy = VLAPolicy(add_adapters(VLANetwork(config), 2))
     policy.base = AdaptedBase("0" * 64, 2)
     nothing = {"size": None, "rank": None, "changes": {}}
     own = {"rank": 2, "changes": {"chunk_size": config.chunk_size, "llm": {"layers": config.llm.layers}}}
     check_sizes(policy, "mine", **nothing | own)
-    with refused(message):
+    with refused(entry):
         check_sizes(policy, "mine", **nothing | asked)

@@ -66,8 +66,8 @@ def test_a_variant_that_only_robosuite_15_knows_is_refused_to_a_policy_of_14(fil
     old = old_policy("Lift", files["Lift", "1.5"])
     old.source = continued_source("lift_moving", old)
     path = write(tmp_path / "moving.h5", "LiftMoving", "1.5")
-    message = "5, wanted as of 1.4: convention"
-    with refused(message):
+    entry = "5, wanted as of 1.4: convention"
+    with refused(entry):
         policy_demos(path, "lift_moving", old)
 
 
@@ -89,10 +89,10 @@ def test_other_cameras_than_the_policys_are_refused_as_in_the_environment(tmp_pa
     policy = VLAPolicy(VLANetwork(VLAConfig.tiny(state_dim=9, action_dim=10)))
     policy.source = VLASource("LiftNamed", {"image": "agentview_image"})
     path, others = write_demos(tmp_path / "images.h5"), {"image": "robot0_eye_in_hand_image"}
-    message = "cameras.image"
-    with refused(message):
+    entry = "cameras.image"
+    with refused(entry):
         instructed_demos(path, "lift_named", others, policy)
-    with refused(message):
+    with refused(entry):
         continued_vla_source("lift_named", policy, others)
     with refused("policy"):
         instructed_demos(path, "lift", {"image": "agentview_image"}, policy)

@@ -106,7 +106,7 @@ def test_merged_entries_give_way_to_own_and_earlier_ones(tmp_path, entry, merged
 
 
 @pytest.mark.parametrize(
-    ("parameters", "message"),
+    ("parameters", "entry"),
     [
         (
             {"out": {"value": "${oc.env:HOME}/a"}},
@@ -120,14 +120,14 @@ def test_merged_entries_give_way_to_own_and_earlier_ones(tmp_path, entry, merged
         ),
     ],
 )
-def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, message):
+def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, entry):
     """A reference would stand for something else; of two parameters that set one option the last would count."""
-    with refused(message):
+    with refused(entry):
         read_sweep(write(parameters))
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "entry"),
     [
         ("seed: {values: [1]}\n  seed: {values: [2]}", "sweep.yaml: line 3: seed"),
         ("seed: {value: 1, value: 2}", "sweep.yaml: line 2: value"),
@@ -141,11 +141,11 @@ def test_a_value_that_cannot_arrive_is_refused_by_name(write, parameters, messag
         ("lr: {<<: 3}", "sweep.yaml: line 2: <<"),
     ],
 )
-def test_what_a_file_says_twice_or_cannot_mean_is_refused(tmp_path, text, message):
+def test_what_a_file_says_twice_or_cannot_mean_is_refused(tmp_path, text, entry):
     """YAML: the names of a mapping are unique. PyYAML keeps the last without a word."""
     path = tmp_path / "sweep.yaml"
     path.write_text(f"parameters:\n  {text}\n")
-    with refused(message):
+    with refused(entry):
         read_sweep(path)
 
 
@@ -196,7 +196,7 @@ def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("entries", "message"),
+    ("entries", "entry"),
     [
         ({"command": ["python", "${program}"]}, "sweep.yaml: command"),
         (
@@ -213,9 +213,9 @@ def test_entries_are_honoured_or_refused_by_name(write, tmp_path):
         ({"metric": 3}, "sweep.yaml: metric"),
     ],
 )
-def test_a_sweep_that_would_not_do_what_it_says_is_refused(write, entries, message):
+def test_a_sweep_that_would_not_do_what_it_says_is_refused(write, entries, entry):
     """Parameters that reach no trial, values that stand twice, held-out seeds, a metric that would be minimised."""
-    with refused(message):
+    with refused(entry):
         read_sweep(write({"seed": {"values": [1]}}, **entries))
 
 

@@ -31,10 +31,10 @@ def test_auto_takes_torch_where_native_does_not_apply_and_says_why(network, ddpm
 
 
 def test_unknown_engines_are_refused(network, ddpm):
-    message = "engine"
-    with refused(message):
+    entry = "engine"
+    with refused(entry):
         make_engine("turbo", network, ddpm)
-    with refused(message):
+    with refused(entry):
         EngineSlot("turbo")
 
 

@@ -103,7 +103,7 @@ def test_threads_change_no_bit():
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         (lambda guide: guide._replace(actions=guide.actions[:, :3]), "guide.actions"),
         (lambda guide: guide._replace(pull=guide.pull[..., 0]), "guide.pull"),
@@ -112,8 +112,8 @@ def test_threads_change_no_bit():
         (lambda guide: guide._replace(pull=guide.pull * torch.nan), "guide.pull"),
     ],
 )  # fmt: skip
-def test_a_wrong_guide_is_refused_by_name(engine, change, message):
+def test_a_wrong_guide_is_refused_by_name(engine, change, entry):
     network, sampler = make_network("lift"), Sampler("ddpm", 6)
     noise, cond, _ = make_query(network, sampler)
-    with refused(message):
+    with refused(entry):
         ENGINES[engine](network, sampler).denoise(noise, cond, guide=change(make_guide(network, 2)))

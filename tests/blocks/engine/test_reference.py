@@ -206,7 +206,7 @@ def test_a_dense_query_records_what_every_block_adds(network, ddpm, query):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         ({"noise": torch.zeros(5, 9, 6, 4)}, "noise"),
         ({"noise": torch.zeros(5, 10, 6, 3)}, "noise"),
@@ -218,7 +218,7 @@ def test_a_dense_query_records_what_every_block_adds(network, ddpm, query):
         ({"reuse": "layer"}, "reuse"),
     ],
 )
-def test_wrong_input_is_refused(network, ddpm, query, change, message):
+def test_wrong_input_is_refused(network, ddpm, query, change, entry):
     arguments = {"noise": query[0], "cond": query[1], **change}
-    with refused(message):
+    with refused(entry):
         denoise(network, ddpm, **arguments)

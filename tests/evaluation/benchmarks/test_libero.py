@@ -64,7 +64,7 @@ def test_a_published_folder_plays_a_suite(made, published, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("option", "message"),
+    ("option", "entry"),
     [
         ("task=libero_90", "task"),
         ("episodes=501", "seed"),
@@ -72,13 +72,13 @@ def test_a_published_folder_plays_a_suite(made, published, tmp_path, monkeypatch
         ("policy=assets/lift", "config.json: format"),
     ],
 )
-def test_what_cannot_be_played_is_refused(made, published, tmp_path, monkeypatch, option, message):  # noqa: F811
+def test_what_cannot_be_played_is_refused(made, published, tmp_path, monkeypatch, option, entry):  # noqa: F811
     monkeypatch.setattr(instructed, "require_libero", lambda: None)
     options = [f"policy={published}", "task=libero_goal", "split=test", "methods=[]", "videos=[]", *SMALL]
     options += ["heads=null"] if "policy" in option else []  # which are said of published folders alone
     with hydra.initialize_config_dir(str(RECIPES), version_base=None):
         config = hydra.compose("benchmark_vla", [*options, f"out={tmp_path}/out", option])
-    with refused(message):
+    with refused(entry):
         load_recipe("benchmark_vla").main.__wrapped__(config)
     assert not (tmp_path / "out").exists()
 

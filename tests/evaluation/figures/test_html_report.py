@@ -143,5 +143,5 @@ def test_the_recipe_shows_one_of_each_kind(tmp_path):
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
-    with refused("test_a_folder_without_results_0", FileNotFoundError):
+    with refused(str(tmp_path), FileNotFoundError):
         find_runs(tmp_path)

@@ -108,7 +108,7 @@ def test_block_labels():
 
 
 @pytest.mark.parametrize(
-    ("draw", "message"),
+    ("draw", "entry"),
     [
         (lambda p: plots.plot_schedule(np.zeros((4, 6)), p, name="x"), "mask"),
         (lambda p: plots.plot_schedule(np.zeros((4, 5), bool), p, name="x"), "mask"),
@@ -121,8 +121,8 @@ def test_block_labels():
         ),
     ],
 )
-def test_faults_leave_no_file(tmp_path, draw, message):
-    with refused(message):
+def test_faults_leave_no_file(tmp_path, draw, entry):
+    with refused(entry):
         draw(tmp_path / "figure.png")
     assert os.listdir(tmp_path) == []
 

@@ -57,7 +57,7 @@ def test_captioned_video(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("images", "captions", "message"),
+    ("images", "captions", "entry"),
     [
         ([], None, "frames"),
         (frames(2), [Caption("bac", 0)], "captions"),
@@ -66,7 +66,7 @@ def test_captioned_video(tmp_path):
         ([np.zeros((4, 4), np.uint8)], None, "frames[0]"),
     ],
 )
-def test_faults_leave_no_file(tmp_path, images, captions, message):
-    with refused(message):
+def test_faults_leave_no_file(tmp_path, images, captions, entry):
+    with refused(entry):
         write_video(images, tmp_path / "rollout.mp4", captions=captions)
     assert os.listdir(tmp_path) == []

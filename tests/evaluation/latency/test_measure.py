@@ -101,7 +101,7 @@ def test_machine_description():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "entry"),
     [
         (lambda: measure_latency({}), "calls"),
         (lambda: measure_latency({"a": lambda: None}, repeats=0), "repeats, warmup"),
@@ -110,8 +110,8 @@ def test_machine_description():
         (lambda: summarize_latency([float("nan")]), "latencies"),
     ],
 )
-def test_faults(call, message):
-    with refused(message):
+def test_faults(call, entry):
+    with refused(entry):
         call()
 
 

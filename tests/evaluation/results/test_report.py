@@ -112,7 +112,7 @@ def test_flops_average_over_queries_not_episodes():
 
 
 @pytest.mark.parametrize(
-    ("runs", "message"),
+    ("runs", "entry"),
     [
         (lambda: {"fast": run([1])}, "runs"),
         (lambda: {"dense": run([1, 1]), "fast": run([1, 1], first_seed=1)}, "fast"),
@@ -128,8 +128,8 @@ def test_flops_average_over_queries_not_episodes():
         ),
     ],
 )
-def test_build_refuses(runs, message):
-    with refused(message):
+def test_build_refuses(runs, entry):
+    with refused(entry):
         build(runs())
 
 

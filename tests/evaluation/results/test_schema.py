@@ -100,13 +100,13 @@ FAULTS = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_with_its_path(name):
-    path, value, message = FAULTS[name]
+    path, value, entry = FAULTS[name]
     results = to_plain(make_results(20))
     target = results
     for key in path[:-1]:
         target = target[key]
     target[path[-1]] = value
-    with refused(message):
+    with refused(entry):
         read(results)
 
 

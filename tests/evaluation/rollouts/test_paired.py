@@ -169,15 +169,15 @@ def test_the_thread_count_survives():
 
 
 @pytest.mark.parametrize(
-    ("seeds", "kwargs", "message"),
+    ("seeds", "kwargs", "entry"),
     [
         ([1, 2, 1], {}, "seeds"),
         ([1], {"num_envs": 0}, "num_envs, max_steps"),
         ([1], {"max_steps": 0}, "num_envs, max_steps"),
     ],
 )
-def test_faults(seeds, kwargs, message):
-    with refused(message):
+def test_faults(seeds, kwargs, entry):
+    with refused(entry):
         rollout_episodes(FakeActor(), FakeEnv, seeds, **kwargs)
 
 

@@ -214,14 +214,14 @@ def test_robosuite_gives_the_same_in_two_workers(backend):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "entry"),
     [
         ({"workers": 0}, "workers"),
         ({"backend": "smoke"}, "backend"),
     ],
 )
-def test_options_are_checked(options, message):
-    with refused(message):
+def test_options_are_checked(options, entry):
+    with refused(entry):
         run(FakeEnv, **options)
 
 

@@ -139,7 +139,7 @@ def test_far_worse_is_inferior():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "entry"),
     [
         (lambda: wilson_interval(5, 4), "k"),
         (lambda: wilson_interval(0, 0), "k"),
@@ -151,8 +151,8 @@ def test_far_worse_is_inferior():
         (lambda: episodes_needed(5), "margin"),
     ],
 )
-def test_faults_name_what_came(call, message):
-    with refused(message):
+def test_faults_name_what_came(call, entry):
+    with refused(entry):
         call()
 
 

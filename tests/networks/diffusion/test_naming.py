@@ -45,7 +45,7 @@ def test_names_and_configs_of_old_files_are_unchanged():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "entry"),
     [
         ({"kind": "flow"}, "kind"),
         ({"spacing": "even"}, "spacing"),
@@ -63,8 +63,8 @@ def test_names_and_configs_of_old_files_are_unchanged():
         ({"timesteps": []}, "num_inference_steps"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message):
-    with refused(message):
+def test_bad_arguments_are_named(arguments, entry):
+    with refused(entry):
         Sampler(**arguments)
 
 

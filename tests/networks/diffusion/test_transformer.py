@@ -135,7 +135,7 @@ def test_initialisation_is_the_published_one():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"n_emb": 10, "n_head": 4}, "n_emb"),
         ({"horizon": 0}, "horizon"),
@@ -143,8 +143,8 @@ def test_initialisation_is_the_published_one():
         ({"n_emb": 2, "n_head": 1}, "dim"),
     ],
 )
-def test_bad_sizes_are_named(make_network, changes, message):
-    with refused(message):
+def test_bad_sizes_are_named(make_network, changes, entry):
+    with refused(entry):
         make_network(**changes)
 
 

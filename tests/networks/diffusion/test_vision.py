@@ -73,19 +73,19 @@ def test_each_camera_has_weights_of_its_own():
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    ("value", "entry"),
     [
         (images(2, size=(40, 40)), "image 'image'"),
         (images(2).float(), "image 'image'"),
     ],
 )
-def test_bad_images_are_named(value, message):
-    with refused(message):
+def test_bad_images_are_named(value, entry):
+    with refused(entry):
         VisionEncoder(["image"], **SMALL)({"image": value})
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "entry"),
     [
         ({"cameras": []}, "cameras"),
         ({"cameras": ["a", "a"]}, "cameras"),
@@ -95,8 +95,8 @@ def test_bad_images_are_named(value, message):
         ({"cameras": ["a"], "width": 24}, "width"),
     ],
 )
-def test_bad_sizes_are_named(arguments, message):
-    with refused(message):
+def test_bad_sizes_are_named(arguments, entry):
+    with refused(entry):
         VisionEncoder(**arguments)
 
 

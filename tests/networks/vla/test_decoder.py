@@ -256,7 +256,7 @@ def test_a_row_with_shared_heads_is_the_row_alone(grouped, sequence):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"kv_heads": 3}, "kv_heads"),
         ({"kv_heads": 0}, "kv_heads"),
@@ -264,8 +264,8 @@ def test_a_row_with_shared_heads_is_the_row_alone(grouped, sequence):
         ({"norm_eps": float("inf")}, "norm_eps"),
     ],
 )
-def test_sizes_that_no_decoder_has_are_named(changes, message):
-    with refused(message):
+def test_sizes_that_no_decoder_has_are_named(changes, entry):
+    with refused(entry):
         VLAConfig.tiny(**changes)
 
 

@@ -77,7 +77,7 @@ def test_the_crop_is_central_and_linear():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"image_size": 30}, "image_size"),
         ({"cameras": ()}, "cameras"),
@@ -87,8 +87,8 @@ def test_the_crop_is_central_and_linear():
         ({"dino": TransformerSize(16, 2, 2, 40)}, "dino.mlp"),
     ],
 )
-def test_sizes_that_do_not_fit_are_refused(changes, message):
-    with refused(message):
+def test_sizes_that_do_not_fit_are_refused(changes, entry):
+    with refused(entry):
         VLAConfig.tiny(**changes)
 
 

@@ -56,7 +56,7 @@ def test_an_empty_batch_of_images_has_an_empty_chunk():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("key", "value", "entry"),
     [
         (keys.EPISODE_SEED, torch.full((3, 1), 1.7), "('episode', 'seed')"),
         (keys.EPISODE_STEP, torch.full((3, 1), 0.0), "('episode', 'step')"),
@@ -66,10 +66,10 @@ def test_an_empty_batch_of_images_has_an_empty_chunk():
         (keys.HISTORY_STATE, torch.zeros(3, 2, 5).to_sparse(), "('history', 'state')"),
     ],
 )  # fmt: skip
-def test_what_is_refused(policy, key, value, message):
+def test_what_is_refused(policy, key, value, entry):
     td = request(3)
     td[key] = value
-    with refused(message):
+    with refused(entry):
         policy(td)
 
 

@@ -88,9 +88,9 @@ TENSOR_FAULTS = {
 
 @pytest.mark.parametrize("fault", TENSOR_FAULTS)
 def test_wrong_tensors_are_named(folder, fault):
-    change, message = TENSOR_FAULTS[fault]
+    change, entry = TENSOR_FAULTS[fault]
     change_tensors(folder, change)
-    with refused(message):
+    with refused(entry):
         DiffusionPolicy.from_pretrained(folder)
 
 
@@ -118,9 +118,9 @@ CONFIG_FAULTS = {
 
 @pytest.mark.parametrize("fault", CONFIG_FAULTS)
 def test_wrong_configs_are_named(folder, fault):
-    change, message = CONFIG_FAULTS[fault]
+    change, entry = CONFIG_FAULTS[fault]
     change_config(folder, change)
-    with refused(message):
+    with refused(entry):
         DiffusionPolicy.from_pretrained(folder)
 
 

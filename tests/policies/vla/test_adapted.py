@@ -110,7 +110,7 @@ def test_another_base_is_refused_and_a_missing_one_asked_for(adapted, base, poli
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "entry"),
     [
         ({"base": {"rank": 0}}, "config.json: rank"),
         ({"base": {"rank": 5}}, "decoder.llama.layers.0.self_attn.q_proj.down"),
@@ -120,11 +120,11 @@ def test_another_base_is_refused_and_a_missing_one_asked_for(adapted, base, poli
         ),
     ],
 )
-def test_a_config_that_does_not_fit_the_base_is_named(adapted, base, tmp_path, change, message):
+def test_a_config_that_does_not_fit_the_base_is_named(adapted, base, tmp_path, change, entry):
     adapted.save_pretrained(tmp_path)
     config = json.loads((tmp_path / "config.json").read_text())
     for part, fields in change.items():
         config[part] |= fields
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with refused(message):
+    with refused(entry):
         VLAPolicy.from_pretrained(tmp_path, base=base)

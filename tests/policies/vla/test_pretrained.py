@@ -35,7 +35,7 @@ def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("field", "value", "entry"),
     [
         ("format", "other", "config.json: format"),
         ("tokenizer", {"kind": "pickle"}, "config.json: tokenizer"),
@@ -44,11 +44,11 @@ def test_one_camera_checkpoint_for_a_two_camera_config(network, tmp_path):
         ("source", {"images": "mine"}, "config.json: source.images"),
     ],
 )
-def test_a_wrong_config_is_named(policy, tmp_path, field, value, message):
+def test_a_wrong_config_is_named(policy, tmp_path, field, value, entry):
     policy.save_pretrained(tmp_path)
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps({**config, field: value}))
-    with refused(message):
+    with refused(entry):
         VLAPolicy.from_pretrained(tmp_path)
 
 

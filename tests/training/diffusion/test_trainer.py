@@ -142,16 +142,16 @@ def test_a_batch_may_hold_more_than_one_epoch():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"lr": 2e-3}, "checkpoint.pt"),
         ({"network_changes": {"n_layer": 1}}, "checkpoint.pt"),
         ({"val_ratio": 0.3}, "checkpoint.pt"),
     ],
 )
-def test_checkpoint_of_another_training_is_refused(make_trainer, tmp_path, changes, message):
+def test_checkpoint_of_another_training_is_refused(make_trainer, tmp_path, changes, entry):
     make_trainer().save(tmp_path / "checkpoint.pt")
-    with refused(message):
+    with refused(entry):
         make_trainer(**changes).load(tmp_path / "checkpoint.pt")
 
 
@@ -201,7 +201,7 @@ def test_diverged_training_stops_with_the_weights_it_had(make_trainer):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "entry"),
     [
         ({"max_steps": 0}, "max_steps, batch_size"),
         ({"precision": "fp16"}, "precision"),
@@ -210,6 +210,6 @@ def test_diverged_training_stops_with_the_weights_it_had(make_trainer):
         ({"n_action_steps": 9}, "horizon"),
     ],
 )
-def test_bad_configuration_is_named(make_trainer, changes, message):
-    with refused(message):
+def test_bad_configuration_is_named(make_trainer, changes, entry):
+    with refused(entry):
         make_trainer(**changes)

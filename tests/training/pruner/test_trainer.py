@@ -189,7 +189,7 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "entry"),
     [
         ({"objective": "steps"}, "objective"),
         ({"objective": "noise"}, "reuse"),
@@ -209,8 +209,8 @@ def test_costs_weigh_blocks_by_their_type(policy, targets):
         ({"information": 0.1}, "information"),
     ],
 )
-def test_a_wrong_configuration_is_refused(options, message):
-    with refused(message):
+def test_a_wrong_configuration_is_refused(options, entry):
+    with refused(entry):
         dataclasses.replace(SMALL, **options)
 
 

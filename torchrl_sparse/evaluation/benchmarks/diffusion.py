@@ -60,7 +60,7 @@ class DiffusionBenchmark(Benchmark):
     Args:
         options, make_env: see `Benchmark`.
         methods: name -> policy, see `make_methods`.
-        calibration: of the dense policy, whose similarities are drawn; called once, at the end.
+        calibration: of the dense policy, whose similarities `draw` shows; called once, at the end. None where it draws nothing.
 
     Raises:
         ValueError: see `make_executor`.
@@ -71,7 +71,7 @@ class DiffusionBenchmark(Benchmark):
         options: BenchmarkOptions,
         methods: Mapping[str, DiffusionPolicy],
         make_env: Callable[..., EnvBase],
-        calibration: Callable[[], Calibration],
+        calibration: Callable[[], Calibration] | None,
     ) -> None:
         self.methods, self.calibration, self.names = methods, calibration, methods
         self.actors = {

@@ -22,7 +22,7 @@ from torchrl_sparse.evaluation.results.schema import DENSE
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.rollouts.evaluate import episode_log
 from torchrl_sparse.methods.diffusion import method_identity
-from torchrl_sparse.methods.executor import make_realtime_executor
+from torchrl_sparse.methods.executor import executed_every, make_realtime_executor
 from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.training.trainer import checksum
@@ -113,7 +113,8 @@ class RealtimeBenchmark(Benchmark):
 
     def identity(self, name: str) -> dict[str, Any]:
         method, steps = _delayed(name)
-        late = {"n_action_steps": self.actor(name).n_action_steps, "delay_steps": steps}
+        every = executed_every(method, self.methods[method], self.options.n_action_steps)
+        late = {"n_action_steps": every, "delay_steps": steps}
         if MethodSpec.parse(method).ahead:
             late["state_model"] = checksum(self.model.weight)
         return method_identity(method, self.methods[method]) | self.settings | late

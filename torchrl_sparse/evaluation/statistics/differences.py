@@ -17,6 +17,7 @@ Verdict = Literal["non-inferior", "inferior", "undecided"]
 class Difference:
     """Success or score of a method minus that of another on the same seeds, with its interval and the verdict.
 
+    ``ci95`` has the confidence that was asked for where it was made; in files it is 95 %.
     The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
     ``mcnemar_p`` is the exact two-sided p-value of no difference at all, see `torchrl_sparse.evaluation.statistics.intervals`;
     None of dense, of scores and in older files.

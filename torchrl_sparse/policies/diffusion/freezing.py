@@ -1,4 +1,4 @@
-"""Policies that are only played: weights that will not change need no look before every query."""
+"""Policies that are only played: their weights are not looked at before every call, and may not be written."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class FreezablePolicy(PolicySizes, TensorDictSequential):
     _parts: Parts | None = None
 
     def freeze(self) -> Self:
-        """Promise that the weights stay as they are, for queries that look at them no more; return the policy.
+        """Refuse every write to the weights from now on, so that calls need not look for one; return the policy.
 
-        A write is an error from now on, never an old answer: an optimiser's step, ``load_state_dict``, ``.data``, a move, a
+        A write is an error, never an old answer: an optimiser's step, ``load_state_dict``, ``.data``, a move, a
         parameter or module exchanged for another, also in policies that share the networks, as `with_plan` makes them. Weights
         move in memory, so that what shared theirs before does no longer; a write to that is an error of the next query. Not
         seen are writes around PyTorch: to a storage, or to an address. Plan, sampler, start, engine and noise may change.

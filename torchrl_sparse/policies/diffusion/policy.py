@@ -48,9 +48,8 @@ class DiffusionPolicy(FreezablePolicy):
     follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does),
     else from torch's global generator. Writes the chunk, from the present step on, all that a table needs: see ``out_keys``.
 
-    The next query sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. `freeze`
-    promises that none will, for faster queries. Frames
-    that the query before has encoded (``("diffusion", "frame_features")``) keep its features.
+    The next call sees weights that change, but for a part of a tensor written through ``.data``: call `refresh` then. `freeze`
+    promises that none will. Frames that the call before has encoded (``("diffusion", "frame_features")``) keep its features.
 
     Args:
         network: the denoiser.
