@@ -74,12 +74,7 @@ class Header(ctypes.Structure):
 
 
 def layout_hash() -> int:
-    """Hash names, types, values and places as compiled code does (``structs.h``): FNV-1a of 64 bits.
-
-    Examples:
-        >>> layout_hash() == layout_hash()
-        True
-    """
+    """Hash names, types, values and places as compiled code does (``structs.h``): FNV-1a of 64 bits."""
     parts: list[str | int] = []
     for name, value in CONSTANTS.items():
         parts += name, value
