@@ -1,9 +1,9 @@
 """Noticing that a network's weights have changed, cheaply enough to ask in every query.
 
-A complete watch would read every weight: 36 MB for the published networks, more than a millisecond. Versions, addresses
-and identities of parameters and modules take 0.06 ms, more where a query has driven them out of the caches, and show all that
-PyTorch records; the first values of each parameter are compared besides, because diffusers' weight average writes through
-``.data``, which leaves no record. Frozen weights cannot change, so that only their versions are compared.
+A complete watch would read every weight: 36 MB for the published networks, more than a millisecond. Versions, addresses and
+identities of parameters and modules show all that PyTorch records; the first values of each parameter are compared besides,
+because diffusers' weight average writes through ``.data``, which leaves no record. That takes 0.16 ms, and 0.03 ms of frozen
+weights, which cannot change, so that only their versions are compared (one core of an AMD EPYC without AVX-512, 2026-11-29).
 """
 
 from __future__ import annotations
