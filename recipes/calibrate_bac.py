@@ -1,6 +1,6 @@
 """Compute the BAC schedules of a policy, without training.
 
-One dense query is all that it takes.
+One dense policy call is all that it takes.
 
     python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=10
     python recipes/calibrate_bac.py task=lift policy=assets/lift num_updates=3 sampler=ddpm10

@@ -70,7 +70,7 @@ def main(config: DictConfig) -> None:
 
 
 def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
-    """Measure the action error at each number, on the same recorded queries."""
+    """Measure the action error at each number, on the same recorded policy calls."""
     if config.demos is not None:
         task = find_robosuite_task(config.task)
         poses = task.pose_slices(task.proprioception_keys)

@@ -73,7 +73,7 @@ def initial_schedules(config: DictConfig) -> list[str]:
 def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     """Return observations and targets, read where an earlier run made them.
 
-    Those of other settings are made anew, or refused once something was trained on them.
+    Those of other settings are made again, or refused once something was trained on them.
     """
     path = Path(config.out) / "targets.safetensors"
     made_for = {

@@ -69,7 +69,7 @@ def backend(request):
 def forked_workers():
     """TorchRL's worker processes as copies of one that has imported everything, where a test is of what they do once they run.
 
-    By default they are spawned, and each then imports PyTorch and TorchRL anew, five seconds of a core.
+    By default they are spawned, and each then imports PyTorch and TorchRL again, five seconds of a core.
     """
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method("forkserver", force=True)

@@ -101,7 +101,7 @@ def counting_policy(length):
 
 
 def sampling_policy():
-    """Samples of one query lie apart, in a way that the last chunk decides about."""
+    """Samples of one policy call lie apart, in a way that the last chunk decides about."""
 
     def chunk(history, seed):
         step, sample = history[..., -1, 1:], seed // NOISE_STREAM

@@ -91,7 +91,7 @@ def first_batch(collector):
 def test_collector_of_one_environment():
     batch = first_batch(Collector(env(3), actor(), auto_register_policy_transforms=True, **OPTIONS))
     check(batch[:HORIZON], 3)
-    assert batch[keys.AGE].squeeze(-1)[HORIZON] == 0  # the next episode starts with a query
+    assert batch[keys.AGE].squeeze(-1)[HORIZON] == 0  # the next episode starts with a policy call
 
 
 def test_collector_of_a_batch_of_environments():

@@ -6,7 +6,7 @@ N the visual tokens.
 
 What a step leaves to the next in keys, a `ChunkExecutor` declares to the environment: by ``make_tensordict_primer``, which
 collectors append with ``auto_register_policy_transforms=True``. For TorchRL's `ParallelEnv` hands back the keys of its spec
-alone. Others that an actor writes may be dropped; they are then 0 until the next query.
+alone. Others that an actor writes may be dropped; they are then 0 until the next policy call.
 
 ================================  =====================  ===========================================================
 constant                          shape, dtype           meaning
@@ -26,46 +26,46 @@ constant                          shape, dtype           meaning
 ``IS_INIT``                       bool [*B, 1]           first step of an episode (TorchRL's ``InitTracker``)
 ``COND``                          f32 [*B, To, D]        encoded observations that condition the denoiser
 ``FRAME_FEATURES``                f32 [*B, To, F]        features of the cameras' frames, the first columns of ``COND``
-``SEED``                          i64 [*B, 1]            seeds all noise of one query, the initial and the per-step noise
+``SEED``                          i64 [*B, 1]            seeds all noise of one call, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
                                                          ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
-``START``                         f32 [*B, H, A]         normalised actions that a query begins from, if not from noise
-``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a query takes, the sampler's last; K from noise
-``KNOWN``                         f32 [*B, H, A]         normalised actions that a query is drawn to in every step
+``START``                         f32 [*B, H, A]         normalised actions that a call begins from, if not from noise
+``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a call takes, the sampler's last; K from noise
+``KNOWN``                         f32 [*B, H, A]         normalised actions that a call is guided toward in every step
 ``PULL``                          f32 [*B, H, 1]         how far, for each of them: 0 is not at all, 1 all the way
 ``KEEP_MASK``                     bool [*B, N]           True = kept; the N visual tokens, camera by camera; others always stay
 ``TOKEN_DEPTH``                   i64 [*B, N]            decoder layers that ran on a visual token; 0 was pruned before
                                                          the decoder, L (all of them) was never pruned
 ``KEPT``                          f32 [*B, 1]            visual tokens in a decoder layer, mean over the layers
-``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next query
-``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last query, as the network saw them
-``TOKEN_PAST_FRAMES``             u8 [*B, R, V, 3, h, w] those of the R queries before it, the latest first, 0 before the
+``TOKEN_SCORE``                   f32 [*B, N]            importance that a pruner carries to the next call
+``TOKEN_FRAMES``                  u8 [*B, V, 3, h, w]    the V cameras' images at the last call, as the network saw them
+``TOKEN_PAST_FRAMES``             u8 [*B, R, V, 3, h, w] those of the R calls before it, the latest first, 0 before the
                                                          episode began; where a pruner looks further back
 ``TOKEN_BUDGET``                  f32 [*B, 1]            visual tokens per camera that the controller grants
 ``CHUNK``                         f32 [*B, n, A]         actions in environment units; entry 0 is for the present step
 ``IS_PAD``                        bool [*B, n]           True = the episode ended before that action of a recorded chunk
 ``ACTION``                        f32 [*B, A]            the action of this step
-``REPLAN``                        bool [*B, 1]           a controller asks for a new query now
+``REPLAN``                        bool [*B, 1]           a controller asks for a new call now
 ``FINE``                          bool [*B, 1]           the hand moves slowly and not upwards: a fine-grained action
 ``CONTROL_STEP``                  i64 [*B, 1]            environment steps that the controller has seen of this episode
-``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a query, -1
+``AGE``                           i64 [*B, 1]            position of ``ACTION`` in the chunk; 0 right after a call, -1
                                                          before an episode's first
-``UNTIL_QUERY``                   i64 [*B, 1]            steps from the next observation to the next query at the earliest; 0
+``UNTIL_QUERY``                   i64 [*B, 1]            steps from the next observation to the next call at the earliest; 0
                                                          where the next observation may be asked about
 ``QUERIED``                       bool [*B, 1]           this step called the policy
-``CANDIDATES``                    f32 [*B, S, n, A]      chunks of a query that was asked S times, of which one is played
+``CANDIDATES``                    f32 [*B, S, n, A]      chunks of a call that was asked S times, of which one is played
 ``CHOSEN``                        i64 [*B, 1]            which of them
-``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the query before, for policies that read it
-``ELAPSED``                       i64 [*B, 1]            steps since that query; 0 at the beginning of an episode
+``LAST_CHUNK``                    f32 [*B, n, A]         ``CHUNK`` of the call before, for policies that read it
+``ELAPSED``                       i64 [*B, 1]            steps since that call; 0 at the beginning of an episode
 ``ENSEMBLED``                     i64 [*B, n]            predictions that were averaged into each action of ``CHUNK``
-``DELAY``                         i64 [*B, 1]            steps that the latest query takes in a world that does not wait; a
+``DELAY``                         i64 [*B, 1]            steps that the latest call takes in a world that does not wait; a
                                                          policy that is asked reads what is expected of its own
-``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the query
+``MEANWHILE``                     f32 [*B, n, A]         what is played until then; entry 0 is for the step of the call
 ``HOLD``                          f32 [*B, A]            the action that keeps the arm where it is
-``FLOPS``                         f32 [*B, 1]            2 * MAC of this query's planner and loop, or of a VLA's whole network;
+``FLOPS``                         f32 [*B, 1]            2 * MAC of this call's planner and loop, or of a VLA's whole network;
                                                          0 on served steps
-``LATENCY``                       f32 [*B, 1]            seconds of this query, 0 on served steps
+``LATENCY``                       f32 [*B, 1]            seconds of this call, 0 on served steps
 ================================  =====================  ===========================================================
 """
 

@@ -21,5 +21,5 @@ if __name__ == "__main__":  # processes import this file
         auto_register_policy_transforms=True,
     )
     for data in collector:
-        print(f"{data.numel()} steps, {data['control', 'queried'].sum()} queries")
+        print(f"{data.numel()} steps, {data['control', 'queried'].sum()} policy calls")
     collector.shutdown()

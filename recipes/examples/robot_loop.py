@@ -25,7 +25,7 @@ def command(action: np.ndarray) -> None:
 period, steps, missed = 1 / 20, 20, 0
 actor = ChunkExecutor(policy, n_action_steps=8)
 actor.reset()
-actor.act(observe())  # the first query also builds what the engine runs
+actor.act(observe())  # the first policy call also builds what the engine runs
 actor.reset()
 deadline = time.perf_counter() + period
 for _ in range(steps):

@@ -39,7 +39,7 @@ def ddpm():
 
 @pytest.fixture
 def query():
-    """Noise [5, K, H, A] and condition [5, To, D] of five queries."""
+    """Noise [5, K, H, A] and condition [5, To, D] of five policy calls."""
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(5, NUM_STEPS, HORIZON, ACTION_DIM, generator=generator)
     return noise, torch.randn(5, OBS_STEPS, COND_DIM, generator=generator)

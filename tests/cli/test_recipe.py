@@ -214,5 +214,5 @@ def test_a_program_says_its_mistakes_and_keeps_its_bugs(tmp_path):
 def test_help_says_what_a_recipe_is_for_and_what_its_options_do():
     told = run("calibrate_bac", "--help")
     assert told.startswith("Compute the BAC schedules of a policy, without training.\n")
-    assert "samples: 1                                   # queries to average over" in told
+    assert "samples: 1                                   # policy calls to average over" in told
     assert "hydra" not in told

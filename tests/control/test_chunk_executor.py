@@ -1,4 +1,4 @@
-"""Which samples query when, what is served in between, and what happens to everything else that a policy writes."""
+"""Which samples policy call when, what is served in between, and what happens to everything else that a policy writes."""
 
 import pytest
 import torch

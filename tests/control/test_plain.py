@@ -19,7 +19,7 @@ def test_it_acts_as_in_the_environment(policy):
     env = make_env("Lift", seeds=[7])
     actor = ChunkExecutor(policy, n_action_steps=3)
     expected = env.rollout(7, actor)
-    for _ in range(2):  # the second episode begins anew
+    for _ in range(2):  # the second episode begins again
         actor.reset(seed=7)
         acted = [actor.act({"state": state.double().numpy()}) for state in expected[keys.STATE]]
         assert acted[0].dtype == np.float32

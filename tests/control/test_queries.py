@@ -61,7 +61,7 @@ class Remembering(TensorDictModuleBase):
 
 
 def test_what_a_policy_leaves_to_itself_is_not_recorded():
-    """Recorded beside a query it would be of that query, where it is to be read of the one before."""
+    """Recorded beside a policy call it would be of that call, where it is to be read of the one before."""
     policy = Remembering()
     policy.device = torch.device("cpu")
     actor = ChunkExecutor(policy, n_action_steps=1)
@@ -72,7 +72,7 @@ def test_what_a_policy_leaves_to_itself_is_not_recorded():
 
 
 def recorded():
-    """Two episodes of three queries."""
+    """Two episodes of three policy calls."""
     elapsed = torch.tensor([[0], [3], [3], [0], [3], [3]])
     return TensorDict({"step": torch.arange(1.0, 7)[:, None], keys.ELAPSED: elapsed}, [6])
 

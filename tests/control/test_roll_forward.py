@@ -16,7 +16,7 @@ from torchrl_sparse.training.state_model import fit_state_model
 WEIGHT = torch.tensor(
     [[-0.5, 0.0], [0.2, 0.0], [0.0, 0.0], [0.0, 0.9], [0.4, 0.1], [0.01, -0.02]], dtype=torch.float64
 )
-"""A hand that follows its commands late, and is drawn to something that drifts: 2 numbers, their change, an action and 1."""
+"""A hand that follows its commands late, and is guided toward something that drifts: 2 numbers, their change, an action and 1."""
 HOLD = TensorDictModule(lambda state: torch.zeros_like(state[..., :1]), [keys.STATE], [keys.HOLD])
 
 
@@ -80,7 +80,7 @@ def test_a_number_that_never_changes_stays():
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
 def test_a_policy_is_shown_the_state_in_which_its_answer_begins(delay):
-    """Played in that world: what each query but the first is shown comes true when its answer takes over."""
+    """Played in that world: what each policy call but the first is shown comes true when its answer takes over."""
     seer = Seer()
     executor = RealtimeExecutor(RollForward(seer, StateModel(WEIGHT)), HOLD, 4, latency=delay / 20)
     states, asked, actions = [torch.zeros(2), torch.tensor([0.1, 0.3])], [], []

@@ -29,7 +29,7 @@ class Drawing(TensorDictModuleBase):
 
 
 def played(executor, steps, resets=()):
-    """What two samples, whose states are the step and ten more, play; `resets` are steps at which the second begins anew."""
+    """What two samples, whose states are the step and ten more, play; `resets` are steps at which the second begins again."""
     td, actions, chosen = TensorDict(batch_size=[2]), [], []
     for step in range(steps):
         td["state"] = torch.tensor([[float(step)], [step + 10.0]])

@@ -84,7 +84,7 @@ def test_an_episode_is_the_scene_of_its_seed(made):
     shown = [first, *(env.reset() for _ in seeds[1:])]
     pictures = [td[keys.IMAGE][:, 0, 0].tolist() for td in shown]
     assert pictures == [[0, 0, 80], [0, 1, 90], [3, 1, 93], [3, 255, 163]]
-    assert [task for _, task, *_ in made] == [0, 3]  # made anew where the task changes alone
+    assert [task for _, task, *_ in made] == [0, 3]  # made again where the task changes alone
     assert made[0] == ("libero_goal", 0, 28, True, "fixed")
 
 

@@ -111,7 +111,7 @@ def test_frames_that_no_query_sees_are_not_rendered_and_change_nothing(env):
     (every, all_frames), (fewer, seen_frames) = played.values()
     assert torch.equal(every[keys.CHUNK], fewer[keys.CHUNK])
     assert torch.equal(every["next"][keys.STATE], fewer["next"][keys.STATE])
-    # The first; after steps 0 to 10, those of the last two before each query, at 4, 8 and, to come, 12.
+    # The first; after steps 0 to 10, those of the last two before each policy call, at 4, 8 and, to come, 12.
     assert (all_frames, seen_frames) == (2 * 12, 2 * 6)
     same = (every["next"][keys.IMAGE] == fewer["next"][keys.IMAGE]).flatten(1).all(1)
     assert same.tolist() == [False, False, True, True] * 2 + [False, False, True]

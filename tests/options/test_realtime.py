@@ -1,4 +1,4 @@
-"""Options of success against latency: what arrives where queries are timed and episodes played, whose own tests do so."""
+"""Options of success against latency: what arrives where policy calls are timed and episodes played, whose own tests do so."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace

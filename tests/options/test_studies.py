@@ -28,7 +28,7 @@ def windows(run):
 
 
 def asked(run):
-    """The policy that answers queries of demonstrations."""
+    """The policy that answers policy calls of demonstrations."""
     return run.call("make_targets")["policy"]
 
 

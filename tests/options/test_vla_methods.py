@@ -1,4 +1,4 @@
-"""Options of the calibration and the benchmark of visual tokens: what arrives where queries are recorded and episodes played,
+"""Options of the calibration and the benchmark of visual tokens: what arrives where calls are recorded and episodes played,
 whose own tests do so; they need a GL library."""
 
 from contextlib import nullcontext

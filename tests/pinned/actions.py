@@ -1,4 +1,4 @@
-"""What every shipped method answers to a few fixed queries."""
+"""What every shipped method answers to a few fixed policy calls."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Case:
         return 1e-3 if has_cameras(ASSETS / self.asset) else 2e-5
 
     def answer(self) -> dict[str, Tensor]:
-        """Normalised chunk [Q, n, A], mask [Q, ...] and FLOPs [Q, 1] of the Q queries."""
+        """Normalised chunk [Q, n, A], mask [Q, ...] and FLOPs [Q, 1] of the Q policy calls."""
         torch.manual_seed(0)
         return _vla_answers(self) if is_vla(ASSETS / self.asset) else _diffusion_answers(self)
 
@@ -86,7 +86,7 @@ def cases() -> Iterator[Case]:
 
 
 def policies() -> list[Path]:
-    """The folders of all policies; one that is trained anew may lie in that of another."""
+    """The folders of all policies; one that is trained again may lie in that of another."""
     return sorted(path.parent for path in ASSETS.rglob("model.safetensors"))
 
 
@@ -126,7 +126,7 @@ def shipped_methods(folder: Path) -> list[str]:
 
 
 def _diffusion_answers(case: Case) -> dict[str, Tensor]:
-    """The first query on its own, the others as a batch: engines have a way for each."""
+    """The first policy call on its own, the others as a batch: engines have a way for each."""
     folder = ASSETS / case.asset
     first, *others = _diffusion_queries(folder)
     with tempfile.TemporaryDirectory() as copies:
@@ -177,7 +177,7 @@ def _reusing(folder: Path, copies: Path, rule: str) -> Path:
 
 
 def _vla_answers(case: Case) -> dict[str, Tensor]:
-    """Two queries of an episode, the second in the knowledge of the first."""
+    """Two policy calls of an episode, the second in the knowledge of the first."""
     actor = build.vla_actor(ASSETS / case.asset, case.method, _vla_queries(), _KEPT)
     answers, last = [], None
     for query in _vla_queries():

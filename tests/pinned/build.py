@@ -76,7 +76,7 @@ def _policy(folder: Path, engine: str) -> DiffusionPolicy:
 
 
 def diffusion_actor(folder: Path, planners: Path, name: str, engine: str) -> ChunkExecutor:
-    """The method ``name`` as `recipes/benchmark.py` makes it, with a query at every step, from files in ``planners``."""
+    """The method ``name`` as `recipes/benchmark.py` makes it, with a policy call at every step, from files in ``planners``."""
 
     def calibration() -> None:
         raise AssertionError(f"{name}: expected a shipped schedule, got one to compute")
@@ -98,7 +98,7 @@ def diffusion_query(
 
 
 def diffusion_answer(actor: ChunkExecutor, query: TensorDictBase) -> dict[str, Tensor]:
-    """The normalised chunk [*B, n, A], the mask [*B, K, 3L], the FLOPs [*B, 1] and the seed [*B, 1] of a query [*B]."""
+    """The normalised chunk [*B, n, A], the mask [*B, K, 3L], the FLOPs [*B, 1] and the seed [*B, 1] of a policy call [*B]."""
     answer = actor(query)
     return {
         "chunk": actor.policy.normalizer.normalize_action(answer[keys.CHUNK]),
@@ -125,9 +125,9 @@ def _vla(folder: Path) -> VLAPolicy:
 
 
 def vla_actor(folder: Path, name: str, recorded: Sequence[TensorDictBase], kept: float) -> ChunkExecutor:
-    """The method ``name`` as `recipes/benchmark_vla.py` makes it, with a query at every step.
+    """The method ``name`` as `recipes/benchmark_vla.py` makes it, with a policy call at every step.
 
-    A method that matches another keeps ``kept`` tokens on the ``recorded`` queries. ``NAME.json`` is a calibrated budget.
+    A method that matches another keeps ``kept`` tokens on the ``recorded`` calls. ``NAME.json`` is a calibrated budget.
     """
     if name.endswith(".json"):
         pruner = TokenBudget.from_pretrained(folder / name).pruner()
@@ -170,7 +170,7 @@ def episodes_of(log: Path) -> list[EpisodeResult]:
 
 
 def results_of(episodes: dict[str, list[EpisodeResult]], like: Results) -> Results:
-    """The content of a ``results.json`` about them, as if every query took a second; the rest is that of ``like``."""
+    """The content of a ``results.json`` about them, as if every policy call took a second; the rest is that of ``like``."""
     second = summarize_latency([1.0])
     runs = {name: MethodRun(of_method, second, (0.0, 0.0)) for name, of_method in episodes.items()}
     about = {name: getattr(like, name) for name in ("task", "split", "seed", "machine", "policy")}

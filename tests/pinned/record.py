@@ -1,6 +1,6 @@
 """Writes what the pinned tests compare with, from the code as it is: ``python -m tests.pinned.record``.
 
-What is stored already stays as it is, unless it is named: ``python -m tests.pinned.record assets/can`` records Can's anew.
+What is stored already stays as it is, unless it is named: ``python -m tests.pinned.record assets/can`` records Can's again.
 """
 
 from __future__ import annotations

@@ -37,5 +37,5 @@ def test_answers_stay(case, stored):
 
 
 def differences(found: torch.Tensor, pinned: torch.Tensor) -> np.ndarray:
-    """How many bits of two packed masks [Q, bytes] differ, of each query."""
+    """How many bits of two packed masks [Q, bytes] differ, of each policy call."""
     return np.unpackbits(found.numpy() ^ pinned.numpy(), axis=1).sum(1)

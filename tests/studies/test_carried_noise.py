@@ -37,7 +37,7 @@ def policy(make_network):
 
 @pytest.fixture
 def targets(policy):
-    """Four queries."""
+    """Four policy calls."""
     cond = torch.randn(4, policy.n_obs_steps, SIZES["cond_dim"])
     return TensorDict({keys.COND: cond, "target": torch.full((4, policy.horizon, 10), 0.1)}, [4])
 
@@ -75,5 +75,5 @@ def test_the_answers_are_those_of_the_policy(policy, targets):
 
 
 def test_too_few_draws_are_refused(policy, targets):
-    with refused("got 2 draws of 4 queries"):
+    with refused("got 2 draws of 4 policy calls"):
         carried_noise(policy, targets, Sampler("ddim", 2), draws=2)

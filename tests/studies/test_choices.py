@@ -1,4 +1,4 @@
-"""Which method a table says to take: within a time of a query, and at twenty times dense's speed."""
+"""Which method a table says to take: within a time of a policy call, and at twenty times dense's speed."""
 
 from dataclasses import replace
 

@@ -39,7 +39,7 @@ def test_a_published_folder_is_played_on_its_images(tmp_path, monkeypatch, capsy
     check_options("libero_smoke", OmegaConf.to_container(config), OPTIONS | recipe.OPTIONS)
     recipe.main.__wrapped__(config)
     assert asked == [("libero_spatial", 28, True)]
-    assert "libero_spatial, 'wait': 5 steps, 2 queries" in capsys.readouterr().out
+    assert "libero_spatial, 'wait': 5 steps, 2 policy calls" in capsys.readouterr().out
 
 
 def test_every_suite_is_stepped_and_drawn(tmp_path, monkeypatch, capsys):
@@ -58,5 +58,5 @@ def test_every_suite_is_stepped_and_drawn(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out.splitlines()
     assert len(printed) == len(SUITES)
     for suite, line in zip(SUITES, printed, strict=True):
-        assert line.startswith(f"{suite}, 'wait': 10 steps, 3 queries")
+        assert line.startswith(f"{suite}, 'wait': 10 steps, 3 policy calls")
         assert iio.imread(tmp_path / f"{suite}.png").std() > 1

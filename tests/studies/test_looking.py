@@ -42,7 +42,7 @@ def policy(make_network):
 
 @pytest.fixture
 def queries():
-    """Three episodes of four queries; in the first half of each the first observed number is positive."""
+    """Three episodes of four policy calls; in the first half of each the first observed number is positive."""
     generator = torch.Generator().manual_seed(0)
     state = torch.randn(12, 2, SIZES["cond_dim"], generator=generator)
     state[..., 0] = torch.tensor([1.0, 1, -1, -1] * 3)[:, None]

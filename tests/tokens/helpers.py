@@ -1,4 +1,4 @@
-"""A small vision-language-action policy, queries for it, and a pruner that records another one."""
+"""A small vision-language-action policy, policy calls for it, and a pruner that records another one."""
 
 from dataclasses import replace
 
@@ -82,7 +82,7 @@ def make_grouped_policies(make_pruner):
 
 
 def query(batch=3, seed=0):
-    """The first query of ``batch`` episodes, with noise for images."""
+    """The first policy call of ``batch`` episodes, with noise for images."""
     generator = torch.Generator().manual_seed(seed)
     td = TensorDict({keys.INSTRUCTION: INSTRUCTIONS[:batch]}, [batch])
     for camera in SPEC.cameras:
@@ -103,7 +103,7 @@ def patch(camera, index):
 
 
 def later(td, changed=None, seed=1):
-    """The next query of the same episodes: everything that the policy wrote is there, and some patches have changed.
+    """The next policy call of the same episodes: everything that the policy wrote is there, and some patches have changed.
 
     Args:
         changed: patches that changed, as (camera, index) with camera 0 or 1; by default the upper half of the first camera.

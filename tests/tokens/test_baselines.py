@@ -18,7 +18,7 @@ NUM_VISUAL = CONFIG.num_visual
 
 
 def recorded(pruner, td, note):
-    """Runs a query and gives ``note(index, state)`` for each layer, before the pruner answers."""
+    """Runs a policy call and gives ``note(index, state)`` for each layer, before the pruner answers."""
     recorder, notes = Recorder(pruner), []
 
     def after_layer(index, state):
@@ -250,7 +250,7 @@ def test_reuse_of_a_scene_that_stands_still_is_exact():
 
 
 def test_what_changed_is_computed_anew():
-    """A token that is reused keeps what the last query made of it; the others, and so the actions, see the change."""
+    """A token that is reused keeps what the last policy call made of it; the others, and so the actions, see the change."""
     pruner = VLACachePruner(relevant_share=1 / PER_CAMERA)
     first = make_policy(pruner)(query(1))
     changed = [(0, i) for i in range(8)]

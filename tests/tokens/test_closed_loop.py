@@ -83,7 +83,7 @@ def first_batch(collector):
 
 
 def check_episode(steps):
-    """Queries at 0 and 4, and at 6, where fine mode begins, in mid-chunk."""
+    """Policy calls at 0 and 4, and at 6, where fine mode begins, in mid-chunk."""
     queries = steps[keys.QUERIED].squeeze(-1).nonzero().squeeze(-1).tolist()
     assert queries == [0, 4, 6]
     kept = steps[keys.KEPT].squeeze(-1)[queries]

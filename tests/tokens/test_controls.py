@@ -1,4 +1,4 @@
-"""The variants of methods that SpecPrune is held against: a dense first query, layers that are skipped, raters as released."""
+"""The variants of methods that SpecPrune is held against: a dense first call, layers that are skipped, raters as released."""
 
 from dataclasses import replace
 from functools import partial

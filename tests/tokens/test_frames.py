@@ -86,7 +86,7 @@ def unlike(td, furthest=3):
 
 
 def test_the_slower_the_hand_the_further_back_is_the_frame():
-    """Patch 1 changes at the second query, 2 at the third and so on; three hands at rest, slow and swift."""
+    """Patch 1 changes at the second policy call, 2 at the third and so on; three hands at rest, slow and swift."""
     td, speeds = query(), torch.tensor([0.0, 0.15, 0.3])
     td[keys.EEF_VEL][:, 2] = -speeds
     seen = [unlike(td)]

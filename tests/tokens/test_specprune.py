@@ -150,7 +150,7 @@ def test_published_counts():
 
 
 def still_scene(first):
-    """A query at the published shape whose images are those of the last one."""
+    """A policy call at the published shape whose images are those of the last one."""
     frames = torch.full((1, 2, 3, 224, 224), 9, dtype=torch.uint8)
     td = TensorDict({keys.IS_INIT: torch.tensor([[first]]), keys.TOKEN_FRAMES: frames}, [1])
     td[keys.IMAGE], td[keys.WRIST_IMAGE] = frames.unbind(1)

@@ -1,4 +1,4 @@
-"""Engines and the pruner's compiled MLP under random queries, right and wrong ones, against the reference in double precision.
+"""Engines and the pruner's compiled MLP under random calls, right and wrong ones, against the reference in double precision.
 
     python -m tests.torture.engine_fuzz seed=0 queries=200 seconds=300
 
@@ -31,12 +31,12 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-RIGHT, WRONG = "a random query is answered as by the reference", "a wrong query is answered or refused"
+RIGHT, WRONG = "a random policy call is answered as by the reference", "a wrong policy call is answered or refused"
 TOLERANCE = 2e-4
 """Largest difference to double precision, of actions in [-1, 1]."""
 
 _REFUSALS = (ValueError, TypeError)
-_LAST = 240.0  # seconds that the last query may take, and the start
+_LAST = 240.0  # seconds that the last policy call may take, and the start
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Query:
 
 
 def fuzz(seed: int, queries: int) -> Iterator[Verdict]:
-    """Ask every engine random queries, then wrong ones, and prune random observations."""
+    """Ask every engine random policy calls, then wrong ones, and prune random observations."""
     engines = ["torch", *(["native"] if native_available()[0] else [])]
     for number in range(queries):
         rng = random.Random(f"{seed}:{number}")
@@ -222,7 +222,7 @@ def torture_engines(seed: int, queries: int, library: Path | None, seconds: floa
     """Fuzz in a process of its own, under the sanitizers where their library is given; the process' end is a case too.
 
     Args:
-        seconds: after which no further query is asked.
+        seconds: after which no further policy call is asked.
     """
     words = (f"seed={seed}", f"queries={queries}", f"seconds={seconds}")
     command = [sys.executable, "-m", "tests.torture.engine_fuzz", *words]

@@ -1,6 +1,6 @@
 """What a campaign tried and what came of it: verdicts, their sums as JSON, and the table of the page.
 
-python -m tests.torture.report    # writes the table of tests/torture/README.md anew from report.json beside it
+python -m tests.torture.report    # writes the table of tests/torture/README.md again from report.json beside it
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ def make_env():
 
 @pytest.fixture(scope="module")
 def alone():
-    """What each query of one environment alone keeps, by seed and step."""
+    """What each policy call of one environment alone keeps, by seed and step."""
     kept = {}
     policy = make_policy()
     for seeds in SEEDS:
@@ -44,7 +44,7 @@ def by_place(steps):
 
 
 def test_a_pruner_compares_with_the_last_query(alone):
-    """The first query of an episode keeps every token, later ones those that changed: without the last images all would."""
+    """The first call of an episode keeps every token, later ones those that changed: without the last images all would."""
     collector = Collector(make_env(), make_policy(), frames_per_batch=2 * QUERIES, total_frames=2 * QUERIES)
     try:
         (steps,) = list(collector)

@@ -29,7 +29,7 @@ def env():
 
 
 def test_the_ordinary_way_to_collect_plays_whole_chunks(env):
-    """Right: one query in four steps, as in a `SerialEnv` (pytorch/rl#1406, #2327, #2362)."""
+    """Right: one policy call in four steps, as in a `SerialEnv` (pytorch/rl#1406, #2327, #2362)."""
     actor = ChunkExecutor(counting_policy(4), 4)
     options = {"frames_per_batch": 8, "total_frames": 8, "auto_register_policy_transforms": True}
     collector = Collector(env, actor, **options)
@@ -57,7 +57,7 @@ def test_zeros_in_the_place_of_the_state_are_an_error():
 
 
 def test_what_a_controller_carries_is_missed_too():
-    """Right: mode and warm-up of a controller whose keys are dropped would start anew at every step."""
+    """Right: mode and warm-up of a controller whose keys are dropped would start again at every step."""
     env = make_count_env([0])
     actor = ChunkExecutor(counting_policy(4), 4, ActionAwareController())
     td = step_mdp(env.step(actor(env.reset()))).exclude(keys.FINE)

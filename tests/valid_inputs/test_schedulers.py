@@ -56,7 +56,7 @@ def test_a_scheduler_samples_as_diffusers_does_with_its_entries(tmp_path, made, 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_engine_clips_as_the_checkpoint_says(tmp_path, made, engine):
-    """A whole query equals the published loop over diffusers' scheduler."""
+    """A whole policy call equals the published loop over diffusers' scheduler."""
     entries = {"timestep_spacing": "trailing", "clip_sample_range": 0.3}
     policy = read(tmp_path, made, scheduled(DDIM, 10, **entries), engine=engine)
     theirs = DDIM(100, beta_schedule="squaredcos_cap_v2", **entries)

@@ -1,6 +1,6 @@
 """BAC: block-wise adaptive caching (arXiv:2506.13456, ICLR 2026).
 
-Calibration records every block's output during dense queries. The *adaptive caching scheduler* (ACS) picks,
+Calibration records every block's output during dense policy calls. The *adaptive caching scheduler* (ACS) picks,
 for each block on its own, the M denoising steps that compute it. The *bubbling union algorithm* (BUA) then
 lets the blocks of highest error compute whenever a downstream FFN does, since an FFN that is updated on a
 stale input amplifies its error.

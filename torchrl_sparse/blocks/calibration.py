@@ -1,7 +1,7 @@
-"""Calibration: statistics of each block over dense queries, from which BAC decides.
+"""Calibration: statistics of each block over dense policy calls, from which BAC decides.
 
 They tell how alike a block's outputs are between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much they
-vary in all. Few queries suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
+vary in all. Few calls suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Calibration:
     Attributes:
         similarity: f64 [3L, K, K], see :func:`feature_similarity`.
         errors: f64 [3L], see :func:`block_error`.
-        num_samples: queries that were averaged.
+        num_samples: policy calls that were averaged.
         sampler: name of the sampler that denoised them; the schedules made from this are for it.
     """
 
@@ -70,7 +70,7 @@ class Calibration:
 
 @torch.no_grad()
 def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Calibration:
-    """Record the block outputs of dense queries; the paper uses a single one, several average its noise out.
+    """Record the block outputs of dense policy calls; the paper uses a single one, several average its noise out.
 
     Args:
         network: the denoiser, in eval mode.
@@ -99,7 +99,7 @@ def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor,
     if len(cond) == 0:
         raise InputError("cond: expected at least one sample, got none")
     similarity, errors = 0, 0
-    for sample in range(len(cond)):  # One at a time bounds the memory to the features of one query.
+    for sample in range(len(cond)):  # One at a time bounds the memory to the features of one policy call.
         recorder = FeatureRecorder()
         rows = slice(sample, sample + 1)
         denoise(network, sampler, noise[rows], cond[rows], record=recorder)

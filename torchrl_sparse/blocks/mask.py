@@ -92,7 +92,7 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
     """
     check_form(mask, num_steps, num_layers, batch)
     first = mask.select(-2, 0)
-    if first.any():  # one operation where nothing is wrong: every query of every method comes through here
+    if first.any():  # one operation where nothing is wrong: every policy call of every method comes through here
         pruned = first.reshape(-1, first.shape[-1]).any(dim=0).nonzero().flatten().tolist()
         names = ", ".join(block_name(column) for column in pruned)
         raise MaskError(
@@ -229,7 +229,7 @@ def fixed_macs(sizes: NetworkSizes) -> int:
 
 
 def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -> Tensor:
-    """Count the FLOPs (2 · MAC) of one query under ``mask``, over all K calls of the denoiser.
+    """Count the FLOPs (2 · MAC) of one policy call under ``mask``, over all K calls of the denoiser.
 
     Args:
         network: the denoiser or its sizes.
@@ -254,7 +254,7 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
 def mask_flops(sizes: NetworkSizes, mask: Tensor) -> Tensor:
     """Return :func:`query_flops` of a mask that was validated before."""
     num_steps = mask.shape[-2]
-    # Summed as whole numbers: a query exceeds what float32 counts exactly.
+    # Summed as whole numbers: a policy call exceeds what float32 counts exactly.
     skipped = (mask.sum(dim=-2) * _block_flops(sizes).to(mask.device)).sum(dim=-1)
     dense = 2 * num_steps * (sizes.num_layers * sum(block_macs(sizes)) + fixed_macs(sizes))
     return (dense - skipped).float()

@@ -1,4 +1,4 @@
-"""Planners: TensorDict modules that write the prune mask of a query and nothing else, and have one reuse rule.
+"""Planners: TensorDict modules that write the prune mask of a policy call and nothing else, and have one reuse rule.
 
 A planner of one's own subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
 does not) and writes one method; ``policy.plan = Mine()`` is all that using it takes. One that is kept in a file gets a
@@ -30,7 +30,7 @@ class PlanSpec:
     """The policy and the sampler that a planner serves.
 
     Attributes:
-        num_inference_steps: denoising steps K of a query.
+        num_inference_steps: denoising steps K of a policy call.
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
         sampler: name of its sampler, see `Sampler.name`.
@@ -68,7 +68,7 @@ class PlanSpec:
 
 
 class Planner(TensorDictModuleBase):
-    """Base of everything that decides which blocks a query skips.
+    """Base of everything that decides which blocks a policy call skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
     A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that was made for
@@ -79,8 +79,8 @@ class Planner(TensorDictModuleBase):
             :mod:`torchrl_sparse.blocks.mask`), of all observations.
         is_static: True where the mask does not depend on the observation.
         made_for: the only spec that it can be bound to; None serves every policy.
-        rate: prune rate of the queries that bring none; None where no rate is asked for. Assign another to change it.
-        flops: of deciding one mask, 2 * MAC; part of what the query costs.
+        rate: prune rate of the calls that bring none; None where no rate is asked for. Assign another to change it.
+        flops: of deciding one mask, 2 * MAC; part of what the call costs.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -192,7 +192,7 @@ class StaticPlanner(Planner):
         self.register_buffer("_mask", None, persistent=False)
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """Return the mask bool [K, 3L] of every query for ``spec``, row 0 all False.
+        """Return the mask bool [K, 3L] of every policy call for ``spec``, row 0 all False.
 
         Raises:
             ValueError: if the planner cannot serve ``spec``.
@@ -209,7 +209,7 @@ class StaticPlanner(Planner):
 
     @property
     def static_mask(self) -> Tensor | None:
-        """The mask bool [K, 3L] that every query gets; None before :meth:`bind`."""
+        """The mask bool [K, 3L] that every policy call gets; None before :meth:`bind`."""
         return self._mask
 
     @property

@@ -1,4 +1,4 @@
-"""Between a policy and an environment: when to query, and which action of a chunk to play."""
+"""Between a policy and an environment: when to call it, and which action of a chunk to play."""
 
 import lazy_loader as lazy
 

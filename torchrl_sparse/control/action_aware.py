@@ -162,7 +162,7 @@ class ActionAwareController(TensorDictModuleBase):
 
     The controller of a `ChunkExecutor`: it runs at every step and writes ``("control", "fine")``, the budget, and
     ``("control", "replan")``, which is True where fine mode begins, so that what is left of a chunk that was planned coarsely
-    is dropped. State is in keys, per sample, and starts anew where ``"is_init"``.
+    is dropped. State is in keys, per sample, and starts again where ``"is_init"``.
 
     Args:
         on: ``"measured"`` reads the hand's velocity, ``("observation", "eef_vel")``; ``"commanded"`` the action served last,

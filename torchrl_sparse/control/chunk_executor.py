@@ -1,4 +1,4 @@
-"""Receding-horizon execution: query the policy for a chunk, serve its actions one by one, query again."""
+"""Receding-horizon execution: ask the policy for a chunk, serve its actions one by one, ask again."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 class ChunkExecutor(TensorKeys, TensorDictModuleBase):
     """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
 
-    A sample queries the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
+    A sample asks the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
     when the controller asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to
-    the policy. Everything the policy writes stays in the TensorDict until that sample's next query, except costs, which are
+    the policy. Everything the policy writes stays in the TensorDict until that sample's next call, except costs, which are
     zero on served steps. A policy that reads ``("control", "last_chunk")`` and ``("control", "elapsed")`` is handed the chunk
-    of the query before and the steps since, 0 where an episode begins.
+    of the call before and the steps since, 0 where an episode begins.
 
     All state is in keys, so it follows the environment through any collector that gives them a place in its spec:
     ``auto_register_policy_transforms=True`` does, or `make_tensordict_primer` by hand. Without TorchRL around it, `reset` and
@@ -50,9 +50,9 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
 
     Args:
         policy: writes ``("vla_action", "chunk")``, [*B, n, A], whose entry 0 is for the present step.
-        n_action_steps: actions of a chunk that are executed before the next query (Ta).
+        n_action_steps: actions of a chunk that are executed before the next call (Ta).
         controller: a TensorDictModule that may write ``("control", "replan")``; run at every step.
-        num_samples: chunks S that a query samples as one batch, of which one is played; the first has the noise of a query that
+        num_samples: chunks S that a call samples as one batch, of which one is played; the first has the noise of a call that
             samples one. Needs ``("episode", "seed")``. FLOPs are those of all.
         selector: writes ``("control", "chosen")`` given ``("control", "candidates")``, see
             :mod:`torchrl_sparse.control.selectors`; with ``num_samples`` above 1, and only then.
@@ -210,7 +210,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         return keys.read(tensordict, keys.IS_INIT) | (self._age(tensordict) < 0)
 
     def _until_query(self, age: Tensor) -> Tensor:
-        """Return i64 [*B, 1]: steps from the next observation to the next query at the earliest."""
+        """Return i64 [*B, 1]: steps from the next observation to the next policy call at the earliest."""
         left = (self.n_action_steps - 1 - age).clamp(min=0)
         return left if self.controller is None else torch.zeros_like(left)  # which may ask at any step
 
@@ -257,11 +257,11 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         return dense(request, self.policy)
 
     def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: steps that a query asked now will take; none in a world that waits."""
+        """Return i64 [*B, 1]: steps that a policy call asked now will take; none in a world that waits."""
         return torch.zeros_like(self._age(tensordict))
 
     def _ask(self, request: TensorDictBase) -> TensorDictBase:
-        """Return the policy's answers to queries [n], each the chosen one of its samples."""
+        """Return the policy's answers to policy calls [n], each the chosen one of its samples."""
         if self.selector is None:
             return self.policy(request)
         rows, samples = len(request), self.num_samples

@@ -19,7 +19,7 @@ __all__ = ["PlainLoop"]
 
 
 class PlainLoop:
-    """One robot's episode under an executor: keeps its history and what a query left, as an environment and a collector would.
+    """One robot's episode under an executor: keeps its history and what a call left, as an environment and a collector would.
 
     Args:
         executor: a `ChunkExecutor`, whose policy has ``n_obs_steps`` and a ``normalizer``, as a `DiffusionPolicy` has.

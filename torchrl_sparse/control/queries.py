@@ -1,4 +1,4 @@
-"""The queries of episodes: recorded once, so that any policy can be asked the same."""
+"""The policy calls of episodes: recorded once, so that any policy can be asked the same."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["answer", "in_turn", "record_queries"]
 def record_queries(
     actor: ChunkExecutor, make_env: Callable[..., EnvBase], seeds: Sequence[int]
 ) -> TensorDictBase:
-    """Record every query of one episode per seed: [number of queries], with what the policy read and what it answered.
+    """Record every policy call of one episode per seed: [number of calls], with what the policy read and what it answered.
 
-    The queries are where the policy is; the environment is where it is made.
+    The calls are where the policy is; the environment is where it is made.
 
-    What the policy leaves to its own next query is left out: it would have to be the query before's. The chunk of that one and
+    What the policy leaves to its own next call is left out: it would have to be the call before's. The chunk of that one and
     the steps since, 0 in the first, are there whether the policy reads them or not, so that another can be asked that does.
 
     Args:
@@ -41,7 +41,7 @@ def record_queries(
 
 
 def _queries(steps: TensorDictBase) -> TensorDictBase:
-    """Return the queries among the steps of an episode, [T], each with the last chunk before it."""
+    """Return the policy calls among the steps of an episode, [T], each with the last chunk before it."""
     asked = steps[keys.QUERIED].squeeze(-1).nonzero().squeeze(-1)
     queries, before = steps[asked], steps[asked - 1]  # the first one's, the last step of all, does not count
     queries.set(keys.LAST_CHUNK, before[keys.CHUNK])
@@ -60,9 +60,9 @@ def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictB
 
 
 def in_turn(policy: TensorDictModuleBase, queries: Iterable[TensorDictBase]) -> Iterator[TensorDictBase]:
-    """Yield what ``policy`` reads of one recorded query after the other, in TensorDicts of their own.
+    """Yield what ``policy`` reads of one recorded policy call after the other, in TensorDicts of their own.
 
-    What it leaves to its own next query, such as scores of visual tokens, was not recorded of another policy. It is taken
+    What it leaves to its own next call, such as scores of visual tokens, was not recorded of another policy. It is taken
     from the TensorDict that was yielded before, which the policy has to have answered in place by then.
     """
     before, left = None, []
@@ -77,6 +77,6 @@ def in_turn(policy: TensorDictModuleBase, queries: Iterable[TensorDictBase]) -> 
 
 
 def _unrecorded(policy: TensorDictModuleBase, queries: TensorDictBase) -> list[NestedKey]:
-    """Return the keys that ``policy`` leaves to itself and that the queries do not hold."""
+    """Return the keys that ``policy`` leaves to itself and that the policy calls do not hold."""
     held = set(queries.keys(True, True))
     return [key for key in policy.in_keys if key in policy.out_keys and unravel_key(key) not in held]

@@ -1,9 +1,9 @@
 """Execution in a world that does not wait: while the policy computes, the old chunk plays on.
 
-A query takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is for
-the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
+A policy call takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is
+for the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
 asynchronous inference. What the seam between the chunks is mended with: `RealtimeChunking`, a start of the policy, draws each
-query to the actions that play meanwhile; `WarmStart` begins from them; with ``num_samples`` the chunk that goes on best is
+call to the actions that play meanwhile; `WarmStart` begins from them; with ``num_samples`` the chunk that goes on best is
 played. `RollForward` shows the policy the state in which its answer will begin.
 """
 
@@ -28,7 +28,7 @@ from torchrl_sparse.rotations import quaternion_to_rot6d
 class RealtimeExecutor(ChunkExecutor):
     """A `ChunkExecutor` whose answers come as late as the policy is slow.
 
-    A sample queries the policy every ``n_action_steps`` steps, or as soon as the last answer has come if that takes longer.
+    A sample asks the policy every ``n_action_steps`` steps, or as soon as the last answer has come if that takes longer.
     Until the new answer is there the old chunk plays on, and where a chunk has come to its end its last action is held, which
     for absolute poses is a standstill. Before the first answer of an episode the arm is held where it is. With latency 0 all
     actions are those of `ChunkExecutor`.
@@ -37,8 +37,8 @@ class RealtimeExecutor(ChunkExecutor):
         policy: as for `ChunkExecutor`; ``("cost", "latency")`` is what it took if ``latency`` is None.
         hold: a TensorDictModule that writes ``("control", "hold")``, [*B, A], the action that keeps the arm where it
             is, e.g. `HoldPose`.
-        n_action_steps: steps from one query to the next; nothing says that a chunk is long enough for that and the latency.
-        latency: seconds that a query takes; None takes each query's own time, as the policy measured it. Rows of a batch
+        n_action_steps: steps from one call to the next; nothing says that a chunk is long enough for that and the latency.
+        latency: seconds that a call takes; None takes each call's own time, as the policy measured it. Rows of a batch
             share a measured time, so measured latencies want batches of one.
         control_freq: steps a second.
         controller: as for `ChunkExecutor`; not heard while an answer is awaited.
@@ -105,7 +105,7 @@ class RealtimeExecutor(ChunkExecutor):
         tensordict.set(keys.MEANWHILE, torch.where(due[..., None], meanwhile, old))
 
     def _expected_delay(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: the latency that is given, else what the latest query took."""
+        """Return i64 [*B, 1]: the latency that is given, else what the latest policy call took."""
         return self._delay(tensordict) if self.latency is None else self._given_delay(tensordict)
 
     def _given_delay(self, tensordict: TensorDictBase) -> Tensor:
@@ -113,11 +113,11 @@ class RealtimeExecutor(ChunkExecutor):
         return delay_steps(latency, self.control_freq).expand(*tensordict.batch_size, 1)
 
     def _delay(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: steps that the latest query takes."""
+        """Return i64 [*B, 1]: steps that the latest policy call takes."""
         return keys.recall(tensordict, keys.DELAY, (1,), 0)
 
     def _new_delay(self, tensordict: TensorDictBase) -> Tensor:
-        """Return i64 [*B, 1]: steps that the query just made takes."""
+        """Return i64 [*B, 1]: steps that the policy call just made takes."""
         if self.latency is None:
             return delay_steps(keys.read(tensordict, keys.LATENCY), self.control_freq)
         return self._given_delay(tensordict)

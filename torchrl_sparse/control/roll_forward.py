@@ -111,7 +111,7 @@ class RollForward(TensorDictModuleBase):
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands
     to a policy that asks for them, and rolls ``("history", "state")`` forward through what plays until the answer is there.
     The first ``delay`` actions of the chunk are those, the answer's own follow, so that entry 0 is for the present step as in
-    any policy. An episode's first query, which waits at rest, and one without delay, are the policy's own. So is the
+    any policy. An episode's first policy call, which waits at rest, and one without delay, are the policy's own. So is the
     latency that it writes: rolling is not in it.
 
     Args:
@@ -119,7 +119,7 @@ class RollForward(TensorDictModuleBase):
         model: of its environment.
 
     Raises:
-        ValueError: if the policy reads no history of states; at a query, if that is of fewer than two.
+        ValueError: if the policy reads no history of states; at a call, if that is of fewer than two.
 
     Examples:
         >>> from torchrl_sparse import DiffusionPolicy

@@ -1,4 +1,4 @@
-"""Which of several chunks to play, when a query is asked more than once.
+"""Which of several chunks to play, when a policy call is asked more than once.
 
 Bidirectional Decoding (arXiv:2408.17355) samples several chunks and keeps one that agrees with the decision before. Its
 backward coherence is the distance to what the last chunk still has for the same steps, later ones counting less::

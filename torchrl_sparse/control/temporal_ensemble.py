@@ -1,11 +1,11 @@
-"""A policy whose chunks are averaged with what earlier queries predicted for the same steps.
+"""A policy whose chunks are averaged with what earlier policy calls predicted for the same steps.
 
 ACT (arXiv:2304.13705, temporal ensembling) asks at every step and plays the weighted mean of all predictions for it, the oldest
 with index 0 and the largest weight::
 
     a_t = sum_i w_i a_t^(i) / sum_i w_i          w_i = exp(-coeff i)
 
-Here it is kept as a running mean, so one chunk and a count are all that a query needs of those before it::
+Here it is kept as a running mean, so one chunk and a count are all that a call needs of those before it::
 
     mean_{k+1} = (W_k mean_k + w_k a_t^(k)) / W_{k+1},     W_k = sum_{i<k} w_i
 
@@ -32,10 +32,10 @@ __all__ = ["TemporalEnsemble"]
 
 
 class TemporalEnsemble(TensorDictModuleBase):
-    """Averages the chunks of a policy over its queries, see the module.
+    """Averages the chunks of a policy over its policy calls, see the module.
 
     Reads ``("control", "last_chunk")`` and ``("control", "elapsed")``, which `ChunkExecutor` hands over, and
-    ``("control", "ensembled")``, which it wrote at the query before: the predictions in each action of that chunk. An episode's
+    ``("control", "ensembled")``, which it wrote at the call before: the predictions in each action of that chunk. An episode's
     first chunk is the policy's own.
 
     Args:

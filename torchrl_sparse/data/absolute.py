@@ -5,7 +5,7 @@ becomes the pose that robosuite's OSC controller makes its goal when the recorde
 delta given to it; the gripper's command stays. Played by an absolute controller in the robosuite that recorded it, the motion
 is the same: whole scripted episodes of Lift are repeated within 1e-4 rad, m, rad/s and m/s.
 
-Observations are made anew from the recorded states, since those of robosuite up to 1.4 mean something else (Lift's vector
+Observations are made again from the recorded states, since those of robosuite up to 1.4 mean something else (Lift's vector
 between hand and cube has the other sign, Transport's parts another order) and published files lack the grip site's quaternion
 (robosuite issue 672). They are those of the state itself; in a running simulator they are one physics step, 2 ms, older.
 """

@@ -4,14 +4,14 @@ DAgger (arXiv:1011.0686) visits states under the mixture ``beta * expert + (1 - 
 expert for one action in each of them, and trains on all. A policy that acts in chunks needs more than that: its target in a
 state are the H actions that the expert would take from there on. Labels along a path that the policy drives are not those.
 Each is right where it is given, but none follows from the one before, and an absolute pose, which aims a step ahead of the
-hand, would follow the policy's hand. So the mixture is drawn once a query, and who takes over stays: before each query after
-the first the expert takes over with probability ``mixing``, and at the latest half-way to the horizon, which leaves it an
-episode's time. From there on an episode is a demonstration, disturbed like any other, that begins at a query of the policy's.
+hand, would follow the policy's hand. So the mixture is drawn once a policy call, and who takes over stays: before each call
+after the first the expert takes over with probability ``mixing``, and at the latest half-way to the horizon, which leaves it an
+episode's time. From there on an episode is a demonstration, disturbed like any other, that begins at a call of the policy's.
 HG-DAgger (arXiv:1810.02890) hands over like that, where a person finds it necessary; here chance does, so that the states are
 those that the policy visits, its failures among them. With rounds, each driven by the policy of the round before, ``mixing``
 falls, which lets the policy drive longer.
 
-Steps that the policy drove stay in the file: they are the history of the first queries, and an episode can be replayed from its
+Steps that the policy drove stay in the file: they are the history of the first calls, and an episode can be replayed from its
 start. Their label is the expert's action in that state. No window has its present among them (`Demonstrations.window_rows`).
 Episodes that the policy solves before the expert takes over teach nothing, and those that the expert does not solve teach what
 fails: both are dropped and counted. An expert that plans ahead, as Push-T's does, first ends the plan that it last made.
@@ -50,7 +50,7 @@ class Driving:
         fingerprint: of its weights, so that a collection is not continued with others.
         method: how it is sampled, see `torchrl_sparse.methods.diffusion`; none that needs a calibration.
         n_action_steps: actions executed of a chunk.
-        mixing: probability that the expert takes over before a query that is not the episode's first.
+        mixing: probability that the expert takes over before a policy call that is not the episode's first.
 
     Raises:
         ValueError: if a value is out of its range.

@@ -4,7 +4,7 @@ The source is ``pusht_cchi_v7_replay.zarr`` without its images, as an ``.npz`` w
 ``state`` f32 [N, 5] (agent x, y; block x, y; pixels; block angle, rad), ``keypoint`` f32 [N, 9, 2] (pixels), ``action``
 f32 [N, 2] (the agent's target, pixels) and ``episode_ends`` i64 [E], the row after each episode's last.
 
-Observations are made anew from the states, as `PushTEnv` observes: the recorded keypoints of an episode's first rows are up to
+Observations are made again from the states, as `PushTEnv` observes: the recorded keypoints of an episode's first rows are up to
 2 pixels off, all others equal to rounding.
 """
 

@@ -90,8 +90,8 @@ class Demonstrations:
 
         Args:
             horizon: rows of a window; the first ``n_obs_steps`` are also its observations.
-            n_obs_steps: observations of a query.
-            n_action_steps: actions executed of a query.
+            n_obs_steps: observations of a policy call.
+            n_action_steps: actions executed of a call.
             episodes: episodes to cut; all by default.
 
         Raises:

@@ -99,7 +99,7 @@ class BlockPushScene:
         self._ending = weakref.finalize(self, _disconnect, self.client)  # its own clean-up fails at exit
 
     def reset(self, start: Start) -> None:
-        """Build everything anew: restoring a state would keep contacts of the last episode in the solver's memory."""
+        """Build everything again: restoring a state would keep contacts of the last episode in the solver's memory."""
         client = self.client
         client.resetSimulation()
         client.setGravity(0, 0, -9.8)

@@ -1,6 +1,7 @@
 """Lift one of five named cubes, while a ball that has nothing to do with it circles them.
 
-What moves in the pictures is not what counts: a pruner that keeps the visual tokens that changed since the last query keeps the
+What moves in the pictures is not what counts: a pruner that keeps the visual tokens that changed since the last policy call
+    keeps the
 ball's. That tells it from one that also asks what the model attends to, which LiftNamed, where only the arm moves, does not.
 
 Importing this module registers ``"LiftCrowded"`` with robosuite; `make_simulator` does so.

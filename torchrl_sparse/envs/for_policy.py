@@ -22,7 +22,7 @@ _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None) -> Callable[..., EnvBase]:
     """Return a maker of environments that show what ``policy`` was trained on; its keywords are those of `make_env`.
 
-    Frames that no query of its executor sees are not rendered (``seen_frames`` of `RobosuiteEnv`; None renders all).
+    Frames that no policy call of its executor sees are not rendered (``seen_frames`` of `RobosuiteEnv`; None renders all).
 
     Args:
         task: see `make_env`.

@@ -115,7 +115,7 @@ def require_libero() -> None:
 class _MountedLibero(LiberoEnv):
     """`LiberoEnv` in robosuite 1.5, which does not know the base of the robots in LIBERO's floor scenes: None.
 
-    Robots are made anew at every reset. robosuite's table has the entry only meanwhile.
+    Robots are made again at every reset. robosuite's table has the entry only meanwhile.
 
     Attributes:
         scene_seed: what a reset draws comes of it; None leaves that to numpy's global generator, as LIBERO does. Cabinets and

@@ -57,7 +57,7 @@ class LiberoSuite(SeededEnv):
     """The tasks of a suite: cameras, velocity and instruction of `make_libero_env`, its state f32 [8] and normalised actions.
 
     An episode is what `scene_of` says, and what a reset draws beside it (where cabinets and stoves stand) comes of its seed
-    too. The simulator is made anew where the task changes, so as many environments as tasks, each with every tenth seed, spare
+    too. The simulator is made again where the task changes, so as many environments as tasks, each with every tenth seed, spare
     that.
 
     Args:

@@ -211,7 +211,7 @@ class RobosuiteEnv(SeededEnv):
         return super()._step(tensordict)
 
     def _goes_unseen(self, tensordict: TensorDictBase) -> bool:
-        """Tell whether no query will see the frames after this step."""
+        """Tell whether no policy call will see the frames after this step."""
         if self._seen_frames is None or (ahead := tensordict.get(keys.UNTIL_QUERY, None)) is None:
             return False
         return int(ahead) >= self._seen_frames

@@ -30,7 +30,7 @@ class SeededEnv(EnvBase):
     An episode is *terminated* on success and *truncated* at the horizon, never both. Its integer, reported under
     ``("episode", "seed")``, is the next of ``seeds``, or one more than the last after `set_seed`.
 
-    Copied or sent to another process, as `MultiSyncCollector` does with one that is ready-made, it is made anew from the
+    Copied or sent to another process, as `MultiSyncCollector` does with one that is ready-made, it is made again from the
     arguments that it was made from, and begins with the first of ``seeds``: no simulator can be sent.
 
     A subclass makes its specs with `_make_specs` and says how an episode starts (`_start`), goes on (`_advance`), looks

@@ -1,16 +1,16 @@
 """The methods of a diffusion policy by name: planner and sampler, controller, and colour in figures.
 
 A method is a `MethodSpec` or its label. The planner is a key of :data:`METHODS`, or a saved one, ``NAME.json`` or ``NAME/``,
-which brings the sampler that it was made for. ``NAME@RATE`` asks every query for that prune rate; with ``NAME@COARSE-FINE`` a
-controller asks for the first rate in coarse motion and for the second in fine motion.
+which brings the sampler that it was made for. ``NAME@RATE`` asks every policy call for that prune rate; with
+``NAME@COARSE-FINE`` a controller asks for the first rate in coarse motion and for the second in fine motion.
 
 ==================== ===========================================================================================
 ``ddpm_82_14``       a sampler with its steps, nothing pruned
 ``uniform``          every block each ``-(-K // M)``-th step, as released
 ``uniform7``         every block each 7th step and in the last
 ``uniform2_ddpm10``  the same of another sampler
-``ddpm10_warm2``     a sampler, of which queries that have a last chunk take the last 2 steps, from it
-``ddpm5_logsnr_rtc`` a sampler, whose queries are drawn to what is left of the last chunk
+``ddpm10_warm2``     a sampler, of which calls that have a last chunk take the last 2 steps, from it
+``ddpm5_logsnr_rtc`` a sampler, whose calls are guided toward what is left of the last chunk
 ``sag:int8@0.9``     a saved planner, run in the native engine with rounded weights and activations
 ==================== ===========================================================================================
 
@@ -93,7 +93,7 @@ class Method:
             written, or None.
         color: in figures, such as ``"#0072B2"``; None takes what is left.
         noise: stream of the noise that it draws; 0 is what all methods share, so that they can be paired.
-        start: returns what queries begin from where the name does not say it; None is noise.
+        start: returns what policy calls begin from where the name does not say it; None is noise.
     """
 
     make: Callable[[MethodInputs], tuple[Planner, Sampler]]
@@ -253,7 +253,7 @@ def _saved_path(planners: Path, name: str) -> Path | None:
 
 
 def _ask_for(planner: Planner, written: MethodSpec) -> None:
-    """Set the rate of queries that bring none. Both rates are tried: a wrong one is found now and not in mid-episode."""
+    """Set the rate of policy calls that bring none. Both rates are tried: a wrong one is found now and not in mid-episode."""
     if planner.rate is None:
         raise InputError(
             f"methods: {written.name}: expected a planner that takes a prune rate, got {type(planner).__name__}"

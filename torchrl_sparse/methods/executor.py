@@ -20,7 +20,7 @@ __all__ = ["execution_options", "executed_every", "make_executor", "make_realtim
 
 
 def executed_every(method: MethodSpec | str, policy: DiffusionPolicy, n_action_steps: int) -> int:
-    """Return the environment steps from one query of a method to the next.
+    """Return the environment steps from one policy call of a method to the next.
 
     Args:
         method: such as ``"ddpm3_logsnr_every2"``.
@@ -96,5 +96,5 @@ def make_realtime_executor(
 
 
 def _averaged(method: MethodSpec | str, policy: TensorDictModuleBase) -> TensorDictModuleBase:
-    """Return the policy, its chunks averaged over queries where the method says so."""
+    """Return the policy, its chunks averaged over policy calls where the method says so."""
     return TemporalEnsemble(policy) if MethodSpec.parse(method).ensembled else policy

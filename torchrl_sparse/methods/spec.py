@@ -41,14 +41,14 @@ class MethodSpec:
         planner: key of `METHODS` or a saved planner; of a vision-language-action policy, key of `TOKEN_METHODS`.
         interval: of the planner ``"uniform"``: every block is computed each so many steps, and in the last.
         sampler: its name; None for the policy's own, or the one that a saved planner was made for.
-        warm: the sampler's last steps that a query with a last chunk takes, see `WarmStart`; None begins from noise.
-        rtc: queries are drawn to what is left of the last chunk, see `RealtimeChunking`.
-        every: environment steps from one query to the next; None leaves them to the benchmark.
-        samples: chunks that a query samples, of which the one that agrees best with the last chunk is played.
-        ensembled: the chunks are averaged over queries, see `TemporalEnsemble`.
+        warm: the sampler's last steps that a policy call with a last chunk takes, see `WarmStart`; None begins from noise.
+        rtc: calls are guided toward what is left of the last chunk, see `RealtimeChunking`.
+        every: environment steps from one call to the next; None leaves them to the benchmark.
+        samples: chunks that a call samples, of which the one that agrees best with the last chunk is played.
+        ensembled: the chunks are averaged over calls, see `TemporalEnsemble`.
         ahead: in a world that does not wait, the policy is shown the state in which its answer will begin.
         weights: ``"bf16"`` or ``"int8"``, which the native engine rounds to; None rounds nothing.
-        rates: prune rates: none, one for every query, or two, of coarse and of fine motion. Of a token method, the number
+        rates: prune rates: none, one for every call, or two, of coarse and of fine motion. Of a token method, the number
             that it is tuned by.
         like: label of the token method whose tokens are matched.
 

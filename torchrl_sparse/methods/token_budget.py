@@ -26,8 +26,8 @@ class BudgetPoint:
 
     Attributes:
         number: SpecPrune's alpha, which multiplies its budget, a baseline's share of the tokens, and so on.
-        kept: visual tokens in a decoder layer, mean over layers and all queries but the first of an episode, which may keep
-            all of them whatever the number is.
+        kept: visual tokens in a decoder layer, mean over layers and all policy calls but the first of an episode, which may
+            keep all of them whatever the number is.
         loss: mean absolute difference to the dense policy's normalised actions, or the share of episodes that were lost.
     """
 

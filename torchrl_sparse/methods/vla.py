@@ -130,9 +130,9 @@ TOKEN_METHODS: dict[str, TokenMethod] = {
 """Name -> method. ``specprune`` runs with the controller; ``specprune_uncontrolled`` (static and dynamic pruning) and
 ``specprune_static`` are its ablations, and so are, with the controller, those that lack one of the sets of Eq. 6.
 ``specprune_look_back`` compares a slow hand's pictures with older ones.
-``..._dense_first`` leaves an episode's first query dense, as SpecPrune and frame difference do. ``fastv`` prunes after two
-layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``efficientvla`` is its half that is about tokens,
-``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the words that rate tokens in each layer,
+``..._dense_first`` leaves an episode's first policy call dense, as SpecPrune and frame difference do. ``fastv`` prunes after
+two layers, ``fastv_scaled`` after as many as two of 32 are at the model's depth. ``efficientvla`` is its half that is about
+tokens, ``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the words that rate tokens in each layer,
 ``sparsevlm_embeddings`` once, as the authors' release."""
 
 

@@ -2,7 +2,8 @@
 
 Parameters and buffers get a class that refuses whatever writes in place, as does all that shares their memory, and the
 dictionaries in which modules hold them refuse others. What was taken of them before has none of their memory: they are moved.
-It still counts its writes together with them, so that these are found in the next query, where an error says what they missed.
+It still counts its writes together with them, so that these are found in the next policy call, where an error says what they
+missed.
 
 Not refused is what goes around PyTorch: a storage's bytes, and addresses handed to other languages.
 """

@@ -6,7 +6,7 @@
      "network": {arguments of TransformerForDiffusion},
      "schedule": {arguments of Sampler},
      "plan": "plan.json" or "plan", a planner's file or folder beside this one; only where something is pruned,
-     "warm_start": steps of a query that begins from the last chunk; only where not all begin from noise,
+     "warm_start": steps of a policy call that begins from the last chunk; only where not all begin from noise,
      "engine": "native_int8" or "native_bf16"; only where the policy runs with rounded weights,
      "vision": {arguments of VisionEncoder; only where there are cameras},
      "source": {where an imported policy comes from; only there}}
@@ -70,7 +70,7 @@ class StoredPolicy:
             observations that make up the state, in order, and ``"cameras"``, name of the image here -> robomimic's; None or
             nothing for what a checkpoint does not say.
         plan: name of the planner's file or folder, beside the other files; None if nothing is pruned.
-        warm_start: steps of a query that begins from the last chunk; None if all begin from noise.
+        warm_start: steps of a policy call that begins from the last chunk; None if all begin from noise.
         engine: that rounds weights and activations; None if nothing is rounded.
     """
 

@@ -55,7 +55,7 @@ def read_checkpoint(
         found = sorted(state) if isinstance(state, dict) else type(state).__name__
         raise InputError(
             f"{path}: expected a training checkpoint of this version with {sorted(fields)}, got {found}; "
-            f"move it away to begin anew"
+            f"move it away to begin again"
         )
     for name, expected in header.items():
         stored, asked = (_without(free, values) for values in (state[name], expected))

@@ -2,19 +2,19 @@
 
 * *Before the decoder.* Whoever runs earlier writes ``("tokens", "keep_mask")``, bool [*B, N], True = kept; a pruner may do so
   in `TokenPruner.begin`.
-* *Between decoder layers.* ``vla.pruner`` is a `TokenPruner` (None is dense), which each query calls like this::
+* *Between decoder layers.* ``vla.pruner`` is a `TokenPruner` (None is dense), which each policy call calls like this::
 
       pruner.bind(spec)     # once, when assigned: sizes to check budgets against
-      pruner.begin(td)      # td: TensorDict [B], the query
+      pruner.begin(td)      # td: TensorDict [B], the call
       ...                   # the decoder's layers, see `torchrl_sparse.networks.vla.hooks`
       pruner.end(td)
 
 **State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
 environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
 `begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
-in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a query,
+in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a call,
 such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key, and `TokenPruner.carried` says what it looks
-like to an environment; it is missing or 0 at the first query of all, and
+like to an environment; it is missing or 0 at the first call of all, and
 rows with ``"is_init"`` start afresh.
 """
 
@@ -35,8 +35,8 @@ class TokenPruner(LayerHooks):
 
     Attributes:
         in_keys: what `begin` reads beside what the policy reads; keys that the environment lacks are left out.
-        out_keys: what `end` leaves in its TensorDict for the environment; all of them, at every query.
-        look_back: queries that its images reach back.
+        out_keys: what `end` leaves in its TensorDict for the environment; all of them, at every policy call.
+        look_back: calls that its images reach back.
 
     Examples:
         >>> class KeepHalf(TokenPruner):
@@ -67,7 +67,8 @@ class TokenPruner(LayerHooks):
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
         """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`; a pruner adds keys of its own.
 
-        These are images and scores of the last query. What it leaves out follows any environment but a bare `ParallelEnv`.
+        These are images and scores of the last policy call. What it leaves out follows any environment but a bare
+        `ParallelEnv`.
         """
         both = set(self.in_keys) & set(self.out_keys)
         if not both:
@@ -82,7 +83,7 @@ class TokenPruner(LayerHooks):
         return {key: entry for key, entry in known.items() if key in both}
 
     def begin(self, td: TensorDictBase) -> None:
-        """Prepare a query before the decoder runs, from its inputs in ``td`` [B]."""
+        """Prepare a policy call before the decoder runs, from its inputs in ``td`` [B]."""
 
     def end(self, td: TensorDictBase) -> None:
         """Write ``out_keys`` into ``td`` after the decoder."""

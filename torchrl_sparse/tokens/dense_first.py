@@ -1,4 +1,4 @@
-"""A pruner that leaves an episode's first query dense, as those do that compare each query with the last."""
+"""A pruner that leaves an episode's first policy call dense, as those do that compare each call with the last."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = ["DenseFirst"]
 class DenseFirst(TokenPruner):
     """Another pruner, but for rows with ``"is_init"``, which keep all tokens as they are.
 
-    SpecPrune and frame difference see an episode's first query whole, since nothing is known of the scene yet. A control that
-    is to be compared with them gets the same.
+    SpecPrune and frame difference see an episode's first policy call whole, since nothing is known of the scene yet. A control
+    that is to be compared with them gets the same.
 
     Args:
         inner: that pruner.

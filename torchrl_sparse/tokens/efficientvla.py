@@ -125,7 +125,7 @@ def redundant_layers(similarity: Tensor, count: int) -> list[int]:
     """Return the ``count`` layers, none of the first two, that change their input least.
 
     Args:
-        similarity: f32 [Q, L], what `LayerSimilarity` says of Q queries of the dense policy.
+        similarity: f32 [Q, L], what `LayerSimilarity` says of Q policy calls of the dense policy.
         count: layers to skip.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Frame difference alone: what changed since the last query stays, the rest goes. One ingredient of SpecPrune-VLA by itself."""
+"""Frame difference alone: what changed since the last call stays, the rest goes. One ingredient of SpecPrune-VLA by itself."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def most_changed(similarity: Tensor, count: int, cameras: int) -> Tensor:
 
 
 class FrameDifferencePruner(TokenPruner):
-    """Keeps, of each camera, the ``share`` of patches that changed most since the last query; all at an episode's first.
+    """Keeps, of each camera, the ``share`` of patches that changed most since the last policy call; all at an episode's first.
 
     It prunes before the decoder, so that no layer is scored.
 

@@ -1,4 +1,4 @@
-"""Changes in the cameras' images since the last query, or since one further back while the hand is slow, patch by patch."""
+"""Changes in the cameras' images since the last call, or since one further back while the hand is slow, patch by patch."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ FRAME_KEYS = [keys.TOKEN_FRAMES, keys.IS_INIT]
 
 
 def past_frame_keys(furthest: int) -> list[NestedKey]:
-    """Return what `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` queries back; the first it writes as well.
+    """Return what `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` calls back; the first it writes as well.
 
     Raises:
-        ValueError: if that is less than one query.
+        ValueError: if that is less than one call.
     """
     if furthest < 1:
-        raise InputError(f"look_back: expected at least 1 query, got {furthest}")
+        raise InputError(f"look_back: expected at least 1 policy call, got {furthest}")
     return [keys.TOKEN_PAST_FRAMES, keys.EEF_VEL] if furthest > 1 else []
 
 
@@ -71,16 +71,16 @@ def similarity(previous: Tensor, current: Tensor) -> Tensor:
 
 
 def look_back(speed: Tensor, furthest: int, swift: float) -> Tensor:
-    """Return how many queries ago the frame to compare with was taken, i64 [...], from 1 to ``furthest``.
+    """Return how many policy calls ago the frame to compare with was taken, i64 [...], from 1 to ``furthest``.
 
-    A slow hand changes little from one query to the next, and what it changes would pass for standing still. So the slower,
+    A slow hand changes little from one call to the next, and what it changes would pass for standing still. So the slower,
     the further back, and linearly, as in the release of SpecPrune-VLA (arXiv:2509.05614). That counts environment steps, 6 for
-    a hand at rest, and reads commanded actions; here it is queries and the measured speed, since a pruner sees no other frames.
+    a hand at rest, and reads commanded actions; here it is calls and the measured speed, since a pruner sees no other frames.
 
     Args:
         speed: of the hand, m/s.
-        furthest: queries for a hand at rest.
-        swift: m/s, at and above which the last query's frame is taken.
+        furthest: calls for a hand at rest.
+        swift: m/s, at and above which the last call's frame is taken.
 
     Examples:
         >>> look_back(torch.tensor([0.0, 0.1, 0.2, 0.3, 9.0]), furthest=4, swift=0.3).tolist()
@@ -92,16 +92,16 @@ def look_back(speed: Tensor, furthest: int, swift: float) -> Tensor:
 def compare_frames(
     td: TensorDictBase, spec: VisualSpec, furthest: int = 1, swift: float = 0.3
 ) -> tuple[Tensor, Tensor]:
-    """Compare the images of this query with those of an earlier one, and remember these.
+    """Compare the images of this policy call with those of an earlier one, and remember these.
 
     Args:
-        td: a query [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced, and where
+        td: a call [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced, and where
             ``furthest`` is above 1 ``("tokens", "past_frames")`` too, for which ``("observation", "eef_vel")`` is read.
-        furthest, swift: see `look_back`; by default it is always the last query.
+        furthest, swift: see `look_back`; by default it is always the last call.
 
     Returns:
         f32 [B, N] similarity of each patch, and bool [B, 1] whether there was nothing to compare with: an episode's first
-        query, or a last one in the dark.
+        call, or a last one in the dark.
     """
     frames = torch.stack([keys.read(td, camera) for camera in spec.cameras], 1)
     previous = keys.recall(td, keys.TOKEN_FRAMES, frames.shape[1:], 0, frames.dtype)

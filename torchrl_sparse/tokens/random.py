@@ -32,7 +32,7 @@ def random_set(seed: Tensor, num_tokens: int, count: int) -> Tensor:
 
 
 class RandomPruner(TokenPruner):
-    """Keeps a random ``share`` of all visual tokens, drawn anew at each query, before the decoder.
+    """Keeps a random ``share`` of all visual tokens, drawn again at each policy call, before the decoder.
 
     The draw follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them, else from
     torch's global generator.

@@ -98,7 +98,7 @@ class SparseVLMPruner(TokenPruner):
         layers: after which to prune, in a decoder 32 deep; scaled to the model's depth.
         recycled: share of the dropped tokens, the best, that are merged.
         clusters: merged tokens, as a share of those.
-        raters: which words rate: ``"layer"`` chooses them anew in each of the ``layers``, from what reaches it;
+        raters: which words rate: ``"layer"`` chooses them again in each of the ``layers``, from what reaches it;
             ``"embeddings"``, as the authors' release, once and before the decoder.
 
     Raises:

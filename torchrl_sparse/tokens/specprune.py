@@ -1,4 +1,4 @@
-"""SpecPrune-VLA: visual tokens chosen from the last query, from what moved, and from the decoder's own first layers.
+"""SpecPrune-VLA: visual tokens chosen from the last policy call, from what moved, and from the decoder's own first layers.
 
 Wang et al., "SpecPrune-VLA: Accelerating Vision-Language-Action Models via Action-Aware Self-Speculative Pruning",
 arXiv:2509.05614. Nothing is trained. Each equation is the function named after what it defines:
@@ -7,7 +7,7 @@ arXiv:2509.05614. Nothing is trained. Each equation is the function named after 
 Eq.    function                          defines
 ====== ================================= =============================================================================
 1      `visual_scores` (`vla.decoder`)   attention of the instruction's words to a visual token
-2      `similarity` (`tokens.frames`)    cosine between a patch and the same patch at the last query
+2      `similarity` (`tokens.frames`)    cosine between a patch and the same patch at the last call
 3      `dynamic_set`                     patches that changed
 4      `layer_set`                       the best tokens of one layer, in each camera
 5      `local_set`                       their union over the first two layers: the speculation
@@ -73,7 +73,7 @@ def local_set(first: Tensor, second: Tensor) -> Tensor:
 
 
 def retain_set(carried: Tensor, dynamic: Tensor, local: Tensor) -> Tensor:
-    """Eq. 6: what the last query found important, what changed since, and what this query's first layers pick."""
+    """Eq. 6: what the last policy call found important, what changed since, and what this call's first layers pick."""
     return carried | dynamic | local
 
 
@@ -118,16 +118,16 @@ class SpecPruneOptions:
         budget: tokens per camera where no controller grants them.
         wrist_share: share of the budget for each camera but the first.
         threshold: patches less similar than this (Eq. 2) have changed.
-        look_back: since when: so many queries for a hand at rest, one for a swift one, see `tokens.frames.look_back`.
+        look_back: since when: so many policy calls for a hand at rest, one for a swift one, see `tokens.frames.look_back`.
         static_share: None: what changed joins in up to the budget (Eq. 3). Else the release's rule: everything stays but the
             most similar patches, up to this share of a camera in coarse and in fine mode.
-        carry: use the last query's scores (the set V_global of Eq. 6).
-        changed: use what changed since the last query (V_dynamic).
-        local: use what this query's first two layers pick (V_local).
+        carry: use the last call's scores (the set V_global of Eq. 6).
+        changed: use what changed since the last call (V_dynamic).
+        local: use what this call's first two layers pick (V_local).
         early: None, or prune after the first layer as well, to so many times K.
         dynamic: prune in deeper layers.
         dynamic_layers, keep_share: where, and the share of the visual tokens that stays each time.
-        carry_layers: whose scores are carried to the next query.
+        carry_layers: whose scores are carried to the next call.
         beta, steepness: of Eqs. 10 and 8; the paper does not give the latter.
     """
 
@@ -168,7 +168,7 @@ PRESETS = {
 
 _DEPTH = 32
 _SPECULATION = 2  # layers that see all tokens
-# What one layer leaves in the query's TensorDict for the next.
+# What one layer leaves in the policy call's TensorDict for the next.
 _COUNTS, _CARRIED, _CHANGED, _FIRST, _RUNNING, _TO_CARRY = (
     ("specprune", name) for name in ("counts", "carried", "changed", "first", "running", "to_carry")
 )
@@ -178,7 +178,7 @@ class SpecPrune(TokenPruner):
     """Static pruning after two layers, dynamic pruning in deeper ones; see the module.
 
     The budget is ``("tokens", "budget")``, per sample, where an `ActionAwareController` writes it. Scores and images of the
-    last query travel as ``("tokens", "score")`` and ``("tokens", "frames")``.
+    last policy call travel as ``("tokens", "score")`` and ``("tokens", "frames")``.
 
     Args:
         preset: ``"paper"`` or ``"release"``.

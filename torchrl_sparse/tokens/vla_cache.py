@@ -1,12 +1,12 @@
-"""VLA-Cache: tokens that did not change are taken from the last query instead of being computed (Xu et al., arXiv:2502.02175).
+"""VLA-Cache: tokens that did not change are taken from the last call instead of being computed (Xu et al., arXiv:2502.02175).
 
 Nothing is dropped. A token is reused where its patch did not change and the instruction did not attend to it; the share of such
 tokens grows from layer to layer, the more, the more focused attention is.
 
 This emulates the method. The authors put the last query's keys and values in a layer's attention and compute nothing of a
-reused token. Here every token is computed, and what the last query left in the residual stream behind a layer is put in its
+reused token. Here every token is computed, and what the last call left in the residual stream behind a layer is put in its
 place, from which the next layer makes its keys and values: a layer's reuse takes effect one layer later, and none in the first.
-Entropy and relevance are those of the last query, relevance that of one layer, the 15th of 32. So it shows what reuse does to
+Entropy and relevance are those of the last call, relevance that of one layer, the 15th of 32. So it shows what reuse does to
 the actions, not what it saves: FLOPs and time are those of a decoder that reuses nothing.
 ``("tokens", "reused")`` says how many tokens a layer would be spared.
 """
@@ -29,7 +29,7 @@ REUSE_SHARE = ("tokens", "reuse_share")
 REUSED = ("tokens", "reused")
 
 _DEPTH, _TASK_LAYER = 32, 15
-# What one layer leaves in the query's TensorDict for the next.
+# What one layer leaves in the policy call's TensorDict for the next.
 _REUSABLE, _ALIKE, _REUSED_NOW, _ENTROPY, _NEW_CACHE = (
     ("vla_cache", name) for name in ("reusable", "alike", "reused", "entropy", "cache")
 )
@@ -42,7 +42,7 @@ def reusable_set(
     predecessors, none below ``threshold``, without the ``relevant`` most attended.
 
     Args:
-        similarity: [B, N] to the last query's patches.
+        similarity: [B, N] to the last policy call's patches.
         attention: [B, N] of the instruction's words, at the last query.
     """
     still = best_per_camera(similarity, [static] * cameras, similarity >= threshold)
@@ -82,7 +82,7 @@ def reuse_shares(entropy: Tensor, growth: float) -> Tensor:
 
 
 class VLACachePruner(TokenPruner):
-    """Reuses unchanged, irrelevant tokens from the last query; see the module for what that means here.
+    """Reuses unchanged, irrelevant tokens from the last policy call; see the module for what that means here.
 
     Entropy and relevance are those of the last query, over the attention of the instruction's words to the visual tokens.
 

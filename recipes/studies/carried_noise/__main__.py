@@ -2,7 +2,7 @@
 
     python -m recipes.studies.carried_noise task=lift demos=data/lift_proficient.h5
 
-No simulator is needed: demonstrations are asked many times, with noise that is drawn anew each time.
+No simulator is needed: demonstrations are asked many times, with noise that is drawn again each time.
 """
 
 from __future__ import annotations

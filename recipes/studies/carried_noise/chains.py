@@ -2,7 +2,7 @@
 
 A deterministic sampler hands the noise that it predicted on to the next step, so that every step sees the same noise, and errs
 in the same direction, until the last. A stochastic one draws new noise between steps, and the errors of its clean predictions
-average out. What is left is measured on queries that are answered many times, with noise that is drawn anew each time.
+average out. What is left is measured on policy calls that are answered many times, with noise that is drawn again each time.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class CarriedNoise:
     Attributes:
         timesteps: of the K steps.
         correlation: of the clean prediction of each step with the noise that its chain began with, over the draws of a
-            query; the mean over queries and executed numbers; [K].
-        spread: standard deviation of the answer over the draws of a query, root mean square.
+            policy call; the mean over calls and executed numbers; [K].
+        spread: standard deviation of the answer over the draws of a call, root mean square.
         error: of the answer against the demonstrated actions, root mean square.
     """
 
@@ -53,19 +53,19 @@ def carried_noise(
     n_action_steps: int = 8,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> CarriedNoise:
-    """Answer every query ``draws`` times and say what is left of the first noise.
+    """Answer every policy call ``draws`` times and say what is left of the first noise.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
         targets: [N], from data, see `torchrl_sparse.training.diffusion.targets.make_targets`.
         sampler: of the chain.
-        draws: of noise a query, at least 3.
+        draws: of noise a call, at least 3.
         seed: of the noise; samplers of as many steps draw the same.
         n_action_steps: actions executed of a chunk.
         on_progress: called with the network calls that were made, in samples.
 
     Raises:
-        ValueError: for fewer than three draws or no queries.
+        ValueError: for fewer than three draws or no calls.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -76,7 +76,7 @@ def carried_noise(
         ((87, 20), True)
     """
     if draws < 3 or not len(targets):
-        raise InputError(f"expected draws >= 3 and queries, got {draws} draws of {len(targets)} queries")
+        raise InputError(f"expected draws >= 3 and policy calls, got {draws} draws of {len(targets)} calls")
     network, target = policy.network, targets["target"]
     generator = torch.Generator().manual_seed(seed)
     shape = (len(targets) * draws, sampler.num_inference_steps, *target.shape[1:])

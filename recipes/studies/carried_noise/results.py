@@ -19,8 +19,8 @@ class CarriedNoiseResults:
 
     Attributes:
         policy: its fingerprint.
-        queries, draws: how many were answered, and how often each.
-        seed: of the queries and the noise.
+        policy calls, draws: how many were answered, and how often each.
+        seed: of the calls and the noise.
         chains: sampler -> what was measured.
     """
 

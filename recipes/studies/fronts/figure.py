@@ -78,7 +78,7 @@ _FAMILIES = (
     _Family("a searched choice", "recalling", "#E8C9C0", "p"),
 )
 
-_USUAL_INTERVAL = 8  # environment steps between queries, of all policies here
+_USUAL_INTERVAL = 8  # environment steps between policy calls, of all policies here
 _FEW_STEPS = {2: "#56B4E9", 3: "#0072B2", 5: "#009E73", 10: "#E69F00"}
 _SPENDERS = (
     _Family("dense, other noise", "dense_noise", "#8A8A8F", "s"),
@@ -93,7 +93,7 @@ _SPENDERS = (
 
 
 def plot_fronts(results: Sequence[Results], path: str | os.PathLike) -> Path:
-    """Draw, for each task, what methods lose to dense against how many times as fast as dense a query is.
+    """Draw, for each task, what methods lose to dense against how many times as fast as dense a policy call is.
 
     Above is success in points, or the score; below the ratio of times to success. Bars are 95 % intervals, the dashed
     lines the margins. Methods that are of no known kind are left out. Steps of one sampler are joined and numbered.
@@ -108,7 +108,7 @@ def plot_fronts(results: Sequence[Results], path: str | os.PathLike) -> Path:
 def plot_spending(results: Sequence[Results], path: str | os.PathLike) -> Path:
     """Draw the same against what a second of the robot's time costs, for methods that ask more often or for several samples.
 
-    Points are marked with the environment steps from one query to the next, eight where a name says nothing.
+    Points are marked with the environment steps from one policy call to the next, eight where a name says nothing.
 
     Args:
         results, path: as of `plot_fronts`; of methods that say what an episode costs.
@@ -222,7 +222,7 @@ def _steps(name: str) -> int:
 
 
 def _interval(name: str) -> int:
-    """Return the environment steps from one query of a few-step chain to the next, 0 for other methods.
+    """Return the environment steps from one policy call of a few-step chain to the next, 0 for other methods.
 
     >>> _interval("ddpm3_logsnr_every2_of8"), _interval("ddpm5_logsnr"), _interval("dense_noise")
     (2, 8, 0)

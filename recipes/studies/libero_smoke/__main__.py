@@ -50,7 +50,7 @@ def play(suite: str, config: DictConfig) -> str:
     queries = steps[steps[keys.QUERIED].squeeze(-1)]
     path = draw(policy, queries, Path(config.out) / f"{suite}.png")
     return (
-        f"{suite}, {steps[keys.INSTRUCTION][0]!r}: {len(steps)} steps, {len(queries)} queries, "
+        f"{suite}, {steps[keys.INSTRUCTION][0]!r}: {len(steps)} steps, {len(queries)} policy calls, "
         f"{queries[keys.KEPT].mean():.0f} visual tokens, success {steps['next', keys.SUCCESS].any().item()}; {path}"
     )
 
@@ -86,7 +86,7 @@ def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase
 
 
 def draw(policy: VLAPolicy, queries: TensorDictBase, path: Path) -> Path:
-    """Draw both cameras at a few queries, darker where tokens were dropped."""
+    """Draw both cameras at a few policy calls, darker where tokens were dropped."""
     shown = np.unique(np.linspace(0, len(queries) - 1, _SHOWN).round().astype(int)).tolist()
     pictures = [
         draw_tokens(
@@ -96,7 +96,7 @@ def draw(policy: VLAPolicy, queries: TensorDictBase, path: Path) -> Path:
         )
         for index in shown
     ]
-    return plot_token_strip(pictures, [f"query {index}" for index in shown], path)
+    return plot_token_strip(pictures, [f"policy call {index}" for index in shown], path)
 
 
 if __name__ == "__main__":

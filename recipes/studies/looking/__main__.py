@@ -2,9 +2,9 @@
 
     python -m recipes.studies.looking task=lift policy=assets/lift pruner=assets/lift/sag
 
-Without a pruner only the similarities of what could be reused are measured. With ``oracle.attempts=200`` masks for all queries,
-for each phase of an episode and for each query are climbed to, which says what a pruner that looks could gain, as far as a
-search finds it.
+Without a pruner only the similarities of what could be reused are measured. With ``oracle.attempts=200`` masks for all policy
+calls, for each phase of an episode and for each call are climbed to, which says what a pruner that looks could gain, as far as
+a search finds it.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def main(config: DictConfig) -> None:
 def climbed(
     policy: DiffusionPolicy, queries: TensorDictBase, n_action_steps: int, config: DictConfig
 ) -> dict:
-    """Return, and print, what masks of each query's own could gain."""
+    """Return, and print, what masks of each policy call's own could gain."""
     total = 3 * config.oracle.attempts
     with tqdm(desc=f"{'oracle':>14}", total=total, unit="attempt", mininterval=2) as bar:
         found = oracle(policy, queries, **config.oracle, n_action_steps=n_action_steps, on_attempt=bar.update)

@@ -17,7 +17,7 @@ __all__ = ["plot_looking", "plot_reuse_sources"]
 _SOURCES = {
     "own": "own block, the step before",
     "type": "latest of its type",
-    "query": "own block, the query before",
+    "query": "own block, the policy call before",
 }
 
 

@@ -2,7 +2,7 @@
 
 A pruner that reads the observation (SAG, arXiv:2601.12894) can end up with one mask for all observations and lose nothing by
 its own loss. So its masks are compared with their own mean, which prunes as much and reads nothing, and with each other's: if
-the masks of other observations do as well as a query's own, what differs between them does not come from seeing.
+the masks of other observations do as well as a policy call's own, what differs between them does not come from seeing.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class Looking:
     """What the masks of a pruner do over rollouts.
 
     Attributes:
-        queries, episodes: that were looked at.
+        policy calls, episodes: that were looked at.
         rate: mean prune rate.
-        varying: share of the cells, of all K x 3L, that differ between any two queries.
-        varying_in_episode: the same within an episode, mean over episodes with two queries or more.
-        differing: share of the cells in which a query's mask differs from the mean mask, mean over queries.
+        varying: share of the cells, of all K x 3L, that differ between any two calls.
+        varying_in_episode: the same within an episode, mean over episodes with two calls or more.
+        differing: share of the cells in which a call's mask differs from the mean mask, mean over calls.
         error: mean absolute difference to the dense policy's actions on the same noise, normalised, over the executed
-            actions: under the query's ``"own"`` mask, the ``"mean"`` mask, and ``"others"``, the mask of another query.
+            actions: under the call's ``"own"`` mask, the ``"mean"`` mask, and ``"others"``, the mask of another call.
         own_minus_mean, own_minus_others: differences of those errors with the 95 % interval of their mean over episodes;
             below 0, looking pays.
-        phases: ``[P][K][3L]``, share of an episode phase's queries that prune each cell, minus that of all queries.
+        phases: ``[P][K][3L]``, share of an episode phase's calls that prune each cell, minus that of all calls.
     """
 
     queries: int
@@ -71,14 +71,14 @@ def looking(
     phases: int = 4,
     seed: int = 0,
 ) -> Looking:
-    """Ask recorded queries for their masks, and for their actions under these and others.
+    """Ask recorded policy calls for their masks, and for their actions under these and others.
 
     Args:
         policy: with the pruner as its planner.
         queries: [N], of `torchrl_sparse.control.queries.record_queries`; none that the pruner was trained on.
         n_action_steps: actions of a chunk that are executed.
-        phases: equal parts of an episode's queries.
-        seed: of whose mask a query gets as another's.
+        phases: equal parts of an episode's calls.
+        seed: of whose mask a call gets as another's.
 
     Raises:
         ValueError: if there are fewer than two episodes.
@@ -113,12 +113,12 @@ def looking(
 
 
 def planned_queries(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDictBase:
-    """Return queries with their conditions and the masks that the policy's planner has for them."""
+    """Return policy calls with their conditions and the masks that the policy's planner has for them."""
     return policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
 
 
 def actions_under(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) -> Tensor:
-    """Return normalised actions [N, H, A] of queries under ``masks``, by the planner's rule of reuse."""
+    """Return normalised actions [N, H, A] of policy calls under ``masks``, by the planner's rule of reuse."""
     noise = policy.sample_noise(encoded[keys.SEED].flatten())
     parts = zip(*(part.split(ANSWER_BATCH) for part in (noise, encoded[keys.COND], masks)), strict=True)
     return torch.cat([policy.denoise(*part, reuse=policy.plan.reuse) for part in parts])
@@ -138,7 +138,7 @@ def episode_rows(queries: TensorDictBase) -> list[Tensor]:
 
 
 def episode_phases(episodes: list[Tensor], count: int, phases: int) -> Tensor:
-    """Return i64 [count]: in which of the equal parts of its episode each query is."""
+    """Return i64 [count]: in which of the equal parts of its episode each policy call is."""
     phase = torch.empty(count, dtype=torch.long)
     for rows in episodes:
         phase[rows.cpu()] = torch.arange(len(rows)) * phases // len(rows)
@@ -146,14 +146,14 @@ def episode_phases(episodes: list[Tensor], count: int, phases: int) -> Tensor:
 
 
 def paired_interval(difference: Tensor, episodes: list[Tensor]) -> tuple[float, float, float]:
-    """Return the mean over episodes and its 95 % interval; an episode's queries are no independent samples."""
+    """Return the mean over episodes and its 95 % interval; an episode's policy calls are no independent samples."""
     by_episode = torch.stack([difference[rows].mean() for rows in episodes])
     mean, half = by_episode.mean().item(), 1.96 * by_episode.std().item() / len(episodes) ** 0.5
     return mean, mean - half, mean + half
 
 
 def _phases(masks: Tensor, episodes: list[Tensor], phases: int) -> Tensor:
-    """Return f32 [P, K, 3L]: how much more often than on average each cell is pruned in each phase, 0 without a query."""
+    """Return f32 [P, K, 3L]: how much more often than on average each cell is pruned in each phase, 0 without a policy call."""
     masks, phase = masks.cpu(), episode_phases(episodes, len(masks), phases)
     change = torch.zeros(phases, *masks.shape[1:])
     for number in phase.unique().tolist():

@@ -1,11 +1,11 @@
-"""What looking could gain, as far as a search finds it: masks for all queries, for each phase of an episode, for each query.
+"""What looking could gain, as far as a search finds it: masks for all calls, for each phase of an episode, for each call.
 
 Masks are climbed to, from one that all share, with the answers of the dense policy known, which no pruner knows, on some draws
 of noise; and they are judged on others. What masks of their own gain there is what a pruner that reads the observation could
-learn. It is no upper bound: a query's own mask is found with few draws of noise, and a part of what it fits is those.
+learn. It is no upper bound: a call's own mask is found with few draws of noise, and a part of what it fits is those.
 
 Each attempt swaps a few cells that are computed for as many pruned ones of the same type, so every mask costs what the first
-one does. It is kept where the mean error of the queries that share the mask falls. All are given as many attempts.
+one does. It is kept where the mean error of the calls that share the mask falls. All are given as many attempts.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ __all__ = ["Climber", "Oracle", "oracle", "swap_cells"]
 
 @dataclass(frozen=True)
 class Oracle:
-    """What masks are worth that are shared by fewer and fewer queries.
+    """What masks are worth that are shared by fewer and fewer policy calls.
 
     Attributes:
-        queries, episodes: that masks were climbed to for.
+        calls, episodes: that masks were climbed to for.
         attempts: for each mask.
-        draws: of noise for each query while climbing, and as many others in the judgement.
+        draws: of noise for each call while climbing, and as many others in the judgement.
         seen, error: mean absolute difference to the dense policy's actions on the same noise, normalised, on the draws that
             were climbed on and on the others: of ``"start"``, the mask that all began with, and of masks shared by
-            ``"all"`` queries, by those of a ``"phase"`` and by none, ``"query"``.
+            ``"all"`` calls, by those of a ``"phase"`` and by none, ``"query"``.
         over_all: of each, the error minus that of the mask of ``"all"``, with the 95 % interval of its mean over episodes.
     """
 
@@ -63,7 +63,7 @@ class Climber:
     Args:
         policy: with the sampler that is pruned, and the planner whose rule of reuse holds.
         queries: [N], with ``("diffusion", "cond")``.
-        draws: of noise for each query.
+        draws: of noise for each policy call.
         n_action_steps: actions of a chunk that are executed.
         seed: of the noise.
     """
@@ -88,7 +88,7 @@ class Climber:
 
     @torch.no_grad()
     def errors(self, masks: Tensor) -> Tensor:
-        """Return f32 [N] on the CPU, of each query under its own of ``masks``, bool [N, K, 3L]."""
+        """Return f32 [N] on the CPU, of each policy call under its own of ``masks``, bool [N, K, 3L]."""
         repeated = masks.to(self._policy.device).repeat_interleave(self._draws, dim=0)
         answers = actions_under(self._policy, self._asked, repeated)[:, self._executed]
         error = (answers - self._dense).abs().mean(dim=(1, 2))
@@ -107,7 +107,7 @@ class Climber:
 
         Args:
             start: bool [K, 3L], where all begin.
-            groups: i64 [N], the number of each query's group, 0 to G - 1.
+            groups: i64 [N], the number of each policy call's group, 0 to G - 1.
             attempts: swaps that are tried for each group.
             seed: of the swaps.
             on_attempt: called after each.
@@ -169,14 +169,14 @@ def oracle(
     seed: int = 0,
     on_attempt: Callable[[], object] = lambda: None,
 ) -> Oracle:
-    """Climb to masks for all queries, for each phase of an episode and for each query, and judge them on other noise.
+    """Climb to masks for all policy calls, for each phase of an episode and for each call, and judge them on other noise.
 
     Args:
         policy: with the pruner as its planner; all begin at the mean of its masks.
         queries: [N], of `torchrl_sparse.control.queries.record_queries`.
         attempts: for each mask.
-        draws: of noise for each query, while climbing and in the judgement.
-        phases: equal parts of an episode's queries.
+        draws: of noise for each call, while climbing and in the judgement.
+        phases: equal parts of an episode's calls.
         n_action_steps: actions of a chunk that are executed.
         seed: of noise and swaps.
         on_attempt: called after each, ``3 * attempts`` times.

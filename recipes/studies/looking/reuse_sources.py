@@ -3,7 +3,7 @@
 Three rules are published. BAC (arXiv:2506.13456) reuses the block's own output of an earlier denoising step. SAG
 (arXiv:2601.12894, "one-for-all") reuses the latest output of any block of its type: that of the layer before in the same step,
 and for the first layer that of the last layer in the step before. TTS (arXiv:2605.13316) also reuses the output of the same
-block in the same step of the query before.
+block in the same step of the policy call before.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ __all__ = ["ReuseSources", "reuse_sources", "source_similarity"]
 
 @dataclass(frozen=True)
 class ReuseSources:
-    """Cosine similarity of each block's output to what it could reuse, mean over queries; ``[3L][K]`` each.
+    """Cosine similarity of each block's output to what it could reuse, mean over policy calls; ``[3L][K]`` each.
 
     Attributes:
         queries: that were asked, densely.
         own: its output one denoising step before; step 0 is not a number and given as 0.
         type: the latest output of its type; in step 0 the first layer has none, and 0.
-        query: its output in the same step of the query before, over the queries that have one before them.
+        query: its output in the same step of the call before, over the calls that have one before them.
     """
 
     queries: int
@@ -45,8 +45,8 @@ def source_similarity(features: Tensor, before: Tensor | None = None) -> Tensor:
     """Return f32 [3, 3L, K], similarity to the sources ``own``, ``type`` and ``query``, 0 where there is none.
 
     Args:
-        features: of a query, f32 [3L, K, n], flattened outputs.
-        before: of the query before.
+        features: of a policy call, f32 [3L, K, n], flattened outputs.
+        before: of the call before.
 
     >>> features = torch.tensor([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]], [[1.0, 1.0], [0.0, 1.0]]])
     >>> (100 * source_similarity(features)[0]).round().int().tolist()
@@ -63,20 +63,20 @@ def source_similarity(features: Tensor, before: Tensor | None = None) -> Tensor:
 
 @torch.no_grad()
 def reuse_sources(policy: DiffusionPolicy, queries: TensorDictBase) -> ReuseSources:
-    """Ask recorded queries densely and compare what their blocks return.
+    """Ask recorded policy calls densely and compare what their blocks return.
 
     Args:
         policy: the trained policy with its sampler; its planner does not matter.
         queries: [N], of `torchrl_sparse.control.queries.record_queries`, episode by episode.
 
     Raises:
-        ValueError: if no query has another before it.
+        ValueError: if no call has another before it.
     """
     encoded = policy.module["encode"](queries.select(*policy.in_keys, strict=False))
     noise = policy.sample_noise(encoded[keys.SEED].flatten())
     elapsed = queries[keys.ELAPSED].flatten().tolist()
     if not any(elapsed):
-        raise InputError("queries: expected some with a query of their episode before them, got none")
+        raise InputError("queries: expected some with a policy call of their episode before them, got none")
     total, before = 0, None
     for row in range(len(queries)):
         recorder = FeatureRecorder()

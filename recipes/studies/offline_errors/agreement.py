@@ -40,7 +40,7 @@ class Agreement:
         tables: table -> Spearman's rank correlation of its methods; 1 where less always went with better.
         together: mean over tables, each weighed by its methods.
         p: how often methods in random order within each table would come to a mean as far from 0.
-        over_error_ci95: of by how much ``together`` exceeds that of the error to demonstrations, methods drawn anew.
+        over_error_ci95: of by how much ``together`` exceeds that of the error to demonstrations, methods drawn again.
     """
 
     tables: dict[str, float]

@@ -1,8 +1,8 @@
 """How far a method's answers are from demonstrations and from dense's, measured without an episode.
 
-A policy's answer is a distribution, of which a query shows one draw. Errors of single answers reward a chain that averages over
-several good ones; the energy score does not: it is least, in the mean, for answers that are distributed as what was
-demonstrated (Gneiting and Raftery, "Strictly Proper Scoring Rules, Prediction, and Estimation", JASA 2007, Eq. 21).
+A policy's answer is a distribution, of which a policy call shows one draw. Errors of single answers reward a chain that
+averages over several good ones; the energy score does not: it is least, in the mean, for answers that are distributed as what
+was demonstrated (Gneiting and Raftery, "Strictly Proper Scoring Rules, Prediction, and Estimation", JASA 2007, Eq. 21).
 Which of these numbers says how episodes will go is measured by the study ``offline_errors``.
 """
 
@@ -23,14 +23,14 @@ __all__ = ["OfflineErrors", "draw_answers", "energy_scores", "offline_errors"]
 
 @dataclass(frozen=True)
 class OfflineErrors:
-    """Of the actions that are executed, normalised; means over queries and draws.
+    """Of the actions that are executed, normalised; means over policy calls and draws.
 
     Attributes:
         error: absolute difference to the demonstrated actions.
-        energy_score: ``E|X - y| - E|X - X'| / 2`` of answers X, X' and the demonstrated actions y of a query, Euclidean.
+        energy_score: ``E|X - y| - E|X - X'| / 2`` of answers X, X' and the demonstrated actions y of a call, Euclidean.
         energy_distance: ``2 E|X - Y| - E|X - X'| - E|Y - Y'|`` to dense's answers Y; about 0 where both are distributed alike,
             and slightly below it by chance.
-        spread: standard deviation of the answers to a query, root mean square.
+        spread: standard deviation of the answers to a call, root mean square.
     """
 
     error: float
@@ -42,12 +42,12 @@ class OfflineErrors:
 def draw_answers(
     policy: DiffusionPolicy, queries, *, draws: int, n_action_steps: int, seed: int = 0
 ) -> Tensor:
-    """Answer every query ``draws`` times, each with noise of its own.
+    """Answer every policy call ``draws`` times, each with noise of its own.
 
     Args:
         policy: under the method's sampler and planner.
         queries: [N], with ``("diffusion", "cond")``, see `torchrl_sparse.training.diffusion.targets.make_targets`.
-        draws: of noise a query.
+        draws: of noise a call.
         n_action_steps: actions executed of a chunk.
         seed: of the noise.
 
@@ -67,9 +67,9 @@ def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> Offl
     """Compare a method's answers with what was demonstrated and with dense's.
 
     Args:
-        answers: f32 [N, S, D], S >= 2 draws for each of N queries.
+        answers: f32 [N, S, D], S >= 2 draws for each of N policy calls.
         demonstrated: f32 [N, D].
-        dense: f32 [N, T, D], dense's answers to the same queries; of its own draws, not those of ``answers``.
+        dense: f32 [N, T, D], dense's answers to the same calls; of its own draws, not those of ``answers``.
 
     Raises:
         ValueError: for fewer than two draws.
@@ -93,7 +93,7 @@ def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> Offl
 
 
 def energy_scores(answers: Tensor, demonstrated: Tensor) -> Tensor:
-    """Return the energy score of each query, f32 [N]; arguments as of `offline_errors`.
+    """Return the energy score of each policy call, f32 [N]; arguments as of `offline_errors`.
 
     >>> energy_scores(torch.tensor([[[0.0], [2.0]]]), torch.tensor([[5.0]]))
     tensor([3.])
@@ -102,6 +102,6 @@ def energy_scores(answers: Tensor, demonstrated: Tensor) -> Tensor:
 
 
 def _mean_distances(draws: Tensor) -> Tensor:
-    """Return the mean distance of two different draws of each query, [N, S, D] -> [N]."""
+    """Return the mean distance of two different draws of each policy call, [N, S, D] -> [N]."""
     count = draws.shape[1]
     return torch.cdist(draws, draws).sum((1, 2)) / (count * (count - 1))

@@ -53,7 +53,7 @@ def difference_ci95(
 
     Args:
         groups: equally many of x, of the other number and of y; see `mean_rank_correlation`.
-        draws: of the bootstrap, which draws the members of each group anew.
+        draws: of the bootstrap, which draws the members of each group again.
         seed: of the draws.
 
     >>> x = [*range(20)]

@@ -47,8 +47,8 @@ class OfflineResults:
 
     Attributes:
         policy: its fingerprint.
-        queries, draws: how many were answered, and how often each.
-        seed: of the queries and the noise.
+        policy calls, draws: how many were answered, and how often each.
+        seed: of the calls and the noise.
         errors: method -> what was measured of its answers.
         played: table of results -> method -> what its episodes came to.
     """

@@ -1,4 +1,4 @@
-"""Write every table of results on the pages anew, from the committed JSON that it shows.
+"""Write every table of results on the pages again, from the committed JSON that it shows.
 
 python -m recipes.studies.pages
 """

@@ -1,4 +1,4 @@
-"""Which method of a ``results.json`` to take: at a time a query may need, and at twenty times dense's speed.
+"""Which method of a ``results.json`` to take: at a time a policy call may need, and at twenty times dense's speed.
 
 Both are read off the table, so a choice among many methods looks better than it will play: what is chosen is to be confirmed
 on other seeds.
@@ -22,11 +22,11 @@ GOAL = 20.0
 """Times dense's speed at which a method is to keep dense's success and its time to success."""
 
 BUDGETS_MS = (1.5, 3.0, 5.0, 10.0, 30.0)
-"""Median times of a query, of groups whose methods are compared with each other."""
+"""Median times of a policy call, of groups whose methods are compared with each other."""
 
 
 def best_within(results: Results, seconds: float) -> str | None:
-    """Return the method that succeeds soonest of those whose median query takes no longer; None if none does.
+    """Return the method that succeeds soonest of those whose median policy call takes no longer; None if none does.
 
     Soonest is the smallest ratio of its restricted mean time, failures counted as the horizon, to dense's on the same seeds.
 

@@ -87,7 +87,7 @@ def find_pages(root: str | os.PathLike) -> list[Path]:
 
 
 def write_pages(root: str | os.PathLike, *, dry: bool = False) -> list[Path]:
-    """Write the tables of all pages anew.
+    """Write the tables of all pages again.
 
     Args:
         root: of the repository.
@@ -114,7 +114,7 @@ def write_pages(root: str | os.PathLike, *, dry: bool = False) -> list[Path]:
 
 
 def write_tables(text: str, root: str | os.PathLike, name: str = "page") -> str:
-    """Return a page with its tables written anew.
+    """Return a page with its tables written again.
 
     Args:
         text: of the page.

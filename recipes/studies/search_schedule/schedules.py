@@ -77,8 +77,8 @@ class Judged:
 
     Attributes:
         cost: of its computed blocks, in unpruned steps.
-        over_searched: by how much its energy score exceeds the searched chain's, mean over queries.
-        standard_error: of that, over queries, as if they were independent.
+        over_searched: by how much its energy score exceeds the searched chain's, mean over policy calls.
+        standard_error: of that, over calls, as if they were independent.
     """
 
     cost: float
@@ -89,12 +89,12 @@ class Judged:
 
 
 class Judge:
-    """Says of every query what the answers of a policy are worth.
+    """Says of every policy call what the answers of a policy are worth.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
         targets: [N], from data, see `torchrl_sparse.training.diffusion.targets.make_targets`.
-        draws: of answers to each query.
+        draws: of answers to each call.
         n_action_steps: actions executed of a chunk.
         reuse: what pruned blocks add.
         seed: of the noise, the same for all chains of one length.
@@ -116,7 +116,7 @@ class Judge:
         self._wanted = targets["target"][:, first : first + n_action_steps].flatten(1)
 
     def scores(self, chain: PrunedChain | None) -> dict[Fitness, Tensor]:
-        """Return all measures of each query, f32 [N]; a chain of None is the policy's own, unpruned."""
+        """Return all measures of each policy call, f32 [N]; a chain of None is the policy's own, unpruned."""
         answers = self._answers(chain)
         return {name: measure(answers, self._wanted) for name, measure in FITNESSES.items()}
 

@@ -1,4 +1,4 @@
-"""What engines say that a query costs, against a count of the products that they run."""
+"""What engines say that a policy call costs, against a count of the products that they run."""
 
 import pytest
 import torch

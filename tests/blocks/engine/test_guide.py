@@ -1,4 +1,4 @@
-"""Queries that are drawn to actions: every engine against the sampler's equations written out."""
+"""Policy calls that are guided toward actions: every engine against the sampler's equations written out."""
 
 import pytest
 import torch

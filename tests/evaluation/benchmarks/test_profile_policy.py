@@ -68,7 +68,7 @@ def seeing(tmp_path_factory):
 @needs_native
 def test_a_call_is_told_by_parts_threads_and_tail(saved, tmp_path):
     output = run("profile_policy", f"policy={saved}", "sampler=ddim2", *FEW, f"out={tmp_path}/out")
-    assert "20 queries, one after the other." in output
+    assert "20 policy calls, one after the other." in output
     found = load_query_profile(tmp_path / "out" / "query.json")
     assert list(found.parts_s) == ["query", "noise", "weights", "blocks", "compiled rest", "tensors"]
     assert found.sampler == "ddim2"
@@ -84,7 +84,7 @@ def test_a_call_is_told_by_parts_threads_and_tail(saved, tmp_path):
 @needs_native
 def test_the_call_of_a_policy_with_cameras_is_told_by_stages(seeing, tmp_path):
     output = run("profile_policy", f"policy={seeing}", "sampler=ddim2", *FEW, f"out={tmp_path}")
-    assert "A query, ddim2: " in output
+    assert "A policy call, ddim2: " in output
     parts = load_query_profile(tmp_path / "query.json").parts_s
     assert parts["encode"] > parts["camera image"] > 0
     assert parts["query"] == pytest.approx(parts["encode"] + parts["denoise"] + parts["rest"])
@@ -113,7 +113,7 @@ def test_every_engine_is_timed_on_a_policys_network_under_its_schedule(saved, tm
 def test_engines_of_a_policy_with_cameras_time_whole_calls_too(seeing, tmp_path):
     options = ("tables=[engines]", "batches=[2]", "repeats=1", "warmup=0")
     printed = run("profile_policy", f"policy={seeing}", *options, f"out={tmp_path}")
-    assert "Whole queries, cameras included." in printed
+    assert "Whole policy calls, cameras included." in printed
     table = read_table(tmp_path / "engine.json", "seeing_b2_parts")
     rows = {table.name(row): row for row in table.rows}
     assert list(rows)[:2] == ["query", "encode"]

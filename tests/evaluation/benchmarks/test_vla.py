@@ -1,4 +1,4 @@
-"""What a benchmark of visual tokens measures: each method with its own controller, on queries that are the same each time."""
+"""What a benchmark of visual tokens measures: each method with its own controller, on calls that are the same each time."""
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ STEPS, TURN, LAYERS = 8, 5, 6
 
 
 class FineLater(torch.nn.Module):
-    """Grants 1 token and, from a step on, 3; asks for a query there."""
+    """Grants 1 token and, from a step on, 3; asks for a policy call there."""
 
     in_keys = ["step_count"]
     out_keys = [keys.TOKEN_BUDGET, keys.FINE, keys.REPLAN]
@@ -119,7 +119,7 @@ def test_a_pruner_that_reads_how_the_hand_moves_is_measured(policy):
 
 
 def test_random_tokens_are_the_same_each_time(policy):
-    """The draw follows from the episode and the step, which are recorded with each query."""
+    """The draw follows from the episode and the step, which are recorded with each policy call."""
 
     recorded = record_methods(["random"], policy, make_env, [3, 4], n_action_steps=4, settings={})["random"]
     worker = policy.with_pruner(make_pruner("random@0.5"))

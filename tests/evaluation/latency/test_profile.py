@@ -1,4 +1,4 @@
-"""One query under the glass: its parts add up, its threads are compared, its tail is kept, and what cannot be is one line."""
+"""One call under the glass: its parts add up, its threads are compared, its tail is kept, and what cannot be is one line."""
 
 import itertools
 from functools import partial

@@ -59,7 +59,7 @@ def test_the_planner_is_timed_within_its_queries(policy):
 
 def test_a_policy_is_timed_with_what_it_left_itself(policy):
     class Counting(Planner):
-        """Counts the queries of an episode, under a key of its own."""
+        """Counts the policy calls of an episode, under a key of its own."""
 
         in_keys = [*Planner.in_keys, keys.ELAPSED, "count"]
         out_keys = [*Planner.out_keys, "count"]

@@ -1,4 +1,4 @@
-"""Parts of a query of an image policy."""
+"""Parts of a policy call of an image policy."""
 
 import pytest
 import torch

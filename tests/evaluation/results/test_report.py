@@ -75,7 +75,7 @@ def test_planning_is_reported_where_it_was_timed():
     results = build({"dense": run([1, 0]), "sag": planned})
     assert results.methods["sag"].planning_s.p50 == 3e-4
     assert results.dense.planning_s is None
-    assert "Planning takes, of that and measured within queries, 0.3 ms (3.0 %) under sag." in format_table(
+    assert "Planning takes, of that and measured within policy calls, 0.3 ms (3.0 %) under sag." in format_table(
         results
     )
     assert "Planning takes" not in format_table(build({"dense": run([1, 0])}))
@@ -217,7 +217,7 @@ def test_a_verdict_that_many_comparisons_explain_is_marked():
 
 
 def test_an_episode_of_more_queries_costs_more_of_them():
-    """A fifth of the FLOPs a query is saved; of an episode, which is twice as long, more than dense's are spent."""
+    """A fifth of the FLOPs a policy call is saved; of an episode, which is twice as long, more than dense's are spent."""
     dense = [EpisodeResult(i, True, 20, 5, 5 * 100.0, 0.0, kept=(8.0,) * 5) for i in range(4)]
     pruned = [EpisodeResult(i, True, 40, 10, 10 * 80.0, 0.5, kept=(4.0,) * 10) for i in range(4)]
     runs = {

@@ -84,7 +84,7 @@ class TellingEnv(FakeEnv):
 
 
 class FakeActor(TensorDictModuleBase):
-    """Queries every `CHUNK_LENGTH` steps; its cost keys hold nonsense on served steps, where nobody may look.
+    """Policy calls every `CHUNK_LENGTH` steps; its cost keys hold nonsense on served steps, where nobody may look.
 
     Args:
         crash_at: raise on this call, as a machine that dies would.

@@ -65,7 +65,7 @@ def test_prepared_queries_remember_those_before():
     prepared = prepared_queries(policy, queries)
     before = [set(query.keys(True)) for query in prepared]
     expected = replay(policy, queries, policy.pruner)
-    for _ in range(2):  # asking leaves the queries as they are
+    for _ in range(2):  # asking leaves the policy calls as they are
         for index in (3, 0, 4, 2, 1):
             answered = answer(policy, prepared[index])
             assert torch.equal(answered[keys.CHUNK], expected[index][keys.CHUNK])

@@ -93,7 +93,7 @@ def test_words_reach_the_actor_in_every_worker(backend):
 @pytest.mark.usefixtures("forked_workers")
 def test_a_worker_that_is_killed_is_reported_and_loses_no_episode(tmp_path, backend):
     log, make_env = tmp_path / "episodes.jsonl", partial(MortalEnv, folder=tmp_path)
-    said = {"process": r"exit code -9.*episodes are run anew", "ray": r"a Ray worker died: .*are run anew"}
+    said = {"process": r"exit code -9.*episodes are run again", "ray": r"a Ray worker died: .*are run again"}
     with pytest.warns(RuntimeWarning, match=said[backend]):
         episodes = run(make_env, workers=2, num_envs=1, results_file=log, backend=backend)
     assert episodes == run(FakeEnv)
@@ -119,7 +119,7 @@ def kill_while_starting(monkeypatch, backend, go, delays):
     monkeypatch.setattr(paired, "_FAILURES", len(delays) + 1)
     killer = Killer(backend, delays, go)
     killer.start()
-    with pytest.warns(RuntimeWarning, match="episodes are run anew") as warned:
+    with pytest.warns(RuntimeWarning, match="episodes are run again") as warned:
         episodes = run(partial(HeldEnv, go=go), workers=2, num_envs=2, backend=backend)
     deaths = [warning for warning in warned if warning.category is RuntimeWarning]
     assert 1 <= len(deaths) <= len(delays)

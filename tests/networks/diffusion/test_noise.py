@@ -1,4 +1,4 @@
-"""What chains of different length share of a query's noise."""
+"""What chains of different length share of a policy call's noise."""
 
 import pytest
 import torch

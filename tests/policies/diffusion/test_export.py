@@ -93,7 +93,7 @@ def run_example(example, path, history, seeds, runner=()):
 
 
 def answers(example, policy, path, runner=(), **options):
-    """Export, and return the file's chunks of some queries and the policy's own."""
+    """Export, and return the file's chunks of some policy calls and the policy's own."""
     policy.export(path, **options)
     network, seeds = policy.network, [0, 1, 2**40 + 3, 2**63 - 1]
     history = torch.randn(
@@ -111,7 +111,7 @@ def answers(example, policy, path, runner=(), **options):
 
 
 def check_equal(example, policy, path, **options):
-    """Export, and compare the answers to some queries bit by bit."""
+    """Export, and compare the answers to some policy calls bit by bit."""
     got, expected = answers(example, policy, path, **options)
     assert torch.equal(got, expected)
     assert not torch.equal(got[0], got[1])

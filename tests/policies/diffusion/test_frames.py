@@ -1,4 +1,4 @@
-"""Frames that the query before has encoded: they are not encoded again, and the features stay what they were."""
+"""Frames that the policy call before has encoded: they are not encoded again, and the features stay what they were."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ CAMERAS, STEPS = ("image", "wrist_image"), 9
 
 @pytest.fixture
 def counted(make_image_policy, monkeypatch):
-    """A policy, and the frames of a camera that it was given in each query."""
+    """A policy, and the frames of a camera that it was given in each policy call."""
     policy = make_image_policy()
     pixels, seen = policy.vision.encoders["image"].pixels, []
     monkeypatch.setattr(policy.vision.encoders["image"], "pixels", lambda x: seen.append(len(x)) or pixels(x))

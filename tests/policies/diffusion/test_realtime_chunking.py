@@ -33,7 +33,7 @@ def test_actions_are_drawn_as_the_paper_says():
 
 @pytest.fixture
 def asked():
-    """Queries at the beginning of an episode, and 1, 3, 3 and 9 steps after the one before."""
+    """Policy calls at the beginning of an episode, and 1, 3, 3 and 9 steps after the one before."""
     generator = torch.Generator().manual_seed(0)
     query = {
         keys.HISTORY_STATE: torch.randn(5, 2, 5, generator=generator),
@@ -107,7 +107,7 @@ class Asked(TensorDictModuleBase):
 
 @pytest.mark.parametrize(
     ("latency", "delays"),
-    [(0.1, [2, 2, 2, 2]), (0.0, [0, 0, 0, 0]), (None, [0, 1, 3, 2])],  # measured: that of the query before
+    [(0.1, [2, 2, 2, 2]), (0.0, [0, 0, 0, 0]), (None, [0, 1, 3, 2])],  # measured: that of the policy call before
 )
 def test_the_executor_says_how_late_the_answer_will_be(latency, delays):
     policy = Asked([0.05, 0.15, 0.1, 0.05])

@@ -1,4 +1,4 @@
-"""A query in one native call is the query of the stages: the same keys, the same bits."""
+"""A policy call in one native call is the call of the stages: the same keys, the same bits."""
 
 import pytest
 import torch

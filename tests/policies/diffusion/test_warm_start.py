@@ -1,4 +1,4 @@
-"""Warm starts: what a query begins from, per sample and per episode, in every engine, against steps written out."""
+"""Warm starts: what a policy call begins from, per sample and per episode, in every engine, against steps written out."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ SAMPLERS = ["ddpm8", "ddpm_82_41_14", "ddim10_eta0.5", "unipc10", "sde2m5"]
 
 @pytest.fixture
 def asked():
-    """Five queries: at the beginning of an episode, and 1, 2, 4 and 9 steps after the query before."""
+    """Five queries: at the beginning of an episode, and 1, 2, 4 and 9 steps after the policy call before."""
     generator = torch.Generator().manual_seed(0)
     query = {
         keys.HISTORY_STATE: torch.randn(5, 2, 5, generator=generator),
@@ -39,7 +39,7 @@ class Half(StaticPlanner):
 
 
 def slow_answer(policy, query, num_steps):
-    """The chunk of one query [], step by step through the network alone, nothing pruned."""
+    """The chunk of one policy call [], step by step through the network alone, nothing pruned."""
     network, normalizer, sampler = policy.network, policy.normalizer, policy.sampler
     cond = normalizer.normalize_state(query[keys.HISTORY_STATE])[None]
     noise = sample_noise(query[keys.SEED], sampler.num_inference_steps, (network.horizon, network.input_dim))

@@ -91,7 +91,7 @@ def test_every_input_matters(policy, query):
 
 
 class Recorder(TokenPruner):
-    """Keeps every second visual token after layer 1, and carries the scores to the next query."""
+    """Keeps every second visual token after layer 1, and carries the scores to the next policy call."""
 
     in_keys = [keys.TOKEN_SCORE, keys.IS_INIT]
     out_keys = [keys.TOKEN_SCORE]

@@ -78,7 +78,7 @@ def test_a_planner_runs_on_it(published, checkpoint, engine):
     td, _ = observe(policy, published, 3)
     together = policy(td.clone())[keys.CHUNK]
     torch.testing.assert_close(policy(td[1:2].clone())[keys.CHUNK], together[1:2], atol=1e-5, rtol=0)
-    # Or every query would fall back to the differentiable engine.
+    # Or every policy call would fall back to the differentiable engine.
     assert policy.module["encode"](td)[keys.COND].requires_grad is False
 
 

@@ -1,4 +1,4 @@
-"""Measuring SpecPrune's budget: replayed queries are those of a rollout, and errors those of the executed actions."""
+"""Measuring SpecPrune's budget: replayed policy calls are those of a rollout, and errors those of the executed actions."""
 
 import imageio.v3 as iio
 import pytest
@@ -31,7 +31,7 @@ from torchrl_sparse.training.vla.trainer import InstructedDemonstrations
 
 
 def episode(steps=4):
-    """Queries of one episode, each []."""
+    """Policy calls of one episode, each []."""
     queries = [query(1)]
     for step in range(1, steps):
         queries.append(later(queries[-1], seed=step))
@@ -88,7 +88,7 @@ def test_queries_of_demonstrations_begin_with_each_episode():
     assert [[int(td[keys.IMAGE][0, 0, 0]) for td in queries] for queries in found] == [[0, 2], [3, 5]]
     assert [[td[keys.IS_INIT].item() for td in queries] for queries in found] == [[True, False]] * 2
     assert [queries[1][keys.INSTRUCTION] for queries in found] == ["up", "down"]
-    # Of the last step alone, whatever lies between two queries, and at rest where an episode begins.
+    # Of the last step alone, whatever lies between two policy calls, and at rest where an episode begins.
     assert [[td[keys.EEF_VEL][0].item() for td in queries] for queries in found] == [[0, 20], [0, 10]]
     assert all(td[keys.EEF_VEL].count_nonzero() <= 1 for queries in found for td in queries)
     back = SpecPrune(alpha=0.2, budget=PER_CAMERA, dynamic=False, look_back=2)

@@ -1,4 +1,4 @@
-"""The contract of every engine: one query, from its noise and its mask to the actions."""
+"""The contract of every engine: one policy call, from its noise and its mask to the actions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Overhead(NamedTuple):
 
 
 class Engine(Protocol):
-    """Runs queries of one network with one sampler; made by :func:`torchrl_sparse.blocks.engine.make_engine`.
+    """Runs policy calls of one network with one sampler; made by :func:`torchrl_sparse.blocks.engine.make_engine`.
 
     An engine answers for the weights that its network has when it is asked. It sees optimiser steps,
     ``load_state_dict``, moves, and parameters or modules that were exchanged. Writes through ``parameter.data`` that
@@ -61,9 +61,9 @@ class Engine(Protocol):
             noise: f32 [B, K, H, A], standard normal; of the network's type and device. There may be no rows.
             cond: f32 [B, To, D], encoded observations, the same.
             mask: bool [B, K, 3L], True = pruned, row 0 all False; None prunes nothing. It is checked here, once a
-                query.
+                policy call.
             reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`.
-            guide: actions that the query is drawn to; of the network's type and device.
+            guide: actions that the call is guided toward; of the network's type and device.
 
         Raises:
             ValueError: naming what was expected and what came (:func:`check_query`).
@@ -71,7 +71,7 @@ class Engine(Protocol):
         ...
 
     def refresh(self) -> None:
-        """Read the network's weights anew in the next query."""
+        """Read the network's weights again in the next policy call."""
         ...
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
@@ -99,7 +99,7 @@ def check_query(
     """Refuse what no engine can run; the arguments are those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
     Raises:
-        MaskError: a ValueError, if the mask is no prune mask for the query.
+        MaskError: a ValueError, if the mask is no prune mask for the policy call.
         ValueError: naming what was expected and what came.
     """
     num_steps, batch = (

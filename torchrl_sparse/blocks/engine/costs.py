@@ -1,4 +1,4 @@
-"""What an engine really does: seconds and FLOPs of a block, for planners that budget in them, and FLOPs of a query."""
+"""What an engine really does: seconds and FLOPs of a block, for planners that budget in them, and FLOPs of a policy call."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
 def folded_overhead_macs(network: TransformerForDiffusion, *, merged_stem: bool) -> Overhead:
     """Count what an engine that folds memory multiplies outside the blocks.
 
-    A step embeds the sample and predicts its noise. What the condition is encoded and folded for is done once in a query,
+    A step embeds the sample and predicts its noise. What the condition is encoded and folded for is done once in a policy call,
     but in every step by a condition encoder whose tokens attend to each other.
 
     Args:
@@ -85,12 +85,12 @@ def executed_flops(engine: Engine, mask: Tensor, num_steps: Tensor | None = None
     """Count the FLOPs (2 * MAC) that ``engine`` really does in queries; norms, softmax, activations and sums are not counted.
 
     :func:`~torchrl_sparse.blocks.mask.query_flops` has the published count, in which cross-attention multiplies its full
-    matrices and every step encodes the condition anew.
+    matrices and every step encodes the condition again.
 
     Args:
         engine: that runs them.
         mask: bool [*B, K, 3L], True = pruned.
-        num_steps: i64 [*B, 1], of queries that take only the last so many steps and compute all of the first of those.
+        num_steps: i64 [*B, 1], of policy calls that take only the last so many steps and compute all of the first of those.
 
     Returns:
         f64 [*B], on the CPU.

@@ -1,4 +1,4 @@
-"""The eager baseline: a query as the published implementation of Diffusion Policy runs it.
+"""The eager baseline: a policy call as the published implementation of Diffusion Policy runs it.
 
 ``torch.nn.TransformerDecoder`` and a diffusers sampler that draws its own noise, step by step
 (arXiv:2303.04137, ``DiffusionTransformerLowdimPolicy``). Speed-ups are quoted against it; nothing else uses

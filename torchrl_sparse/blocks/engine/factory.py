@@ -87,7 +87,7 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sam
 
 
 class EngineSlot:
-    """Holds the engine of a policy: made when it is first needed, and anew for another sampler or device.
+    """Holds the engine of a policy: made when it is first needed, and again for another sampler or device.
 
     Copies and pickles carry the choice, not the engine.
 
@@ -121,7 +121,7 @@ class EngineSlot:
         return engine
 
     def refresh(self) -> None:
-        """Make the engine anew in the next query, from the weights that the network has then."""
+        """Make the engine again in the next policy call, from the weights that the network has then."""
         self._made, self._stale = (None, None), True
 
     def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:

@@ -1,4 +1,4 @@
-"""From a prune mask to a program: the operations that the PyTorch engine executes for one query, known before its loop.
+"""From a prune mask to a program: the operations that the PyTorch engine executes for one policy call, known before its loop.
 
 The native engine does the same operations, but finds them in the mask as it goes.
 
@@ -8,7 +8,7 @@ runs, and a run adds a sum of vectors that are already there, so it is one opera
     COMPUTE   first, -     d = block_first(x); latest[first] = d; x = x + d
     REUSE     first, last  x = x + the sum of what the pruned blocks first .. last-1 add
     COLLAPSE  fresh, -     the only operation of a step that computes nothing: eps = head(LN(embed(sample) + c)),
-                           c being the sum over *all* blocks; fresh = 1 if c must be summed anew, 0 if it is still
+                           c being the sum over *all* blocks; fresh = 1 if c must be summed again, 0 if it is still
                            that of the latest collapsed step
 
 Blocks are the columns of the mask, :mod:`torchrl_sparse.blocks.mask` says which. The functions here are pure;
@@ -54,7 +54,7 @@ class Program:
 def build_program(mask: Tensor | np.ndarray) -> Program:
     """Build the program of one mask.
 
-    The work is array arithmetic over the computed blocks, so that a new mask costs little next to its query.
+    The work is array arithmetic over the computed blocks, so that a new mask costs little next to its policy call.
 
     Args:
         mask: bool [K, 3L], True = pruned, row 0 all False (checked by the caller, see

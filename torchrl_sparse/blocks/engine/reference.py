@@ -24,7 +24,7 @@ __all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
 class FeatureRecorder:
     """Keeps, detached, what every block added to the residual stream in every denoising step.
 
-    The published models need about 25 MB per query (K=100, L=8, H=10, d=256, f32).
+    The published models need about 25 MB per policy call (K=100, L=8, H=10, d=256, f32).
 
     Examples:
         >>> recorder = FeatureRecorder()
@@ -75,7 +75,7 @@ def denoise(
         reuse: what a pruned block adds, see :mod:`torchrl_sparse.blocks.mask`: ``"block"`` (BAC,
             arXiv:2506.13456), ``"type"`` (SAG, arXiv:2601.12894, one-for-all buffers with
             last-writer-wins) or ``"single"``.
-        guide: what every step's clean prediction is drawn to, see `Guide`; None draws nothing.
+        guide: what every step's clean prediction is guided toward, see `Guide`; None draws nothing.
         record: called with (step, block, output) for every block, output [B, H, d] being what was added.
 
     Returns:
@@ -158,7 +158,7 @@ class ComputedRows:
 
 
 class ReferenceEngine:
-    """The definition: eager and differentiable; reads the network's weights anew in every query.
+    """The definition: eager and differentiable; reads the network's weights again in every policy call.
 
     Args:
         network: the denoiser.
@@ -188,7 +188,7 @@ class ReferenceEngine:
         return denoise(self._network, self._sampler, noise, cond, mask, reuse=reuse, guide=guide)
 
     def refresh(self) -> None:
-        """Do nothing: no weights are kept between queries."""
+        """Do nothing: no weights are kept between policy calls."""
 
     @torch.no_grad()
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:

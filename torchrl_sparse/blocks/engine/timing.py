@@ -19,7 +19,7 @@ def time_blocks(
 
     Args:
         walk: runs the blocks of one type (an index of ``BLOCK_TYPES``) of all layers, so that weights come from
-            where they come from in a query.
+            where they come from in a policy call.
         num_layers: layers L.
         repeats: timed walks of each type, interleaved, after a few that are not timed.
         device: synchronised around every walk if it is a GPU.

@@ -1,4 +1,4 @@
-"""Noticing that a network's weights have changed, cheaply enough to ask in every query.
+"""Noticing that a network's weights have changed, cheaply enough to ask in every policy call.
 
 A complete watch would read every weight: 36 MB for the published networks, more than a millisecond. Versions, addresses and
 identities of parameters and modules show all that PyTorch records; the first values of each parameter are compared besides,

@@ -166,7 +166,7 @@ class PrunerNetwork(nn.Module):
         return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
 
     def features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        """Return the numbers of a query, f32 [B, n]."""
+        """Return the numbers of a policy call, f32 [B, n]."""
         return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
@@ -209,7 +209,7 @@ class PrunerNetwork(nn.Module):
 
     @property
     def macs_per_query(self) -> int:
-        """Multiply-accumulates of one query in evaluation mode, where ``z`` is there already."""
+        """Multiply-accumulates of one policy call in evaluation mode, where ``z`` is there already."""
         hidden, obs = self.fuse_obs.out_features, self.obs
         return (
             obs.in_features * obs.out_features

@@ -1,22 +1,22 @@
 """Sparse ActionGen (SAG, arXiv:2601.12894): a learned planner that decides from the observation.
 
 One small network reads the encoded observation and the coordinates of all K x 3L blocks, and predicts the whole
-mask of a query before its first denoising step (Section 3.2 of the paper)::
+mask of a policy call before its first denoising step (Section 3.2 of the paper)::
 
     z = Encoder([sin(timestep k) ; sin(block b)])         one token per block of every step
     I = MLP([W_o obs ; z])                                two logits per block: keep, prune
     M = argmax I                                          the first step is always kept
 
 ``z`` does not depend on the observation: in evaluation mode it is computed once and kept, already multiplied by
-its half of the first MLP layer, so that a query costs the rest of the MLP alone. Pruned blocks reuse the latest
+its half of the first MLP layer, so that a call costs the rest of the MLP alone. Pruned blocks reuse the latest
 output of their type ("one-for-all") in the paper and their own here by default: of the policies here, an output is
 nearly that of the same block one step before and little alike that of another layer (the study `looking` draws both). That
 is so on long chains; on three steps the paper's rule does better (``assets/README.md``).
 The paper does not publish sizes; those here keep the pruner below 0.3 % of
 the dense FLOPs. :mod:`torchrl_sparse.training.pruner.trainer` trains it.
 
-Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen query by
-query through ``("diffusion", "prune_rate")``. It keeps each of them exactly: it prunes as many blocks as the rate
+Beyond the paper, the target prune rate can be an input: one pruner then serves a range of rates, chosen call by
+call through ``("diffusion", "prune_rate")``. It keeps each of them exactly: it prunes as many blocks as the rate
 asks for, those of the highest logits.
 """
 
@@ -112,7 +112,7 @@ def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
 
 
 class SAGPruner(Planner):
-    """Predicts the mask of every query from its observation; serves only the policy that it was trained for.
+    """Predicts the mask of every policy call from its observation; serves only the policy that it was trained for.
 
     Reads ``("diffusion", "cond")`` and, if the rate is an input, ``("diffusion", "prune_rate")`` f32 [*B, 1] where
     it is there; ``rate`` stands in for it where it is not.
@@ -122,7 +122,7 @@ class SAGPruner(Planner):
         info: what it was trained for.
 
     Attributes:
-        rate: prune rate of the queries that do not bring their own. Assign another within ``info.rate_range``.
+        rate: prune rate of the calls that do not bring their own. Assign another within ``info.rate_range``.
         format: what its ``config.json`` says that it holds.
 
     Examples:
@@ -152,7 +152,7 @@ class SAGPruner(Planner):
 
     @property
     def rate(self) -> float:
-        """Prune rate of the queries that bring none."""
+        """Prune rate of the policy calls that bring none."""
         return self._rate
 
     @rate.setter
@@ -171,7 +171,7 @@ class SAGPruner(Planner):
         return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
 
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
-        """Return the rate of every query, if it is an input.
+        """Return the rate of every policy call, if it is an input.
 
         Raises:
             ValueError: if a rate is out of the range that the pruner was trained for.

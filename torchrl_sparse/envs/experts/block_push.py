@@ -12,7 +12,7 @@ _BEHIND = 0.045  # m from a block's centre, where a push begins
 _NEAR = 0.03  # m beyond that, from where on a push is as fast as a walk
 _CLEAR = 0.05  # m from a block's centre that a walk keeps; the corner of a block is at 0.028
 _ON_LINE = 0.006  # m beside the line of the push, within which a push begins
-_OFF_LINE = 0.016  # m beside it, beyond which it ends, to begin anew
+_OFF_LINE = 0.016  # m beside it, beyond which it ends, to begin again
 _ARRIVAL = 0.6  # share of the way left that a walk makes in a step at most
 _TURNING = 3.0  # how much a walk turns outwards that comes too close to a block
 _STEERING = 1.6  # share of the distance to the line that a step of a push makes good
@@ -25,7 +25,7 @@ class BlockPushExpert:
     What it does follows from the state, from whether it is pushing, and from a preference drawn at the start: which block goes
     first and which square it gets, one of four orders. It recovers by itself: a block that is pushed out of its square is
     brought back. Its commands jump only where it turns to the other block, begins a push, or ends one that has left its line to
-    begin it anew: a policy has to learn them.
+    begin it again: a policy has to learn them.
 
     Args:
         rng: draws the order.

@@ -28,7 +28,7 @@ class Operator:
         turn: the same for rotations, rad.
         hover: height over a goal at which it is approached, m.
         slope: metres of height, up to ``hover``, for each metre of horizontal distance left to the goal.
-        bow: sideways offset of a path while the goal is far, m; its sign is drawn too.
+        bow: sideways offset of a path while the goal is far, m; its sign is guided towardo.
         offset: distance of the chosen grasp from the ideal one, m.
         noise: standard deviation of the noise on executed positions, m, far from the goal.
         bump: probability that the hand is pushed away once in an episode.

@@ -22,13 +22,13 @@ __all__ = ["Finalists"]
 
 
 class Finalists(DiffusionBenchmark):
-    """Methods that were timed already, together with those that do not play, and whose queries are demonstrations'.
+    """Methods that were timed already, together with those that do not play, and whose policy calls are demonstrations'.
 
     Args:
         request: what was asked for.
         methods: name -> policy, dense among them.
         make_env, out: see `Benchmark`.
-        machine, timings: where and how long a query of each method took.
+        machine, timings: where and how long a call of each method took.
         queries: [Q], with dense's answers.
     """
 

@@ -16,7 +16,7 @@ class Request:
 
     Attributes:
         task: a name or alias.
-        budget_ms: milliseconds that 95 % of the queries may take; None asks for the fastest method that is still right.
+        budget_ms: milliseconds that 95 % of the policy calls may take; None asks for the fastest method that is still right.
         episodes: at most so many of each method, until its verdict is reached; 0 ranks offline and needs no simulator.
         finalists: methods that are played.
         margin: of non-inferiority in success, a difference of rates.
@@ -24,7 +24,7 @@ class Request:
         n_action_steps: actions executed of a chunk.
         windows: of demonstrations, that errors are measured on.
         seed: of the windows, and of the first episode, see `evaluation_seeds`.
-        repeats: timed queries of each candidate.
+        repeats: timed calls of each candidate.
         threads: of the timing.
         workers: processes that play episodes.
     """

@@ -161,7 +161,7 @@ def _no_calibration() -> Any:
 def _from_demonstrations(
     policy: DiffusionPolicy, demos: Demonstrations, request: Request
 ) -> tuple[TensorDict, TensorDict]:
-    """Return targets of some windows of the demonstrations, and queries with what is observed in them."""
+    """Return targets of some windows of the demonstrations, and policy calls with what is observed in them."""
     rows = demos.window_rows(policy.horizon, policy.n_obs_steps, request.n_action_steps)
     targets = make_targets(
         policy,
@@ -205,7 +205,7 @@ def _time(
     made_for: dict[str, Any],
     request: Request,
 ) -> tuple[Machine, dict[str, Latency]]:
-    """Time all methods, unless they were timed on this machine; on another they are timed anew."""
+    """Time all methods, unless they were timed on this machine; on another they are timed again."""
     machine = describe_machine(methods[DENSE].device, request.threads)
     settings = {
         **made_for,

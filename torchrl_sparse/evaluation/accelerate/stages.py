@@ -1,6 +1,6 @@
 """What the stages of an acceleration leave behind, so that one that was killed goes on where it was.
 
-Each file says what it was made for; under other settings it is refused, or made anew where that costs little.
+Each file says what it was made for; under other settings it is refused, or made again where that costs little.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def read_or_make(
         kind: dataclass of its content.
         made_for: what the content depends on; JSON values.
         make: called at most once.
-        anew: whether to make again, instead of refusing, what was made for something else.
+        again: whether to make again, instead of refusing, what was made for something else.
 
     Raises:
         ValueError: naming the file, if it is malformed, or was made for something else.

@@ -1,4 +1,4 @@
-"""Benchmarks: from episodes, timed queries and errors of every method to results, figures and films."""
+"""Benchmarks: from episodes, timed policy calls and errors of every method to results, figures and films."""
 
 import lazy_loader as lazy
 

@@ -45,7 +45,7 @@ class BenchmarkOptions:
         num_envs, workers, backend: see `rollout_episodes`.
         device: of the policy.
         threads, latency_repeats: of the timing.
-        probe_episodes: dense episodes whose queries are measured.
+        probe_episodes: dense episodes whose policy calls are measured.
         dense_log: where dense's episodes are kept; None is with the others.
         pairs: of methods that are compared with each other.
         videos: methods to film.
@@ -80,7 +80,7 @@ class BenchmarkOptions:
 
 
 class Benchmark(ABC):
-    """Methods against dense, on the same episodes and the same queries. `run` is the order.
+    """Methods against dense, on the same episodes and the same policy calls. `run` is the order.
 
     A subclass has the methods: what acts them out, what tells their episodes from others', how they are timed, what is drawn.
 

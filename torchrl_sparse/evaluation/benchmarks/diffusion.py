@@ -160,7 +160,7 @@ def time_methods(
     Args:
         methods: name -> policy, ``"dense"`` among them.
         queries: [Q] of dense episodes.
-        repeats: queries that are timed under each method.
+        repeats: policy calls that are timed under each method.
         threads: of PyTorch while timing.
     """
     samples = {name: MethodSpec.parse(name).samples for name in methods}
@@ -180,13 +180,13 @@ def measure_methods(
     repeats: int,
     threads: int,
 ) -> dict[str, MethodRun]:
-    """Measure latency and action error of all methods on the same queries, and add them to the episodes.
+    """Measure latency and action error of all methods on the same policy calls, and add them to the episodes.
 
     Args:
         methods: name -> policy, ``"dense"`` among them.
         episodes: name -> its episodes.
         queries: [Q] of dense episodes, with the dense policy's answers; see `record_queries`.
-        repeats: queries that are timed under each method.
+        repeats: calls that are timed under each method.
         threads: of PyTorch while timing.
     """
     latency = time_methods(methods, queries, repeats=repeats, threads=threads)
@@ -224,7 +224,7 @@ def draw_methods(
     plot_pareto(results, out / "pareto.png")
     plot_success_within(results, out / "success_within.png")
     plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
-    # The first query of an episode has no last chunk to begin from.
+    # The first policy call of an episode has no last chunk to begin from.
     masks = {name: answer(method, queries[:2])[keys.PRUNE_MASK][-1] for name, method in methods.items()}
     for name, mask in masks.items():
         ratio = results.methods[name].flops.ratio_to_dense
@@ -249,7 +249,7 @@ def _adaptive(methods: Mapping[str, DiffusionPolicy]) -> dict[str, DiffusionPoli
 
 
 def _draw_masks(name: str, method: DiffusionPolicy, queries: TensorDictBase, out: Path) -> None:
-    """Draw the masks along an episode, and their statistics over all queries."""
+    """Draw the masks along an episode, and their statistics over all policy calls."""
     masks = answer(method, queries)[keys.PRUNE_MASK].numpy()
     plot_mask_statistics(masks, out / f"masks_{name}.png", name=name)
     step = queries[keys.EPISODE_STEP].flatten()

@@ -22,7 +22,7 @@ _WHOLE = (
     "dense",
     "ddim10",
     "ddim2",
-)  # kinds of queries of which whole calls of a policy with cameras are timed
+)  # kinds of policy calls of which whole calls of a policy with cameras are timed
 
 
 def measure_engines(
@@ -37,13 +37,13 @@ def measure_engines(
     compiled: bool = False,
     instruction_sets: bool = False,
 ) -> EngineShape:
-    """Time every engine on every kind of query, interleaved, and of a policy with cameras whole calls by stage.
+    """Time every engine on every kind of policy call, interleaved, and of a policy with cameras whole calls by stage.
 
     Dense is DDPM in all training steps of the policy's sampler, whatever the policy takes itself.
 
     Args:
         policy: whose network is timed, where it is; its plan, sampler and engine play no part.
-        batch: rows of a query; each has a random mask of its own where masks are random.
+        batch: rows of a call; each has a random mask of its own where masks are random.
         bac: of the rows ``"bac10"``; None calibrates one on noise.
         name: of the case, for the progress.
         repeats, warmup: rounds, see `measure_latency`.

@@ -1,4 +1,4 @@
-"""Films of an episode: what the cameras see, what the method prunes, and what each query took."""
+"""Films of an episode: what the cameras see, what the method prunes, and what each policy call took."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from torchrl_sparse.runtime.threads import num_threads
 __all__ = ["captions", "film_masks", "film_tokens"]
 
 _CAMERA, _SIZE = "agentview", 320
-_SHOWN = 6  # queries of a strip
+_SHOWN = 6  # policy calls of a strip
 _ZOOM = 2
 
 
 def film_masks(
     name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path, threads: int
 ) -> None:
-    """Film a diffusion policy's episode, with the latest query's mask beside it where masks depend on the observation.
+    """Film a diffusion policy's episode, with the latest policy call's mask beside it where masks depend on the observation.
 
     Args:
         name: of the method; the film is ``out/rollout_NAME.mp4``.
@@ -37,10 +37,10 @@ def film_masks(
         make_env: called as ``make_env(seeds=[seed])``.
         seed: of the episode.
         out: folder of the film.
-        threads: of PyTorch meanwhile, as captions tell what each query took.
+        threads: of PyTorch meanwhile, as captions tell what each call took.
 
     Raises:
-        RuntimeError: without a GL library, before any query.
+        RuntimeError: without a GL library, before any call.
     """
     frames = []
 
@@ -94,7 +94,7 @@ def captions(name: str, steps: TensorDictBase) -> list[Caption]:
 
     Args:
         name: of the method.
-        steps: [T], of which the first queries the policy.
+        steps: [T], of which the first asks the policy.
     """
     made, latency = [], None
     for index, step in enumerate(steps.unbind(0)):

@@ -40,12 +40,12 @@ def measure_call(
     busy: int = 0,
     library: str | Path | None = None,
 ) -> QueryProfile:
-    """Time a policy call in its parts, unpruned queries by number of threads, and many calls from Python and in C.
+    """Time a policy call in its parts, unpruned policy calls by number of threads, and many calls from Python and in C.
 
     Args:
         policy: on the CPU, with the sampler and the plan of the call.
         threads: of PyTorch and the engine, for the parts and the tail; None leaves PyTorch's.
-        thread_counts: that unpruned queries are timed on, dense ones too, as far as there are so many cores.
+        thread_counts: that unpruned calls are timed on, dense ones too, as far as there are so many cores.
         repeats, warmup: rounds of parts and threads, see `measure_latency`.
         queries: of the tail.
         hz: how often they begin; None: one after the other.

@@ -17,7 +17,7 @@ from torchrl_sparse.evaluation.statistics.sequential import Design
 __all__ = ["episode_horizon", "make_design", "play_rounds"]
 
 _LOOKS = 30  # of a benchmark that goes on until it is decided, at most
-_BETWEEN = 10  # episodes from one look to the next, at least: each makes its environments anew
+_BETWEEN = 10  # episodes from one look to the next, at least: each makes its environments again
 _UNTIL = ("episodes", "decided")
 
 

@@ -46,14 +46,14 @@ def error_to_dense(
     Args:
         policy: whose normaliser applies.
         answers: of a method, with ``("vla_action", "chunk")``, [Q].
-        dense_answers: of the dense policy to the same queries, [Q].
+        dense_answers: of the dense policy to the same policy calls, [Q].
     """
     normalize = policy.normalizer.normalize_action
     return action_error(normalize(answers[keys.CHUNK]), normalize(dense_answers[keys.CHUNK]))
 
 
 def flops_executed(policy: DiffusionPolicy, answers: TensorDictBase) -> float:
-    """Return the FLOPs that the planner and the chosen engine really did in a query, mean over ``answers`` [Q].
+    """Return the FLOPs that the planner and the chosen engine really did in a policy call, mean over ``answers`` [Q].
 
     Examples:
         >>> import torch

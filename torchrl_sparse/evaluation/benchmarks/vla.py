@@ -1,4 +1,4 @@
-"""A benchmark of a vision-language-action policy: its methods, which may match each other, and the queries they are asked."""
+"""A benchmark of a vision-language-action policy: its methods, which may match each other, and the calls they are asked."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 Recorded = Sequence[Sequence[TensorDictBase]]
-"""The queries, each [], of dense episodes."""
+"""The policy calls, each [], of dense episodes."""
 
 
 def record_methods(
@@ -54,9 +54,9 @@ def record_methods(
     n_action_steps: int,
     settings: Settings,
 ) -> dict[str, Recorded]:
-    """Record the queries that each method is measured on: those of dense episodes under the method's own controller.
+    """Record the policy calls that each method is measured on: those of dense episodes under the method's own controller.
 
-    The controller asks for queries of its own where motion becomes fine, and grants each its budget; both are replayed with
+    The controller asks for calls of its own where motion becomes fine, and grants each its budget; both are replayed with
     it. Methods without one, and those with the same, share their episodes.
 
     Args:
@@ -104,7 +104,7 @@ def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def skipped_layers(dense: VLAPolicy, recorded: Recorded, count: int) -> list[int]:
-    """Return the decoder layers that change their input least on recorded queries, see `redundant_layers`."""
+    """Return the decoder layers that change their input least on recorded policy calls, see `redundant_layers`."""
     similarity = [replay(dense, queries, LayerSimilarity())[SIMILARITY] for queries in recorded]
     return redundant_layers(torch.cat(similarity), count)
 
@@ -158,7 +158,7 @@ def matched_number(
     Args:
         text: the method, see `torchrl_sparse.methods.vla`.
         dense: the dense policy.
-        recorded: the method's queries, see `record_methods`.
+        recorded: the method's policy calls, see `record_methods`.
         episodes: name -> episodes, those of the method that is matched among them.
         settings: see `make_pruner`.
     """

@@ -1,4 +1,4 @@
-"""The benchmark of a vision-language-action policy: what is measured on recorded queries is time, distance to dense, depth."""
+"""The benchmark of a vision-language-action policy: what is measured on recorded calls is time, distance to dense, depth."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ __all__ = ["VLABenchmark", "draw_methods", "measure_methods", "replay_all", "tim
 class VLABenchmark(Benchmark):
     """A vision-language-action policy, dense against pruned visual tokens.
 
-    Queries are recorded before methods play, since a method that matches another's tokens needs both.
+    Policy calls are recorded before methods play, since a method that matches another's tokens needs both.
 
     Args:
         options, make_env: see `Benchmark`.
@@ -135,11 +135,11 @@ def measure_methods(
     threads: int,
     device: str,
 ) -> dict[str, MethodRun]:
-    """Measure each method's time and its distance to dense, on its own queries.
+    """Measure each method's time and its distance to dense, on its own policy calls.
 
     Args:
         policies: name -> policy, the dense one among them.
-        recorded: name -> the method's queries, see `record_methods`.
+        recorded: name -> the method's calls, see `record_methods`.
         episodes: name -> the method's episodes.
         repeats, threads, device: see `measure_latency`.
     """
@@ -173,14 +173,14 @@ def time_methods(
     threads: int,
     device: str,
 ) -> dict[str, Latency]:
-    """Time the queries of the first recorded episode in turn, each method its own, interleaved.
+    """Time the policy calls of the first recorded episode in turn, each method its own, interleaved.
 
     So the times are those of an episode's mixture of queries: the first, which knows nothing of the scene and may keep more,
     coarse and fine ones.
 
     Args:
         policies: name -> policy.
-        recorded: name -> the method's queries, see `record_methods`.
+        recorded: name -> the method's calls, see `record_methods`.
         repeats, threads, device: see `measure_latency`.
     """
     calls = {name: _in_turn(policy, recorded[name][0]) for name, policy in policies.items()}
@@ -189,12 +189,12 @@ def time_methods(
 
 
 def _in_turn(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> Callable[[], TensorDictBase]:
-    """Return a function whose calls answer one query of an episode after the other, and begin anew after the last."""
+    """Return a function whose calls answer one policy call of an episode after the other, and begin again after the last."""
     endless = cycle(prepared_queries(policy, queries))
     return lambda: answer(policy, next(endless))
 
 
 def replay_all(policy: VLAPolicy, recorded: Recorded) -> TensorDictBase:
-    """Return the policy's answers to all queries of all episodes, [Q]: chunks, and how deep each token went."""
+    """Return the policy's answers to all policy calls of all episodes, [Q]: chunks, and how deep each token went."""
     wanted = (keys.CHUNK, keys.TOKEN_DEPTH)
     return torch.cat([replay(policy, queries, policy.pruner).select(*wanted) for queries in recorded])

@@ -78,7 +78,7 @@ def measure_vla(
     repeats: int,
     warmup: int = 2,
 ) -> VLALatency:
-    """Time the parts of the dense query and all methods, everything interleaved.
+    """Time the parts of the dense policy call and all methods, everything interleaved.
 
     Args:
         case: with a method ``"dense"``.

@@ -26,7 +26,7 @@ _NAMED = 4  # of the ranking, beside dense, what was played and the front
 
 
 def plot_acceleration(acceleration: Acceleration, path: str | os.PathLike) -> Path:
-    """Draw the error to demonstrations against the median latency of a query (log axes), coloured by family.
+    """Draw the error to demonstrations against the median latency of a policy call (log axes), coloured by family.
 
     Pale candidates are over the budget; a ring is around what was played, a star on what was chosen. The front, of which no
     candidate is beaten in both, is a line through candidates of all families, between which the error compares little.
@@ -52,7 +52,7 @@ def plot_acceleration(acceleration: Acceleration, path: str | os.PathLike) -> Pa
     _set_limits(axes, points)
     if acceleration.budget_ms is not None:
         axes.axvline(acceleration.budget_ms, color="#666666", linewidth=1, linestyle=(0, (4, 3)))
-    axes.set_xlabel("latency per query, median (ms, log scale)")
+    axes.set_xlabel("latency per policy call, median (ms, log scale)")
     axes.set_ylabel("error of actions to demonstrations, normalised (log scale)")
     machine = acceleration.machine
     axes.set_title(f"{acceleration.task}; {machine.cpu}, {threads_text(machine.threads)}", loc="left")

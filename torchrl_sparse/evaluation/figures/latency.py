@@ -62,14 +62,14 @@ def plot_engine_times(name: str, shape: EngineShape, machine: Machine, path: str
     axes.set_yticks(places, rows, fontsize=9)
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.grid(False, axis="y")
-    axes.set_xlabel("time per query, median (ms, log scale)")
+    axes.set_xlabel("time per policy call, median (ms, log scale)")
     axes.set_title(f"{name}, batch {shape.batch}; {machine.cpu}, {threads_text(shape.threads)}", loc="left")
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     return save_figure(figure, path)
 
 
 def plot_vla_times(results: VLALatency, path: str | os.PathLike) -> Path:
-    """Draw what a dense query spends its time on and, below, every method's speed-up beside what its FLOPs promise.
+    """Draw what a dense policy call spends its time on and, below, every method's speed-up beside what its FLOPs promise.
 
     Args:
         results: what ``vla_latency.json`` holds.
@@ -97,7 +97,7 @@ def _draw_parts(axes: Axes, parts: Mapping[str, Part]) -> None:
         left += width
     axes.set_yticks([])
     axes.set_xlim(0, left)
-    axes.set_xlabel("dense query, median (ms)")
+    axes.set_xlabel("dense policy call, median (ms)")
     axes.legend(
         frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0), fontsize=9, columnspacing=1.2
     )
@@ -133,10 +133,10 @@ def _draw_speedups(axes: Axes, methods: Mapping[str, VLAMethod]) -> None:
 def plot_thread_scaling(
     threads_s: Mapping[str, Mapping[str, float]], machine: Machine, path: str | os.PathLike
 ) -> Path:
-    """Draw how many times as fast queries are on more threads, and Amdahl's law fitted to each, up to 16.
+    """Draw how many times as fast policy calls are on more threads, and Amdahl's law fitted to each, up to 16.
 
     Args:
-        threads_s: name of a query -> number of threads, as text, ``"1"`` among them -> seconds.
+        threads_s: name of a call -> number of threads, as text, ``"1"`` among them -> seconds.
         machine: what it was measured on.
         path: of the PNG.
     """
@@ -152,6 +152,6 @@ def plot_thread_scaling(
         )
     axes.set_xlabel("threads")
     axes.set_ylabel("times as fast as on one thread")
-    axes.set_title(f"One query; {machine.cpu}", loc="left")
+    axes.set_title(f"One policy call; {machine.cpu}", loc="left")
     axes.legend(frameon=False)
     return save_figure(figure, path)

@@ -17,13 +17,13 @@ _TYPES = len(BLOCK_TYPES)
 
 
 def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, steps_per_query: int) -> Path:
-    """Draw the masks of queries along one rollout, side by side (figure 5 of SAG, arXiv:2601.12894).
+    """Draw the masks of policy calls along one rollout, side by side (figure 5 of SAG, arXiv:2601.12894).
 
     Args:
-        masks: bool [Q, K, 3L], True = pruned, queries in order; eight of them are drawn, evenly spread.
+        masks: bool [Q, K, 3L], True = pruned, calls in order; eight of them are drawn, evenly spread.
         path: of the PNG.
         name: of the method, for the title.
-        steps_per_query: environment steps from one query to the next.
+        steps_per_query: environment steps from one call to the next.
 
     Raises:
         ValueError: if ``masks`` is not such an array.
@@ -51,11 +51,11 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
 def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: str) -> Path:
     """Draw where a planner prunes, and how much that depends on the observation.
 
-    Above: the pruned share of each type of block along the denoising steps. Below: the variance over queries of every
+    Above: the pruned share of each type of block along the denoising steps. Below: the variance over policy calls of every
     entry of the mask, 0 where it is always the same and 0.25 where it is a toss of a coin.
 
     Args:
-        masks: bool [Q, K, 3L], True = pruned, of many queries.
+        masks: bool [Q, K, 3L], True = pruned, of many calls.
         path: of the PNG.
         name: of the method, for the title.
 
@@ -74,14 +74,14 @@ def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: st
     above.legend(ncols=3, loc="lower right")
     variance = masks.mean(axis=0) * (1 - masks.mean(axis=0))
     above.set_title(
-        f"{name}: {100 * masks.mean():.1f} % pruned, {len(masks)} queries; mean variance {variance.mean():.4f}",
+        f"{name}: {100 * masks.mean():.1f} % pruned, {len(masks)} policy calls; mean variance {variance.mean():.4f}",
         loc="left",
     )
     image = below.imshow(variance.T, aspect="auto", interpolation="nearest", vmin=0, vmax=0.25, cmap="magma")
     below.grid(False)
     below.set_yticks(range(num_blocks), block_labels(num_blocks), fontsize=8)
     below.set_xlabel("denoising step, in execution order (0 is the first call of the network)")
-    figure.colorbar(image, ax=below, pad=0.01, label="variance over queries")
+    figure.colorbar(image, ax=below, pad=0.01, label="variance over policy calls")
     return save_figure(figure, path)
 
 

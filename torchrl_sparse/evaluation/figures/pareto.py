@@ -25,7 +25,7 @@ _MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
 
 
 def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
-    """Draw success, or the score, with its interval, against the median latency of a query (log axis).
+    """Draw success, or the score, with its interval, against the median latency of a policy call (log axis).
 
     The marker is the verdict.
 
@@ -47,7 +47,7 @@ def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
     _draw_front(axes, points)
     _set_limits(axes, points, min(low for low, _ in intervals.values()))
     _draw_margin(axes, points[DENSE][1], 100 * results.dense.paired_vs_dense.margin, colors[DENSE])
-    axes.set_xlabel("latency per query, median (ms, log scale)")
+    axes.set_xlabel("latency per policy call, median (ms, log scale)")
     what = "score, % of the highest" if results.by_degrees else "success (%)"
     axes.set_ylabel(f"{what}, 95 % interval")
     title = f"{results.task}: {results.dense.success.n} paired episodes; {results.machine.cpu}"

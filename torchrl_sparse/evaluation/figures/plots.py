@@ -46,7 +46,7 @@ def plot_schedule(
         mask: bool [K, 3L], True = pruned, steps in execution order.
         path: of the PNG.
         name: of the method, for the title.
-        flops_ratio: FLOPs of a query over those of the dense policy, for the title.
+        flops_ratio: FLOPs of a policy call over those of the dense policy, for the title.
 
     Raises:
         ValueError: if ``mask`` is not a bool matrix with a multiple of three columns.
@@ -131,12 +131,12 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
 def plot_error_surge(
     errors: Mapping[str, np.ndarray], masks: Mapping[str, np.ndarray], path: str | os.PathLike
 ) -> Path:
-    """Draw the error of the blocks' outputs within a query under several schedules (figure 3 of BAC,
+    """Draw the error of the blocks' outputs within a policy call under several schedules (figure 3 of BAC,
     arXiv:2506.13456).
 
     Args:
         errors: schedule -> [K, 3L] relative error of every block's output to the dense run on the same noise,
-            ``|x - dense| / |dense|``, of one query or the mean of several.
+            ``|x - dense| / |dense|``, of one call or the mean of several.
         masks: schedule -> bool [K, 3L], True = pruned; the same names.
         path: of the PNG.
 
@@ -161,7 +161,7 @@ def plot_error_surge(
         axes.set_ylabel(f"relative error,\nmean of {label}")
         axes.set_ylim(bottom=0)
     ffn_axes.legend(ncols=len(errors), loc="upper left", frameon=False)
-    ffn_axes.set_title("Error of the blocks' outputs within a query", loc="left")
+    ffn_axes.set_title("Error of the blocks' outputs within a policy call", loc="left")
     _draw_updates(update_axes, masks, colors)
     update_axes.set_xlabel("denoising step, in execution order")
     return save_figure(figure, path)

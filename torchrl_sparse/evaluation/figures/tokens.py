@@ -28,7 +28,7 @@ def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: i
     """Draw the cameras side by side, each patch the darker, the earlier its token was dropped; those never dropped as they are.
 
     Args:
-        images: u8 [V, 3, h, w], a query's images.
+        images: u8 [V, 3, h, w], a policy call's images.
         depth: [N], decoder layers that each visual token reached (``("tokens", "depth")``), camera by camera.
         num_layers: decoder layers; the depth of tokens that were never dropped.
         scale: pixels of the picture for one of the image.
@@ -65,7 +65,7 @@ def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path
     """Line up pictures of `draw_tokens` along a rollout, from left to right, each camera in a row of its own.
 
     Args:
-        pictures: u8 [h, V * w, 3], one per query that is shown; the V images of each are square.
+        pictures: u8 [h, V * w, 3], one per policy call that is shown; the V images of each are square.
         labels: what to write above each.
         path: of the PNG.
 
@@ -96,13 +96,13 @@ def plot_control(
     *,
     kept: np.ndarray | None = None,
 ) -> Path:
-    """Draw when the controller held the motion for fine, over the hand's speed, with the queries marked.
+    """Draw when the controller held the motion for fine, over the hand's speed, with the policy calls marked.
 
     Args:
         speed: [T] m/s at each step.
         fine, queried: bool [T].
         path: of the PNG.
-        kept: [T] visual tokens of the latest query, drawn below.
+        kept: [T] visual tokens of the latest call, drawn below.
 
     Raises:
         ValueError: if lengths differ.
@@ -134,19 +134,19 @@ def plot_control(
 
 
 def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: str | os.PathLike) -> Path:
-    """Draw the visual tokens in each decoder layer, mean over queries, of several methods.
+    """Draw the visual tokens in each decoder layer, mean over policy calls, of several methods.
 
     Args:
-        depth: method -> [queries, N] layers that each token reached (``("tokens", "depth")``).
+        depth: method -> [calls, N] layers that each token reached (``("tokens", "depth")``).
         num_layers: decoder layers.
         path: of the PNG.
 
     Raises:
-        ValueError: if there is no method, or one without queries.
+        ValueError: if there is no method, or one without calls.
     """
     if not depth or any(np.ndim(values) != 2 or not np.size(values) for values in depth.values()):
         shapes = {name: list(np.shape(values)) for name, values in depth.items()}
-        raise InputError(f"depth: expected [queries, N] for at least one method, got {shapes}")
+        raise InputError(f"depth: expected [policy calls, N] for at least one method, got {shapes}")
     figure, axes = make_figure(9, 3.8)
     colors = method_colors(depth)
     for place, (name, values) in enumerate(depth.items()):

@@ -28,7 +28,7 @@ class Caption:
         method: name of the method.
         step: environment step of the episode.
         queried: whether this step called the policy; lights the lamp.
-        latency: seconds of the latest query, None before the first.
+        latency: seconds of the latest policy call, None before the first.
         success: whether the task is solved.
     """
 
@@ -85,7 +85,7 @@ def write_video(
 
 
 def add_caption(frame: np.ndarray, caption: Caption) -> np.ndarray:
-    """Put a bar of two lines under the frame: method and step; the latest query, with a lamp lit at queries.
+    """Put a bar of two lines under the frame: method and step; the latest policy call, with a lamp lit at calls.
 
     Args:
         frame: u8 [h, w, 3].
@@ -114,7 +114,7 @@ def add_caption(frame: np.ndarray, caption: Caption) -> np.ndarray:
     )
     if caption.latency is not None:
         color = _TEXT if caption.queried else _DIM
-        text = f"query {1e3 * caption.latency:.0f} ms"
+        text = f"policy call {1e3 * caption.latency:.0f} ms"
         draw.text((left + 3.5 * radius, lower), text, color, regular, anchor="lm")
     if caption.success:
         draw.text((right, lower), "solved", _SUCCESS, _font(size, bold=True), anchor="rm")

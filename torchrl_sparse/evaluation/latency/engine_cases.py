@@ -1,7 +1,7 @@
-"""The cases of a benchmark of the engines: shapes, queries of different sparsity, and every way of answering them.
+"""The cases of a benchmark of the engines: shapes, policy calls of different sparsity, and every way of answering them.
 
-A *query kind* is a sampler and a mask (``"dense"``, ``"random91"``, ``"ddim10"`` ...); a *variant* is one way of answering
-one kind of query, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, though
+A *call kind* is a sampler and a mask (``"dense"``, ``"random91"``, ``"ddim10"`` ...); a *variant* is one way of answering
+one kind of call, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, though
 diffusers' sampler draws the noise itself.
 """
 
@@ -59,7 +59,7 @@ def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
 
 @dataclass(frozen=True)
 class QueryKind:
-    """One kind of query.
+    """One kind of policy call.
 
     Attributes:
         sampler: the sampler, K steps.
@@ -86,11 +86,11 @@ class QueryKind:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way of answering one kind of query.
+    """One way of answering one kind of policy call.
 
     Attributes:
         call: answers it once, with normalised actions [B, H, A].
-        kind: of the query.
+        kind: of the call.
         dense: name of the variant that runs ``"dense"`` in the same runner.
         weight_bytes: size of a weight as the runner reads it.
         in_f32: whether the runner multiplies and adds in f32.
@@ -104,15 +104,15 @@ class Variant:
 
 
 class EngineCase:
-    """One network, one batch, all kinds of queries.
+    """One network, one batch, all kinds of policy calls.
 
     Args:
         network: the denoiser, in eval mode, on the device that is to run everything.
         batch: rows B; each has a random mask of its own where masks are random.
-        dense: sampler of the dense query, whose steps the caches are calibrated for; DDPM with 100 without it.
+        dense: sampler of the dense call, whose steps the caches are calibrated for; DDPM with 100 without it.
         compiled: also run the eager baseline through ``torch.compile``.
         bac_mask: of a schedule of BAC (arXiv:2506.13456) at M=10 for this network, bool [K, 3L]; None computes one from the
-            first of the case's own queries, whose observation is noise.
+            first of the case's own calls, whose observation is noise.
         instruction_sets: also run the native engine on each of those that this CPU has.
     """
 
@@ -145,12 +145,12 @@ class EngineCase:
         self.queries = {kind: query.to(self.device) for kind, query in queries.items()}
 
     def reference(self, kind: str) -> Tensor:
-        """Return the reference engine's answer to a query, [B, H, A]."""
+        """Return the reference engine's answer to a policy call, [B, H, A]."""
         query = self.queries[kind]
         return self._call(partial(ReferenceEngine, self.network, query.sampler), query)()
 
     def variants(self) -> dict[str, Variant]:
-        """Return all ways of answering all kinds of queries, by name."""
+        """Return all ways of answering all kinds of policy calls, by name."""
         variants = self._eager_variants()
         variants["reference dense"] = Variant(partial(self.reference, "dense"), "dense", "reference dense")
         for runner, make in self._runners().items():
@@ -167,7 +167,7 @@ class EngineCase:
         return variants
 
     def _runners(self) -> dict[str, Callable[[TransformerForDiffusion, Sampler], Engine]]:
-        """Return by name what makes the engines; all but `_RUNNERS` answer few kinds of queries."""
+        """Return by name what makes the engines; all but `_RUNNERS` answer few kinds of policy calls."""
         if not native_supports(self.network)[0]:
             return {"torch": TorchEngine}
         rounded = {

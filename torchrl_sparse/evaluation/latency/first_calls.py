@@ -24,7 +24,7 @@ class FirstCall:
     """What the first call of a variant took.
 
     Attributes:
-        seconds: with everything that is done once: tables, compilation, captured graphs. Kinds of queries that share an
+        seconds: with everything that is done once: tables, compilation, captured graphs. Kinds of policy calls that share an
             engine leave what they have in common to the first of them.
         peak_bytes: of the GPU's memory beyond what the variants before hold, with the network's weights; None on a CPU.
     """
@@ -41,7 +41,7 @@ def first_calls(
     """Call every variant once; one that cannot be compiled here is left out, and a line says so.
 
     Args:
-        case: of the variants; its reference answers each kind of query once, whatever the number of its variants.
+        case: of the variants; its reference answers each kind of policy call once, whatever the number of its variants.
         variants: by name.
         on_call: called as ``on_call(done, total)`` after each.
 
@@ -77,7 +77,7 @@ def _first_call(case: EngineCase, name: str, variant: Variant, expected: Tensor)
 
 
 def _begin_peak(device: torch.device) -> int:
-    """Let the GPU's peak begin anew; return the bytes that are taken already."""
+    """Let the GPU's peak begin again; return the bytes that are taken already."""
     torch.cuda.reset_peak_memory_stats(device)
     return torch.cuda.memory_allocated(device)
 

@@ -33,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Latency:
-    """Latency of one query.
+    """Latency of one policy call.
 
     Attributes:
         p50: median, seconds.
@@ -94,7 +94,7 @@ def measure_latency(
     """Time several callables against each other, without gradients.
 
     Args:
-        callables: name -> function; one call is one query.
+        callables: name -> function; one call is one policy call.
         repeats: timed rounds; every round calls each candidate once.
         warmup: untimed rounds before them.
         threads: intra-op threads of PyTorch while measuring (restored afterwards); None leaves the setting

@@ -1,4 +1,4 @@
-"""One query under the glass: what its time goes to, what more threads make of it, and how late the latest of many come."""
+"""One call under the glass: what its time goes to, what more threads make of it, and how late the latest of many come."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def call_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[s
 
 @torch.no_grad()
 def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[str, float]:
-    """Measure the median seconds of a query in the native engine, and of what happens in it, interleaved.
+    """Measure the median seconds of a policy call in the native engine, and of what happens in it, interleaved.
 
     Args:
         policy: of states, on the CPU, with a planner that does not look at the observation.
@@ -133,7 +133,7 @@ def thread_seconds(
     *,
     engine: str = "native",
 ) -> dict[str, dict[int, float]]:
-    """Measure the median seconds of an unpruned query of each sampler on each number of threads, all interleaved.
+    """Measure the median seconds of an unpruned policy call of each sampler on each number of threads, all interleaved.
 
     Args:
         network: the denoiser, on the CPU.
@@ -179,10 +179,10 @@ def paced_seconds(
     *,
     inputs: Mapping[str, Iterator[Any]] | None = None,
 ) -> dict[str, list[float]]:
-    """Time many queries of each caller, which begin ``hz`` times a second as a control loop's do; None: one after the other.
+    """Time many calls of each caller, which begin ``hz`` times a second as a control loop's do; None: one after the other.
 
     Those in ``inputs`` are called with the next of theirs, made before they begin. Several callers take turns, spread evenly
-    over the period. A query that comes late delays the next; each is timed from its own beginning.
+    over the period. A call that comes late delays the next; each is timed from its own beginning.
 
     Returns:
         name of a caller -> seconds of its ``queries``, in order. Ctrl-C ends it with as many of each as there are by then.
@@ -222,7 +222,7 @@ def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
 
 @contextmanager
 def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[], Any]]:
-    """Export the policy and lend the same query of the C interface, ``tsp.h``, as a robot calls it.
+    """Export the policy and lend the same policy call of the C interface, ``tsp.h``, as a robot calls it.
 
     Args:
         policy: of states, which `DiffusionPolicy.export` can write; with the weights that its engine rounds to.

@@ -1,4 +1,4 @@
-"""Latency of recorded queries, and of the planners within them."""
+"""Latency of recorded policy calls, and of the planners within them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def time_queries(
     samples: Mapping[str, int] | None = None,
     on_round: Callable[[int, int], None] | None = None,
 ) -> dict[str, Latency]:
-    """Time recorded queries [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
+    """Time recorded policy calls [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
 
     Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods that
-    carry something from query to query have what they left themselves in the one before. Those in ``samples`` are asked it so
+    carry something from call to call have what they left themselves in the one before. Those in ``samples`` are asked it so
     many times at once.
     """
     samples = samples or {}
@@ -46,7 +46,7 @@ def time_queries(
 def time_planning(
     methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
 ) -> dict[str, Latency]:
-    """Time the planners alone, within recorded queries [N]: from their encoding to their denoising, interleaved.
+    """Time the planners alone, within recorded policy calls [N]: from their encoding to their denoising, interleaved.
 
     In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
     """
@@ -61,7 +61,7 @@ def time_planning(
 
 
 def _copied(queries: TensorDictBase, samples: int) -> TensorDictBase:
-    """Return queries [N, samples], or [N] as they are for one."""
+    """Return policy calls [N, samples], or [N] as they are for one."""
     return queries if samples == 1 else queries[:, None].expand(len(queries), samples).contiguous()
 
 

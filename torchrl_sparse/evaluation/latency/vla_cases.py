@@ -1,8 +1,8 @@
-"""The cases of a latency benchmark of vision-language-action models: shapes, queries, parts of a query, and pruning's own work.
+"""The cases of a latency benchmark of vision-language-action models: shapes, calls, parts of a call, and pruning's own work.
 
 Images are noise, and of `SHAPES` the weights too: they change which tokens go, not what arithmetic costs. Every method answers
-the second query of an episode, in which a tenth of all patches has changed, with what it remembers of the first. Parts and
-helpers are replayed on tensors of such a query, so that nothing is timed from within.
+the second call of an episode, in which a tenth of all patches has changed, with what it remembers of the first. Parts and
+helpers are replayed on tensors of such a call, so that nothing is timed from within.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def make_policy(
 
 
 class VLACase:
-    """One network and every way of answering the same query, batch 1.
+    """One network and every way of answering the same policy call, batch 1.
 
     Args:
         policy: whose network, normaliser and tokenizer all methods share.
@@ -89,7 +89,7 @@ class VLACase:
 
     Attributes:
         policies: name -> its policy.
-        queries: name -> the second query, with what the first left it.
+        queries: name -> the second call, with what the first left it.
     """
 
     def __init__(
@@ -106,16 +106,16 @@ class VLACase:
             self.queries[name] = remembered.update(second)
 
     def answer(self, name: str) -> TensorDictBase:
-        """Return a method's answer to its query."""
+        """Return a method's answer to its policy call."""
         return self.policies[name](self.queries[name].clone(recurse=False))
 
     def sequence(self) -> LayerState:
-        """Return the decoder's input, [1, S], of a dense query."""
+        """Return the decoder's input, [1, S], of a dense policy call."""
         policy, query = self._dense
         return _recorded(policy, _FirstLayer(), query).scored[0][0]
 
     def parts(self) -> dict[str, Callable[[], Any]]:
-        """Return the parts of a dense query, but for reading and laying out its inputs: name -> call."""
+        """Return the parts of a dense policy call, but for reading and laying out its inputs: name -> call."""
         network, sequence = self.network, self.sequence()
         images = torch.cat([self._dense[1][camera] for camera in network.config.cameras])
         features = network.vision(images)
@@ -128,7 +128,7 @@ class VLACase:
         }
 
     def record(self, name: str) -> _Recorder:
-        """Record what a method's pruner works on in its query."""
+        """Record what a method's pruner works on in its policy call."""
         return _recorded(self.policies[name], self.policies[name].pruner, self.queries[name])
 
     def helpers(self, name: str) -> dict[str, Callable[[], Any]]:
@@ -209,7 +209,7 @@ class _Recorder(TokenPruner):
 
 
 def _recorded(policy: VLAPolicy, pruner: TokenPruner, query: TensorDictBase) -> _Recorder:
-    """Record what ``pruner`` does in a query of this model."""
+    """Record what ``pruner`` does in a policy call of this model."""
     recorder = _Recorder(pruner)
     policy.with_pruner(recorder)(query.clone(recurse=False))
     return recorder
@@ -222,7 +222,7 @@ def _own_instruction(policy: VLAPolicy) -> str:
 
 
 def _queries(policy: VLAPolicy, instruction: str) -> tuple[TensorDict, TensorDict]:
-    """Make the first two queries of an episode, [1]: noise for images, and the same with some patches drawn anew."""
+    """Make the first two policy calls of an episode, [1]: noise for images, and the same with some patches drawn again."""
     config, generator = policy.network.config, torch.Generator().manual_seed(0)
     size, rows = (1, 3, config.image_size, config.image_size), config.grid[0]
     first = TensorDict({keys.INSTRUCTION: [instruction]}, [1])

@@ -49,7 +49,7 @@ class Candidate:
         family: a chain that draws noise in its steps ("stochastic") or does not ("deterministic"), the policy's own chain with
             "rounded" weights, a "cached" schedule over a chain, or a learned "pruner".
         error: mean absolute difference of executed actions to demonstrated ones, normalised.
-        latency_s: of a query, interleaved with all others.
+        latency_s: of a policy call, interleaved with all others.
     """
 
     family: Family
@@ -110,7 +110,7 @@ class Acceleration:
         ranking: methods within the budget, the most promising first.
         chosen: the method that the saved policy runs.
         played: method -> what episodes said; empty where none were played.
-        budget_ms: of the 95th percentile of a query's latency; None for "faster than dense".
+        budget_ms: of the 95th percentile of a policy call's latency; None for "faster than dense".
     """
 
     acceleration: Literal[1]
@@ -163,12 +163,12 @@ def acceleration_note(acceleration: Acceleration) -> str:
         "the fastest that is no farther from demonstrations than dense, else the nearest",
     )
     if budget is not None:
-        allowed, first = f"within {budget:g} ms in 95 % of the queries", "the one of least error"
+        allowed, first = f"within {budget:g} ms in 95 % of the policy calls", "the one of least error"
     return (
         f"{verdict_line(acceleration)} {acceleration.task}: {len(acceleration.candidates) - 1} candidates, of which "
         f"{len(acceleration.ranking)} are {allowed}, in the order in which they would be played: of every family in turn "
         f"{first}. Error: of executed actions to those of {acceleration.windows} windows of demonstrations, normalised; "
-        "it agrees with success in part alone, so episodes have the last word. Latency of a query, all candidates "
+        "it agrees with success in part alone, so episodes have the last word. Latency of a policy call, all candidates "
         f"interleaved in one process, on {machine.cpu}, {threads_text(machine.threads)}, PyTorch {machine.torch}, "
         f"{machine.date}."
     )
@@ -179,7 +179,7 @@ def verdict_line(acceleration: Acceleration) -> str:
     name, played = acceleration.chosen, acceleration.played
     latency = acceleration.candidates[name].latency_s
     chosen = (
-        f"{name}: {milliseconds_text(latency.p50)} ms a query (95th percentile {milliseconds_text(latency.p95)} ms), "
+        f"{name}: {milliseconds_text(latency.p50)} ms a policy call (95th percentile {milliseconds_text(latency.p95)} ms), "
         f"{acceleration.speedup(name):.1f} times as fast as dense."
     )
     if name not in played:

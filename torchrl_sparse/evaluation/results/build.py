@@ -44,12 +44,12 @@ class MethodRun:
     Attributes:
         episodes: its episodes, the same seeds as every other method's, in any order; where benchmarks stop when they are
             decided, some of dense's.
-        latency: of one query, measured interleaved with the other methods.
+        latency: of one policy call, measured interleaved with the other methods.
         action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
             observations and the same noise; (0, 0) for the dense policy.
-        planning: of the planner alone, within a query; where it looks at the observation.
-        every: environment steps from one query to the next, of a method that says so itself.
-        executed_flops: of a query, that the engine really does; None where that is not counted.
+        planning: of the planner alone, within a call; where it looks at the observation.
+        every: environment steps from one call to the next, of a method that says so itself.
+        executed_flops: of a call, that the engine really does; None where that is not counted.
     """
 
     episodes: Sequence[EpisodeResult]
@@ -144,7 +144,7 @@ def build_results(
 
 def _entry(name: str, run: MethodRun, dense: MethodRun, terms: Terms, *, uneven: bool) -> MethodEntry:
     cost, tokens = totals(run.episodes), tokens_kept(run.episodes)
-    whole = uneven or tokens is not None  # a query does not say what an episode costs
+    whole = uneven or tokens is not None  # a policy call does not say what an episode costs
     return MethodEntry(
         success=Success.of([episode.success for episode in run.episodes]),
         **compare_episodes(name, run.episodes, dense.episodes, terms),

@@ -1,4 +1,4 @@
-"""``engine.json`` and its table: how fast each engine answers each kind of query."""
+"""``engine.json`` and its table: how fast each engine answers each kind of policy call."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ COLUMNS = ("variant", "p50, ms", "p10 – p90", "× eager", "× own dense", "max
 
 @dataclass(frozen=True)
 class EngineRow:
-    """One variant: a way of answering one kind of query. Seconds.
+    """One variant: a way of answering one kind of policy call. Seconds.
 
     Attributes:
-        p50_s, p10_s, p90_s: percentiles of ``n`` timed queries.
-        n: timed queries.
-        x_eager: how many times as fast as the dense query of the eager baseline, a ratio of medians.
-        x_dense: the same of the dense query of the same runner.
+        p50_s, p10_s, p90_s: percentiles of ``n`` timed calls.
+        n: timed calls.
+        x_eager: how many times as fast as the dense call of the eager baseline, a ratio of medians.
+        x_dense: the same of the dense call of the same runner.
         max_err: largest difference of a normalised action to the reference's, on the same noise and mask.
         limit_s: what reading the weights of all computed blocks takes, once per evaluation, at the shape's bandwidth.
         f32_limit_s: what multiplying with these weights takes, for every row that computes them, at the shape's rate of
@@ -74,13 +74,13 @@ class EngineShape:
 
     Attributes:
         threads: that were used.
-        batch: rows of a query.
+        batch: rows of a policy call.
         bandwidth_gb_per_s: at which one thread reads an array as large as a step's weights, again and again.
         f32_gflops_per_s: of PyTorch's product of two large matrices.
         rows: by the name of the variant, ``"<runner> <kind>"``.
         program_build_s: that the program of a new mask takes to build.
         all_pruned_step_s: of a step that computes nothing, by runner.
-        image_parts_s: of whole queries of an image policy: sampler -> part -> seconds, see `stage_seconds`; None
+        image_parts_s: of whole calls of an image policy: sampler -> part -> seconds, see `stage_seconds`; None
             elsewhere.
     """
 
@@ -165,7 +165,7 @@ def _all_weights(case: EngineCase) -> torch.Tensor:
 
 
 def _all_pruned_steps(case: EngineCase, rows: Mapping[str, EngineRow]) -> dict[str, float]:
-    """Return the seconds of a step that computes nothing, per runner: what all take beyond a query of one dense step."""
+    """Return the seconds of a step that computes nothing, per runner: what all take beyond a policy call of one dense step."""
     steps = case.queries["dense"].sampler.num_inference_steps
     runners = [name.split()[0] for name in rows if name.endswith(" all-pruned")]
     return {
@@ -197,12 +197,12 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape.all_pruned_step_s.items()]
     text = [head, table, f"A step that computes nothing takes {', '.join(steps)}."]
     if shape.image_parts_s:
-        text += ["Whole queries, cameras included.", markdown_table(image_part_rows(shape.image_parts_s))]
+        text += ["Whole policy calls, cameras included.", markdown_table(image_part_rows(shape.image_parts_s))]
     return "\n\n".join(text)
 
 
 def image_part_rows(parts_s: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
-    """Return one row of text per part of a whole query of images: its time and its share by sampler."""
+    """Return one row of text per part of a whole policy call of images: its time and its share by sampler."""
     rows = []
     for part in next(iter(parts_s.values())):
         row = {"part": part}

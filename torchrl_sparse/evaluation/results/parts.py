@@ -126,12 +126,12 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class Flops:
-    """FLOPs of a query, by the published count.
+    """FLOPs of a policy call, by the published count.
 
     Attributes:
         per_query: see `torchrl_sparse.blocks.mask`; with the planner's.
         ratio_to_dense: those over dense's.
-        executed: that the engine really does, mean over queries of dense episodes; None in older files and of VLAs.
+        executed: that the engine really does, mean over calls of dense episodes; None in older files and of VLAs.
     """
 
     per_query: float
@@ -146,7 +146,7 @@ class Flops:
 
 @dataclass(frozen=True)
 class EpisodeCost:
-    """What an episode costs, mean over episodes. A method that saves of a query may lose it again in longer episodes.
+    """What an episode costs, mean over episodes. A method that saves of a policy call may lose it again in longer episodes.
 
     Attributes:
         queries: calls of the policy.
@@ -154,7 +154,7 @@ class EpisodeCost:
         flops_to_dense: those over dense's.
         flops_per_step: of an environment step, mean; times the control frequency, those of a second of motion.
         flops_per_step_to_dense: those over dense's.
-        seconds: of all queries, each as long as the mean of those that were timed.
+        seconds: of all calls, each as long as the mean of those that were timed.
         seconds_to_dense: those over dense's.
     """
 

@@ -1,4 +1,4 @@
-"""``query.json``: what a query's time goes to, what more threads make of it, and how late the latest of many come."""
+"""``query.json``: what a policy call's time goes to, what more threads make of it, and how late the latest of many come."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class QueryProfile:
         machine: that was measured on.
         sampler: name of the sampler.
         parts_s: ``"query"`` and the parts that it is made of, medians; see `call_parts`.
-        threads_s: name of a sampler -> number of threads, as text -> median of an unpruned query.
+        threads_s: name of a sampler -> number of threads, as text -> median of an unpruned policy call.
         tails_s: ``"Python"``, and ``"C"`` if the exported policy was asked too -> ``"p50"``, ``"p99"``, ``"p99.9"`` and
             ``"max"`` of ``queries``.
         queries: of each that were timed for the tail, in turns.
@@ -53,11 +53,11 @@ def format_query_profile(found: QueryProfile) -> str:
     )
     return "\n\n".join(
         [
-            f"A query, {found.sampler}: {whole}.",
+            f"A policy call, {found.sampler}: {whole}.",
             markdown_table(tables["parts"]),
-            "Queries by number of threads, milliseconds.",
+            "Policy calls by number of threads, milliseconds.",
             markdown_table(tables["threads"]),
-            f"{found.queries} queries, {_pace_text(found)}.",
+            f"{found.queries} policy calls, {_pace_text(found)}.",
             markdown_table(tables["tails"]),
         ]
     )

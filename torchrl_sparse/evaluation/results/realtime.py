@@ -107,7 +107,7 @@ class RealtimeRun:
     episodes: Mapping[int, Sequence[EpisodeResult]]
 
     def own_delay(self, control_freq: float) -> int:
-        """Count the steps that the world makes in a query."""
+        """Count the steps that the world makes in a policy call."""
         return int(delay_steps(torch.tensor(self.own_latency), control_freq))
 
 
@@ -223,7 +223,7 @@ def format_realtime(results: Realtime) -> str:
 def realtime_note(results: Realtime) -> str:
     """Return the lines that explain the table."""
     machine = results.machine
-    every = f"a query every {results.n_action_steps} steps, or as soon as the last one is answered"
+    every = f"a policy call every {results.n_action_steps} steps, or as soon as the last one is answered"
     return (
         f"{results.task}, {results.control_freq:g} Hz; {every}; the world goes on meanwhile. Success with Wilson's "
         "95 % interval, difference to dense with Tango's: at a method's own latency to dense at dense's own, else at the "

@@ -143,7 +143,7 @@ def results_note(results: Results) -> str:
         compared = "score, the highest reward of an episode, and its difference to dense with Student's; verdicts are on it"
     steps, flops = f"{policy.num_inference_steps} denoising steps", "planner and denoiser, as published"
     if dense.flops.executed is not None:
-        flops += ", and what the engine executes of it, having folded what a query repeats"
+        flops += ", and what the engine executes of it, having folded what a policy call repeats"
     if dense.tokens:
         steps, flops = f"chunks of {policy.horizon} actions", "whole network"
     lines = [
@@ -157,17 +157,17 @@ def results_note(results: Results) -> str:
         f"{num_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
         "correction for them.",
         f"Dense: {policy.params:,} parameters, {steps}. FLOPs are "
-        f"2·MAC of a query, {flops}. Latency of a query, all methods interleaved in one process, on "
+        f"2·MAC of a policy call, {flops}. Latency of a call, all methods interleaved in one process, on "
         f"{machine.cpu}, {machine.device}, {threads_text(machine.threads)}, torch {machine.torch}, "
         f"{machine.date[:10]}.",
     ]
     if any(method.per_episode for method in results.methods.values()):
         lines.append(
-            "FLOPs ratio is that of a query; beside it that of *an episode*, whose length methods change, and of *a second* of "
-            "motion. Queries are those of an episode, *time, an episode* the seconds that all of them take, over dense's."
+            "FLOPs ratio is that of a call; beside it that of *an episode*, whose length methods change, and of *a second* of "
+            "motion. Policy calls are those of an episode, *time, an episode* the seconds that all of them take, over dense's."
         )
     if planning := ", ".join(_planning(results.methods)):
-        lines.append(f"Planning takes, of that and measured within queries, {planning}.")
+        lines.append(f"Planning takes, of that and measured within policy calls, {planning}.")
     if n < episodes_needed(margin):
         lines.append(
             f"{n} episodes cannot show non-inferiority at this margin even without one differing episode: "
@@ -206,7 +206,7 @@ def _time_line(results: Results) -> str:
 
 
 def _planning(methods: Mapping[str, MethodEntry]) -> Iterator[str]:
-    """Yield what each planner that looks at the observation takes, and its share of a query."""
+    """Yield what each planner that looks at the observation takes, and its share of a policy call."""
     for name, method in methods.items():
         if method.planning_s:
             seconds = method.planning_s.p50

@@ -1,7 +1,7 @@
 """``results.json``: the only source of every table and figure.
 
-The dataclasses are the schema, and `load_results` refuses everything else. Seconds are those of a query; FLOPs are 2 * MAC of a
-query, of the denoiser alone or of a whole vision-language-action model.
+The dataclasses are the schema, and `load_results` refuses everything else. Seconds are those of a policy call; FLOPs are 2 *
+MAC of a call, of the denoiser alone or of a whole vision-language-action model.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class MethodEntry:
         success: of its episodes.
         paired_vs_dense: their difference to the dense policy's.
         prune_rate: pruned share of the blocks, or of the visual tokens.
-        flops: of a query.
-        latency_s: of a query, measured interleaved with the other methods.
+        flops: of a policy call.
+        latency_s: of a call, measured interleaved with the other methods.
         speedup_vs_dense: ratio of the medians.
         action_error_vs_dense: of its actions.
         episode_length: mean, environment steps.
-        planning_s: part of a query in which the planner decides; where it looks at the observation.
+        planning_s: part of a call in which the planner decides; where it looks at the observation.
         tokens: that it keeps; of policies with visual tokens.
         restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
         time_vs_dense: its ratio to the dense policy's.
@@ -72,7 +72,7 @@ class MethodEntry:
         p_values: of the two verdicts; None of dense.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement; None in older files.
         score: of a task that is done by degrees; its verdict is the one that counts there.
-        per_episode: what an episode costs; of policies with visual tokens, whose queries differ, or where methods are asked
+        per_episode: what an episode costs; of policies with visual tokens, whose calls differ, or where methods are asked
             unequally often.
     """
 

@@ -29,7 +29,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class VLAShape:
-    """The model: its name, weights, the tokens of a query and those of them that are visual, and its configuration."""
+    """The model: its name, weights, the tokens of a policy call and those of them that are visual, and its configuration."""
 
     name: str
     dtype: str
@@ -52,7 +52,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Helper:
-    """Work of a pruner beside the network: seconds, and the share of its method's query."""
+    """Work of a pruner beside the network: seconds, and the share of its method's policy call."""
 
     p50_s: float
     share: float
@@ -63,9 +63,9 @@ class VLAMethod:
     """One method. Seconds; FLOPs are 2 * MAC.
 
     Attributes:
-        p50_s, p10_s, p90_s: percentiles of ``n`` timed queries.
-        n: timed queries.
-        flops: of a query.
+        p50_s, p10_s, p90_s: percentiles of ``n`` timed policy calls.
+        n: timed calls.
+        flops: of a call.
         kept: visual tokens in a decoder layer, mean over the layers.
         tokens_per_layer: visual tokens in each.
         flops_speedup: dense FLOPs over the method's.
@@ -121,7 +121,7 @@ def load_vla_results(path: str | os.PathLike) -> VLALatency:
 
 
 def format_vla_table(results: VLALatency) -> str:
-    """Return the parts of a dense query and the methods, as two tables in Markdown."""
+    """Return the parts of a dense policy call and the methods, as two tables in Markdown."""
     shape, machine = results.shape, results.machine
     about = (
         f"{shape.name}: {shape.parameters:,} parameters, {shape.dtype}, {shape.tokens} tokens, "
@@ -134,7 +134,7 @@ def format_vla_table(results: VLALatency) -> str:
 def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
     """Return the rows of the table of parts: column -> text."""
     return [
-        {"part of a dense query": name, "p50, ms": f"{1e3 * part.p50_s:.2f}", "share": f"{part.share:.1%}"}
+        {"part of a dense policy call": name, "p50, ms": f"{1e3 * part.p50_s:.2f}", "share": f"{part.share:.1%}"}
         for name, part in results.parts.items()
     ]
 

@@ -32,17 +32,17 @@ class EpisodeResult:
     """One finished episode.
 
     Attributes:
-        seed: the episode's seed; it fixes the initial state and, with the step, all noise of every query.
+        seed: the episode's seed; it fixes the initial state and, with the step, all noise of every policy call.
         success: whether the task's predicate held at any step.
         length: environment steps.
         queries: calls of the policy.
-        flops_total: FLOPs (2 * MAC) of all queries together, as `torchrl_sparse.keys.FLOPS` counts them.
-        prune_rate: pruned share of the blocks, or of the visual tokens, mean over all queries, in [0, 1].
-        latency: seconds of each query as the policy reported it. A batched call reports its duration for
+        flops_total: FLOPs (2 * MAC) of all calls together, as `torchrl_sparse.keys.FLOPS` counts them.
+        prune_rate: pruned share of the blocks, or of the visual tokens, mean over all calls, in [0, 1].
+        latency: seconds of each call as the policy reported it. A batched call reports its duration for
             every row, so these describe the rollout; the figures of a table come from
             :func:`measure_latency`.
-        kept: visual tokens in a decoder layer, mean over the layers, of each query; empty for a policy without them.
-        fine: whether each query was made in the controller's fine mode; empty without a controller.
+        kept: visual tokens in a decoder layer, mean over the layers, of each call; empty for a policy without them.
+        fine: whether each call was made in the controller's fine mode; empty without a controller.
         score: highest reward of a step. Published results on Push-T are means of it.
         completed: parts of the task that were done, None for a task that counts none.
         way: which of its ways the task was done, None for a task that does not tell; -1 if none showed, -2 if
@@ -65,13 +65,13 @@ class EpisodeResult:
 
 @dataclass(frozen=True)
 class Totals:
-    """Cost of several episodes: per query where a query is what costs, per episode where the episode does.
+    """Cost of several episodes: per policy call where a call is what costs, per episode where the episode does.
 
     Attributes:
         flops_per_query: FLOPs (2 * MAC).
-        prune_rate: mean over queries, in [0, 1].
+        prune_rate: mean over calls, in [0, 1].
         episode_length: mean environment steps.
-        queries: number of queries.
+        queries: number of calls.
     """
 
     flops_per_query: float
@@ -82,9 +82,9 @@ class Totals:
 
 @dataclass(frozen=True)
 class TokensKept:
-    """Visual tokens in a decoder layer, mean over layers and queries: of all queries, of those in fine mode, and of the others.
+    """Visual tokens in a decoder layer, mean over layers and queries: of all calls, of those in fine mode, and of the others.
 
-    The last two are None where there was no such query, as without a controller.
+    The last two are None where there was no such call, as without a controller.
     """
 
     kept_mean: float
@@ -93,10 +93,10 @@ class TokensKept:
 
 
 def totals(episodes: Sequence[EpisodeResult]) -> Totals:
-    """Average episodes, every query counting the same.
+    """Average episodes, every policy call counting the same.
 
     Raises:
-        ValueError: if there are no episodes or no query.
+        ValueError: if there are no episodes or no call.
 
     >>> totals([EpisodeResult(0, True, 8, 1, 10.0, 0.5), EpisodeResult(1, True, 24, 3, 90.0, 0.9)])
     Totals(flops_per_query=25.0, prune_rate=0.8, episode_length=16.0, queries=4)
@@ -115,7 +115,7 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
 
 
 def tokens_kept(episodes: Sequence[EpisodeResult]) -> TokensKept | None:
-    """Average the visual tokens of episodes, every query counting the same; None for a policy without them.
+    """Average the visual tokens of episodes, every policy call counting the same; None for a policy without them.
 
     >>> tokens_kept([EpisodeResult(0, True, 8, 2, 10.0, 0.5, kept=(90.0, 30.0), fine=(True, False))])
     TokensKept(kept_mean=60.0, kept_fine=90.0, kept_coarse=30.0)

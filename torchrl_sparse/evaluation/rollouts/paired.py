@@ -1,6 +1,6 @@
 """Paired rollouts: every method on the same initial states and the same noise.
 
-An episode is fixed by its seed, and the noise of a query by (episode seed, episode step). So methods are
+An episode is fixed by its seed, and the noise of a policy call by (episode seed, episode step). So methods are
 paired by running each on the same seeds, in whatever order, number of environments or number of restarts.
 """
 
@@ -164,7 +164,7 @@ def _episodes(
             failures += 1
             if failures == _FAILURES:
                 raise RunFailed(f"{death}, {failures} times without an episode finished between") from death
-            warnings.warn(f"{death}; {len(pending)} episodes are run anew", RuntimeWarning, stacklevel=3)
+            warnings.warn(f"{death}; {len(pending)} episodes are run again", RuntimeWarning, stacklevel=3)
 
 
 def _finished(collector: BaseCollector, pending: set[int]) -> Iterator[EpisodeResult]:
@@ -247,7 +247,7 @@ def _count(row: TensorDictBase, key: NestedKey) -> int | None:
 
 
 def _prune_rate(row: TensorDictBase) -> float:
-    """Return the pruned share of a query's blocks or, where there are visual tokens, of those; else 0."""
+    """Return the pruned share of a policy call's blocks or, where there are visual tokens, of those; else 0."""
     if (mask := row.get(keys.PRUNE_MASK, None)) is not None:
         return float(mask.float().mean())
     if (kept := row.get(keys.KEPT, None)) is not None:

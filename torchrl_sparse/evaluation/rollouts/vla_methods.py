@@ -59,11 +59,11 @@ def matching_share(
     *,
     most: float = 1.0,
 ) -> float:
-    """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all queries.
+    """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all policy calls.
 
     Args:
         make: called with a share in (0, 1]; more of it keeps more.
-        episodes: their queries, as `recorded_queries` yields them.
+        episodes: their calls, as `recorded_queries` yields them.
         kept: that many.
         most: the largest share that is tried.
 
@@ -89,7 +89,7 @@ def matching_share(
 
 @torch.no_grad()
 def prepared_queries(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-    """Return an episode's queries, each [], with what the policy remembers of the one before: each can be asked by itself."""
+    """Return an episode's calls, each [], with what the policy remembers of the one before: each can be asked by itself."""
     remembered = [key for key in policy.out_keys if key in policy.in_keys]
     left = replay(policy, queries, policy.pruner).select(*remembered)[:-1]
     first, *others = (query.exclude(*remembered) for query in queries)

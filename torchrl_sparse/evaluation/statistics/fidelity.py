@@ -1,4 +1,4 @@
-"""Errors of a sparse query to the dense one, on the same observation and the same noise."""
+"""Errors of a sparse policy call to the dense one, on the same observation and the same noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 
 __all__ = ["action_error", "block_errors", "relative_error"]
 
-_AT_ONCE = 8  # queries whose features are held at once: 25 MB each, of the published models
+_AT_ONCE = 8  # policy calls whose features are held at once: 25 MB each, of the published models
 
 
 def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:

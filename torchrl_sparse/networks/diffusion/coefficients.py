@@ -29,11 +29,11 @@ __all__ = ["Guide", "StepCoefficients", "squared_cosine", "step_coefficients"]
 
 
 class Guide(NamedTuple):
-    """Actions that a query's clean predictions are drawn to in every step, so that the others are denoised to fit them.
+    """Actions that a call's clean predictions are guided toward in every step, so that the others are denoised to fit them.
 
     Attributes:
         actions: normalised, f32 [B, H, A].
-        pull: f32 [B, H, 1], how far each is drawn: 0 leaves it free, at 1 the query ends in ``actions``.
+        pull: f32 [B, H, 1], how far each is drawn: 0 leaves it free, at 1 the call ends in ``actions``.
     """
 
     actions: Tensor
@@ -99,7 +99,7 @@ class StepCoefficients:
             sample, eps: of one shape.
             gaussian: standard normal of the same shape; None where :meth:`reads_noise` is False.
             cleans: clipped predictions of the steps before, the latest first; those of weight 0 may be missing.
-            guide: what the clean prediction is drawn to.
+            guide: what the clean prediction is guided toward.
         """
         clean = self.clean(step, sample, eps, guide)
         result = self.clean_weight[step] * clean + self.sample_weight[step] * sample

@@ -1,4 +1,4 @@
-"""All randomness of a query follows from one integer, so that two methods can be run on the same noise."""
+"""All randomness of a policy call follows from one integer, so that two methods can be run on the same noise."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def query_seed(episode_seed: Tensor, episode_step: Tensor, stream: int = 0) -> T
 
 
 def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
-    """Draw the noise of B queries, f32 [B, num_steps, H, A], row i from ``seed[i]`` alone.
+    """Draw the noise of B policy calls, f32 [B, num_steps, H, A], row i from ``seed[i]`` alone.
 
     Entry 0 is the initial sample, whatever ``num_steps``: a ten-step and a hundred-step sampler start from the same point,
     and so they are paired. The gaussians of the transitions follow in one stream, entry k of a short chain being entry k

@@ -1,6 +1,6 @@
 """The cameras' encoder as a CPU computes it fastest: the same layers on weights that oneDNN has laid out once.
 
-A few frames are little work for 22 million weights, and PyTorch lays each convolution's weights out anew in every call. Here
+A few frames are little work for 22 million weights, and PyTorch lays each convolution's weights out again in every call. Here
 that is done when the encoder is packed, and activations stay in the order that those weights are for (channels last). They can
 also be rounded to bfloat16, weights and activations, which changes the features and is faster still where the processor
 multiplies bfloat16.

@@ -38,7 +38,7 @@ _LN2, _SQRT_HALF, _LOG_TERMS = 0.6931471805599453, 0.7071067811865476, 10
 
 
 def philox_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
-    """Draw the noise of B queries, f32 [B, num_steps, H, A]: entry k of a seed is the same whatever ``num_steps``.
+    """Draw the noise of B policy calls, f32 [B, num_steps, H, A]: entry k of a seed is the same whatever ``num_steps``.
 
     Args:
         seed: i64 [B].

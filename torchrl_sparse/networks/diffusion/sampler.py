@@ -52,14 +52,14 @@ _MAX_CLIP = 1e6
 
 
 class Sampler:
-    """The denoising steps of one query, in execution order, and the noising of training.
+    """The denoising steps of one policy call, in execution order, and the noising of training.
 
     The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
-    noise of a query. A sampler cannot be changed: engines keep tables of its steps.
+    noise of a call. A sampler cannot be changed: engines keep tables of its steps.
 
     Args:
         kind: ``"ddpm"``, ``"ddim"``, ``"dpmpp2m"``, ``"sde2m"`` or ``"unipc"``, see the module.
-        num_inference_steps: denoising steps K of a query, 1 to ``num_train_timesteps``; None for one per entry of
+        num_inference_steps: denoising steps K of a call, 1 to ``num_train_timesteps``; None for one per entry of
             ``timesteps``, or without those for all training steps.
         num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
         timesteps: K falling diffusion timesteps, where no spacing shall decide.
@@ -207,7 +207,7 @@ class Sampler:
     def last_steps(self, number: int) -> Sampler:
         """Return the sampler of the last steps alone, 1 to K; each has the coefficients that it has here.
 
-        Those of solvers that remember earlier steps begin anew: their first step is of first order.
+        Those of solvers that remember earlier steps begin again: their first step is of first order.
 
         >>> Sampler("ddpm", timesteps=[82, 41, 14]).last_steps(2).name
         'ddpm_41_14'
@@ -256,7 +256,7 @@ class Sampler:
             noise_k: standard normal [B, H, A] of the transition from step ``k`` to ``k + 1``; not read by
                 deterministic samplers nor by the last step.
             cleans: what :meth:`remember` returned after the step before; empty before the first.
-            guide: what the clean prediction is drawn to, see `Guide`.
+            guide: what the clean prediction is guided toward, see `Guide`.
 
         Raises:
             IndexError: if ``k`` is not in 0..K-1.

@@ -31,7 +31,7 @@ class Decoded:
         lengths: i64 [B], alive tokens of each row.
         tokens: i64 [B, L], tokens on which each layer ran; 0 where it was skipped.
         depth: i64 [B, N], layers that ran on each visual token.
-        scored: i64 [B], query-key pairs of all scores, rows times tokens.
+        scored: i64 [B], policy call-key pairs of all scores, rows times tokens.
         visual: [B, N, d], the visual tokens that the decoder was given; None where the network does not add them.
     """
 

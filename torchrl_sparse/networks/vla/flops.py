@@ -63,7 +63,7 @@ def fixed_flops(config: VLAConfig) -> dict[str, float]:
 
 
 def query_flops(config: VLAConfig, tokens: Tensor, scored: Tensor) -> Tensor:
-    """Return the FLOPs f32 [B] of whole queries, the scores that hooks ask for included.
+    """Return the FLOPs f32 [B] of whole policy calls, the scores that hooks ask for included.
 
     Args:
         config: sizes.

@@ -93,7 +93,7 @@ class LayerState:
         kind: i64 [B, S], `TokenKind`.
         task: bool [B, S]; the words of the instruction itself, without the prompt around them.
         num_visual: N.
-        td: the query, [B].
+        td: the policy call, [B].
         scores: f32 [B, N], indexed by visual token id: attention of the rows from `LayerHooks.score_rows` to each visual
             token, mean over heads and over those rows (SpecPrune-VLA, arXiv:2509.05614, Eq. 1); 0 for tokens that are gone.
             None where the layer is not scored, and in `score_rows`.

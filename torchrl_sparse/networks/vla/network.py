@@ -68,7 +68,7 @@ class VLANetwork(nn.Module):
             prompts: tokenised prompts of the B samples.
             keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
             hooks: called around each layer of the decoder; None is dense.
-            td: the query that ``hooks`` are shown, [B].
+            td: the policy call that ``hooks`` are shown, [B].
         """
         td = TensorDict({}, [len(images)], device=images.device) if td is None else td
         visual = self.visual_tokens(images)

@@ -16,7 +16,7 @@ __all__ = ["CameraSlot"]
 
 
 class CameraSlot:
-    """Holds what computes the features of the cameras: made when it is first needed, and anew when weights change.
+    """Holds what computes the features of the cameras: made when it is first needed, and again when weights change.
 
     Copies and pickles carry nothing.
     """
@@ -53,7 +53,7 @@ class CameraSlot:
         return packed
 
     def refresh(self) -> None:
-        """Pack the weights anew in the next query."""
+        """Pack the weights again in the next policy call."""
         self._made = {}
 
     def __getstate__(self) -> dict[str, Any]:

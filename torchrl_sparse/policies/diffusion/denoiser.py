@@ -39,8 +39,8 @@ class ActionDenoiser(TensorDictModuleBase):
     """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost.
 
     Attributes:
-        warm: whether queries say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
-        guided: whether they say what they are drawn to, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
+        warm: whether policy calls say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
+        guided: whether they say what they are guided toward, see :mod:`torchrl_sparse.policies.diffusion.realtime_chunking`.
         planning_flops: of the planner, which are counted with the loop's.
         reuse: what a pruned block adds, as the planner that wrote the mask has it.
     """
@@ -85,12 +85,12 @@ class ActionDenoiser(TensorDictModuleBase):
         return plan.reuse
 
     def follow(self, plan: Planner) -> None:
-        """Take the reuse rule, and the FLOPs of deciding, of the planner that writes the masks from the next query on."""
+        """Take the reuse rule, and the FLOPs of deciding, of the planner that writes the masks from the next policy call on."""
         self._plan = (plan,)  # in a tuple, since the planner is a stage of its own and no part of this one
         self.planning_flops = plan.flops
 
     def choose(self, engine: EngineName) -> None:
-        """Take another engine from the next query on; ValueError as `check_engine`."""
+        """Take another engine from the next policy call on; ValueError as `check_engine`."""
         check_engine(engine)
         self.engine = EngineSlot(engine)
 
@@ -99,7 +99,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return self.engine.describe(self.network, self.sampler)
 
     def current_engine(self) -> Engine:
-        """Return the engine that queries run in now."""
+        """Return the engine that policy calls run in now."""
         return self.engine.get(self.network, self.sampler)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,7 +121,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
 
     def static_flops(self, mask: Tensor) -> float:
-        """Count the FLOPs of a query under a planner's mask [K, 3L], once: the planner never writes to it."""
+        """Count the FLOPs of a policy call under a planner's mask [K, 3L], once: the planner never writes to it."""
         known, flops = self._counted  # read and replaced in one go: other threads may do the same
         if known is not mask:
             flops = mask_flops(NetworkSizes.of(self.network), mask).item() + self.planning_flops
@@ -137,7 +137,7 @@ class ActionDenoiser(TensorDictModuleBase):
         start: Tensor | None = None,
         num_steps: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return normalised actions [B, H, A] and FLOPs [B] of queries, each with as many steps as it takes."""
+        """Return normalised actions [B, H, A] and FLOPs [B] of policy calls, each with as many steps as it takes."""
         whole, sizes = self.sampler.num_inference_steps, NetworkSizes.of(self.network)
         steps = None if num_steps is None else num_steps.flatten()
         numbers = [whole] if steps is None else sorted(set(steps.tolist()))
@@ -182,7 +182,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse, guide)
 
     def refresh(self) -> None:
-        """Read all weights anew in the next query."""
+        """Read all weights again in the next policy call."""
         self.engine.refresh()
         self._tails.clear()
 

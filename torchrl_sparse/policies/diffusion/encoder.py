@@ -31,7 +31,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
     Attributes:
         bf16: whether the cameras' encoder rounds to bfloat16 in use; False unless another is assigned.
         in_keys: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
-            u8 [*B, To, 3, h, w] of each camera; with cameras, also what the query before left of them,
+            u8 [*B, To, 3, h, w] of each camera; with cameras, also what the policy call before left of them,
             ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there.
     """
 
@@ -71,11 +71,11 @@ class ConditionEncoder(TensorKeys, nn.Module):
     def _features(
         self, tensordict: TensorDictBase, images: dict[str, Tensor], encode: Callable[..., Tensor]
     ) -> Tensor:
-        """Return the features of the frames, [*B, To, F]; those that the query before has encoded are taken from it."""
+        """Return the features of the frames, [*B, To, F]; those that the policy call before has encoded are taken from it."""
         known, elapsed = tensordict.get(keys.FRAME_FEATURES, None), tensordict.get(keys.ELAPSED, None)
         if known is None or elapsed is None or self.training:
             return encode(images)
-        # Where each frame lay in the history of the query before.
+        # Where each frame lay in the history of the policy call before.
         place = torch.arange(known.shape[-2], device=known.device) + elapsed
         fresh = (elapsed == 0) | (place >= known.shape[-2])
         if fresh.all():
@@ -86,7 +86,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
 
 
 class ObservationEncoder(TensorDictModuleBase):
-    """Writes the denoiser's condition, and the seed of the query's noise.
+    """Writes the denoiser's condition, and the seed of the policy call's noise.
 
     Args:
         network: the denoiser, for the sizes.
@@ -138,7 +138,7 @@ class ObservationEncoder(TensorDictModuleBase):
         self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
 
     def refresh(self) -> None:
-        """Read the cameras' weights anew in the next query."""
+        """Read the cameras' weights again in the next policy call."""
         self.condition.cameras.refresh()
 
     def _check(self, state: Tensor) -> None:
@@ -157,7 +157,7 @@ class ObservationEncoder(TensorDictModuleBase):
             raise InputError(f"{key}: expected finite numbers, got {state[tuple(bad)]} at {bad}")
 
     def seed(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the seed of each query's noise, i64 [*B, 1]."""
+        """Return the seed of each policy call's noise, i64 [*B, 1]."""
         seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
         if seed is None or step is None:
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)

@@ -61,7 +61,7 @@ def export_policy(
     if (vision := encode.condition.vision) is not None:
         raise InputError(f"export: expected a policy of states, got cameras {list(vision.cameras)}")
     if start.name:
-        raise InputError(f"start: expected queries that begin from noise, got {start.name}")
+        raise InputError(f"start: expected policy calls that begin from noise, got {start.name}")
     supported, reason = native_supports(network)
     if not supported:
         raise InputError(f"export: {reason}")

@@ -30,7 +30,8 @@ class FreezablePolicy(PolicySizes, TensorDictSequential):
 
         A write is an error, never an old answer: an optimiser's step, ``load_state_dict``, ``.data``, a move, a
         parameter or module exchanged for another, also in policies that share the networks, as `with_plan` makes them. Weights
-        move in memory, so that what shared theirs before does no longer; a write to that is an error of the next query. Not
+        move in memory, so that what shared theirs before does no longer; a write to that is an error of the next policy call.
+        Not
         seen are writes around PyTorch: to a storage, or to an address. Plan, sampler, start, engine and noise may change.
 
         ``copy.deepcopy(policy)``, a pickle, a worker of a collector and a saved policy are not frozen: freeze them again.

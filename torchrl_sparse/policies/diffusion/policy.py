@@ -44,7 +44,7 @@ from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_pol
 class DiffusionPolicy(FreezablePolicy):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
-    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a query
+    Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a call
     follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them (`RobosuiteEnv` does),
     else from torch's global generator. Writes the chunk, from the present step on, all that a table needs: see ``out_keys``.
 
@@ -207,13 +207,13 @@ class DiffusionPolicy(FreezablePolicy):
         return engine_block_costs(self.module["denoise"].current_engine())
 
     def refresh(self) -> None:
-        """Read all weights anew in the next query, after writes to them that `Engine` says it does not see."""
+        """Read all weights again in the next policy call, after writes to them that `Engine` says it does not see."""
         self.module["denoise"].refresh()
         self.module["encode"].refresh()
         self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
 
     def sample_noise(self, seed: Tensor) -> Tensor:
-        """Draw all noise, f32 [B, K, H, A], of the queries with ``seed``, i64 [B]."""
+        """Draw all noise, f32 [B, K, H, A], of the policy calls with ``seed``, i64 [B]."""
         return NOISES[self.noise](seed, self.num_inference_steps, (self.horizon, self.network.input_dim))
 
     def denoise(

@@ -1,4 +1,4 @@
-"""Queries that are drawn to what is played while they are answered, so that two chunks meet where one takes over.
+"""Policy calls that are guided toward what is played while they are answered, so that two chunks meet where one takes over.
 
 In a world that does not wait, the first d actions of a new chunk come too late: the old chunk's are played instead. A new
 chunk that knows nothing of them may go on from somewhere else. Real-time chunking (RTC, arXiv:2506.07339) has every
@@ -32,7 +32,7 @@ __all__ = ["RealtimeChunking", "chunk_pull"]
 
 
 def chunk_pull(delay: Tensor, left: Tensor, length: int) -> Tensor:
-    """Return f32 [B, length], how far the actions of a new chunk are drawn to those of the old one: RTC's Eq. 5.
+    """Return f32 [B, length], how far the actions of a new chunk are guided toward those of the old one: RTC's Eq. 5.
 
     Args:
         delay: i64 [B, 1], d, actions that are played before the new chunk takes over.
@@ -48,13 +48,13 @@ def chunk_pull(delay: Tensor, left: Tensor, length: int) -> Tensor:
 
 
 class RealtimeChunking(ColdStart):
-    """Has queries go on from the last chunk, see the module; ``policy.start = RealtimeChunking()`` is all that it takes.
+    """Has policy calls go on from the last chunk, see the module; ``policy.start = RealtimeChunking()`` is all that it takes.
 
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands
     to a policy that asks for them; `ChunkExecutor`, whose world waits, hands over no delay, which is one of 0. The first
-    query of an episode, and queries that come without these keys, are drawn to nothing.
+    call of an episode, and calls that come without these keys, are guided toward nothing.
 
-    A chunk must reach further than from one query to the end of the next: where nothing of it is left, nothing is wished for.
+    A chunk must reach further than from one call to the end of the next: where nothing of it is left, nothing is wished for.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -1,7 +1,7 @@
-"""A whole query in two calls of compiled code, where nothing between its state and its chunk is asked for.
+"""A whole policy call in two calls of compiled code, where nothing between its state and its chunk is asked for.
 
-Stages that only move tensors cost as much as a denoising step: after a query, the caches have lost what Python and PyTorch
-run on, and each operation has to fetch it anew. So where the stages are those of the library, the state is all that the
+Stages that only move tensors cost as much as a denoising step: after a call, the caches have lost what Python and PyTorch
+run on, and each operation has to fetch it again. So where the stages are those of the library, the state is all that the
 policy reads and the mask is known, the native engine takes the state and gives the condition, all other keys are written, and
 then it gives the chunk. The keys are the same, and so is every bit of them.
 """
@@ -30,7 +30,7 @@ __all__ = ["Parts", "answer_directly"]
 
 
 class Parts:
-    """What is read of the stages that stay, in every query anew or, of a frozen policy, once.
+    """What is read of the stages that stay, in every policy call again or, of a frozen policy, once.
 
     Copies and pickles of it are None: those of a frozen policy are not frozen.
 
@@ -80,7 +80,7 @@ def answer_directly(
     """Write what the four stages would, or return False and leave everything as it is where they have to run themselves.
 
     Args:
-        began: when the query began, as ``time.perf_counter`` has it; its latency is written, too.
+        began: when the policy call began, as ``time.perf_counter`` has it; its latency is written, too.
         parts: those of a frozen policy.
     """
     # A plain TensorDict keeps the tensor that it is given, which can then be filled.

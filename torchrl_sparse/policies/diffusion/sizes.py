@@ -39,7 +39,7 @@ class PolicySizes:
 
     @property
     def device(self) -> torch.device:
-        """Where the networks are, and queries and their noise must be; ``policy.to("cuda")`` moves it."""
+        """Where the networks are, and policy calls and their noise must be; ``policy.to("cuda")`` moves it."""
         return self.network.pos_emb.device
 
     @property
@@ -82,7 +82,7 @@ class PolicySizes:
             ('history', 'proprio')
         """
         self.module["encode"].condition.set_keys(**names)
-        self.sampler = self.sampler  # which lists the keys anew
+        self.sampler = self.sampler  # which lists the keys again
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
         """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""

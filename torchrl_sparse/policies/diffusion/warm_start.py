@@ -1,4 +1,4 @@
-"""Queries that begin from the last chunk instead of from noise, so that one or two network calls are enough.
+"""Policy calls that begin from the last chunk instead of from noise, so that one or two network calls are enough.
 
 Most of what a policy is asked for it has planned before: the actions of the last chunk for the steps that are still to
 come. A warm start shifts that chunk to the present step, noises it to the timestep of one of the sampler's last steps,
@@ -8,9 +8,9 @@ and denoises from there (SDEdit, arXiv:2108.01073, along an episode)::
     sample  = sqrt(abar_t) guess + sqrt(1 - abar_t) gaussian          t = timesteps[K - n]
     actions = the sampler's last n steps from sample
 
-Nothing is trained and the equations are the sampler's own, from its own table. The first query of an episode has no last
+Nothing is trained and the equations are the sampler's own, from its own table. The first call of an episode has no last
 chunk and takes all K steps. RTI-DP (arXiv:2508.05396) and Falcon (arXiv:2503.00339) begin from earlier results too, with
-other rules for how far back: Falcon keeps the noisy samples of earlier queries and chooses among their noise levels by a
+other rules for how far back: Falcon keeps the noisy samples of earlier calls and chooses among their noise levels by a
 distance, RTI-DP begins from the shifted solution at a fixed level and rescales what is discrete.
 
 How much of a guess is known decides what this is worth. Published horizons leave little: of ten actions that begin one
@@ -53,12 +53,12 @@ def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
 
 
 class ColdStart(TensorDictModuleBase):
-    """Has every query begin from noise: it reads and writes nothing.
+    """Has every policy call begin from noise: it reads and writes nothing.
 
     A stage of one's own subclasses it, reads what it likes, and writes ``("diffusion", "start")`` f32 [*B, H, A], a
     normalised guess of the actions, and ``("diffusion", "num_steps")`` i64 [*B, 1], how many of the sampler's last steps
     to take from there; K begins from noise. Or ``("diffusion", "known")`` f32 [*B, H, A] and ``("diffusion", "pull")``
-    f32 [*B, H, 1], normalised actions that every step is drawn to, and how far.
+    f32 [*B, H, 1], normalised actions that every step is guided toward, and how far.
     """
 
     in_keys: list[NestedKey] = []
@@ -73,7 +73,7 @@ class ColdStart(TensorDictModuleBase):
 
     @property
     def name(self) -> str:
-        """What it is, for people and logs; empty where queries begin from noise."""
+        """What it is, for people and logs; empty where policy calls begin from noise."""
         return ""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -81,13 +81,13 @@ class ColdStart(TensorDictModuleBase):
 
 
 class WarmStart(ColdStart):
-    """Has queries begin from the last chunk, see the module; ``policy.start = WarmStart(1)`` is all that it takes.
+    """Has policy calls begin from the last chunk, see the module; ``policy.start = WarmStart(1)`` is all that it takes.
 
     Reads ``("control", "last_chunk")`` and ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for
-    them. Samples at the beginning of their episode, and queries that come without these keys, begin from noise.
+    them. Samples at the beginning of their episode, and calls that come without these keys, begin from noise.
 
     Args:
-        num_steps: the sampler's last steps that a warm query takes, n >= 1; a sampler of as many or fewer is refused.
+        num_steps: the sampler's last steps that a warm call takes, n >= 1; a sampler of as many or fewer is refused.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -137,7 +137,7 @@ class WarmStart(ColdStart):
 
 
 def stored_start(start: ColdStart) -> int | None:
-    """Return what a policy's file says of its start: the steps of a warm query, None where all begin from noise.
+    """Return what a policy's file says of its start: the steps of a warm policy call, None where all begin from noise.
 
     Raises:
         ValueError: for a start of another class.

@@ -136,7 +136,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         read, written = (pruner.in_keys, pruner.out_keys) if pruner else ((), ())
         masked = (
             [] if keys.KEEP_MASK in written else [keys.KEEP_MASK]
-        )  # a pruner's own mask is new at every query
+        )  # a pruner's own mask is new at every policy call
         reads = [*([] if wrist is None else [wrist]), *masked, *read]
         writes = [keys.TOKEN_DEPTH, keys.KEPT, *written]
         self.in_keys = list(dict.fromkeys([*self.in_keys, *reads]))
@@ -161,16 +161,16 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
 
     def _flatten(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return what a query reads, [B]."""
+        """Return what a policy call reads, [B]."""
         rows = tensordict.batch_size.numel()
         if not rows:
             raise InputError(
-                f"batch: expected at least one query, got batch size {list(tensordict.batch_size)}"
+                f"batch: expected at least one policy call, got batch size {list(tensordict.batch_size)}"
             )
         return dense(tensordict.select(*self.in_keys, strict=False), self).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
-        """Return normalised actions f32 [B, H, A] of a query [B], and the decoder's output; a pruner writes into ``query``."""
+        """Return normalised actions f32 [B, H, A] of a call [B], and the decoder's output; a pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
         images = self.crop_images(query)
         state = read_state(query, names.state, config.state_dim)

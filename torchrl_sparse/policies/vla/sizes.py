@@ -1,4 +1,4 @@
-"""How large a query and an answer of a VLA are: what its network and its pruner say."""
+"""How large a policy call and an answer of a VLA are: what its network and its pruner say."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Which entries of a published configuration are read, which must have one value, and which say nothing about a query.
+"""Which entries of a published configuration are read, which must have one value, and which say nothing about a policy call.
 
 What a policy computes, observes and does depends on every entry of its ``policy`` and ``task`` sections. So an entry is
-read (and compared with the tensors where those tell), fixed to the value that is supported, or listed as one that a query
+read (and compared with the tensors where those tell), fixed to the value that is supported, or listed as one that a call
 does not depend on. Any other is refused: what it does is not known here. Entries elsewhere act through references alone.
 """
 
@@ -28,7 +28,7 @@ class Section:
     Attributes:
         fixed: name -> (what the published code takes where it is missing, what is supported).
         read: names that are read elsewhere.
-        unused: names on which a query does not depend.
+        unused: names on which a policy call does not depend.
         nullable: those of ``fixed`` and ``read`` that may be null, which is no default to the published code.
     """
 

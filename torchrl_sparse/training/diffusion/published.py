@@ -18,7 +18,7 @@ class PublishedShape:
 
     Attributes:
         horizon: actions of a chunk (Tp).
-        n_obs_steps: observations of a query (To).
+        n_obs_steps: observations of a policy call (To).
         n_action_steps: actions executed of a chunk (Ta).
         n_emb: width.
         p_drop_attn: dropout in and after every block.

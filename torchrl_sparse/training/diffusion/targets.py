@@ -1,6 +1,6 @@
 """Calibration sets: observations that gates are trained on, and the actions that a pruned policy should give there.
 
-The calibration set of SAG (arXiv:2601.12894, Section 3.3), also with the queries of the closed loop.
+The calibration set of SAG (arXiv:2601.12894, Section 3.3), also with the policy calls of the closed loop.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
     "save_targets",
 ]
 
-ANSWER_BATCH = 16  # queries that the policy answers at a time
+ANSWER_BATCH = 16  # policy calls that the policy answers at a time
 
 
 def make_targets(
@@ -101,7 +101,7 @@ def add_queries(
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TensorDict:
-    """Return targets together with those of queries made in closed loop, in random order.
+    """Return targets together with those of policy calls made in closed loop, in random order.
 
     A pruned policy comes to states that demonstrations do not hold; as in DAgger (arXiv:1011.0686), the dense policy
     gives the targets there.
@@ -111,7 +111,7 @@ def add_queries(
         targets: see `make_targets`.
         queries: [n], with ``("diffusion", "cond")`` f32 [n, To, D] and ``("diffusion", "seed")`` i64 [n, 1].
         seed: of the order.
-        on_progress: called with (queries answered, all).
+        on_progress: called with (calls answered, all).
 
     Returns:
         [N + n], with the keys of ``targets``.
@@ -133,7 +133,7 @@ def dense_answers(
     Args:
         policy: the policy with its sampler.
         queries: [N], with ``("diffusion", "cond")`` f32 [N, To, D] and ``("diffusion", "seed")`` i64 [N, 1].
-        on_progress: called with (queries answered, all).
+        on_progress: called with (policy calls answered, all).
     """
     answers: list[Tensor] = []
     for part in queries.split(ANSWER_BATCH):

@@ -20,7 +20,7 @@ __all__ = ["closed_loop_queries"]
 def closed_loop_queries(
     policy: DiffusionPolicy, task: str, episodes: int, schedule: str | Path | None = None
 ) -> TensorDictBase:
-    """Record the queries of episodes, see `torchrl_sparse.control.queries.record_queries`.
+    """Record the policy calls of episodes, see `torchrl_sparse.control.queries.record_queries`.
 
     Args:
         policy: the trained policy.

@@ -163,7 +163,7 @@ class PrunerTrainer(Trainer):
 
     def load_state(self, state: dict[str, Any]) -> None:
         super().load_state(state)
-        self.weight = state["weight"].to(self.policy.device)  # seconds are measured anew in every process
+        self.weight = state["weight"].to(self.policy.device)  # seconds are measured again in every process
 
     def _masks(self, cond: Tensor) -> Tensor:
         """Return the masks bool [B, K, 3L] as they will be used, at the rate that is trained for."""
@@ -200,7 +200,7 @@ class PrunerTrainer(Trainer):
         return self._norm(error)
 
     def _query(self, batch: TensorDict, gate: Tensor) -> tuple:
-        """Return what a query of the policy is made of: network, sampler, noise, condition and gates or mask."""
+        """Return what a policy call of the policy is made of: network, sampler, noise, condition and gates or mask."""
         noise = self.policy.sample_noise(batch[keys.SEED].squeeze(-1))
         return self.policy.network, self.policy.sampler, noise, batch[keys.COND], gate
 

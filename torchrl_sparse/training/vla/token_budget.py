@@ -1,7 +1,7 @@
 """Measuring what each number of a token pruner costs a policy, in action error or in success, to calibrate it.
 
-`torchrl_sparse.methods.token_budget` chooses. The queries of recorded episodes are answered again under each number, in their
-order, so that what one query leaves for the next is there as in a rollout, and their actions are compared with the dense
+`torchrl_sparse.methods.token_budget` chooses. The policy calls of recorded episodes are answered again under each number, in
+their order, so that what one call leaves for the next is there as in a rollout, and their actions are compared with the dense
 policy's.
 """
 
@@ -30,7 +30,7 @@ _FOREVER = 2**31  # environments end an episode themselves
 _BESIDE = (keys.IS_INIT, keys.EPISODE_SEED, keys.EPISODE_STEP, keys.EEF_VEL, keys.TOKEN_BUDGET, keys.FINE)
 
 
-# -- queries -----------------------------------------------------------------------------------------------------------
+# -- policy calls -----------------------------------------------------------------------------------------------------------
 
 
 def recorded_queries(
@@ -39,7 +39,7 @@ def recorded_queries(
     make_env: Callable[..., EnvBase],
     seeds: Sequence[int],
 ) -> Iterator[list[TensorDictBase]]:
-    """Record the queries, each [], that ``actor`` makes of a dense policy in one episode per seed.
+    """Record the policy calls, each [], that ``actor`` makes of a dense policy in one episode per seed.
 
     Args:
         policy: whose inputs are recorded, with what pruners and controllers read beside them, and what a controller granted.
@@ -59,15 +59,15 @@ def demonstrated_queries(
     poses: Sequence[tuple[slice, slice]],
     control_freq: float = 20.0,
 ) -> Iterator[list[TensorDictBase]]:
-    """Take the same from demonstrations with images, one query each ``every`` steps; no simulator is needed.
+    """Take the same from demonstrations with images, one policy call each ``every`` steps; no simulator is needed.
 
-    The hand's velocity, which demonstrations do not keep, is that of the step before each query, as `EndEffectorVelocity`'s;
+    The hand's velocity, which demonstrations do not keep, is that of the step before each call, as `EndEffectorVelocity`'s;
     an episode's seed is its place in the file, so that a pruner that draws tokens draws the same ones each time.
 
     Args:
         policy: whose inputs are taken.
         demos: whose states are the policy's.
-        every: steps from one query to the next.
+        every: steps from one call to the next.
         poses: for each arm, where its position and its quaternion (xyzw) lie in the state.
         control_freq: steps a second.
     """
@@ -100,7 +100,7 @@ def _rollout(actor: Actor, make_env: Callable[..., EnvBase], seed: int) -> Tenso
 def replay(
     policy: VLAPolicy, queries: Sequence[TensorDictBase], pruner: TokenPruner | None
 ) -> TensorDictBase:
-    """Answer an episode's queries in their order, each with what the one before left.
+    """Answer an episode's policy calls in their order, each with what the one before left.
 
     Returns:
         The policy's ``out_keys`` under ``pruner``, [Q].
@@ -123,21 +123,21 @@ def measure_errors(
     n_action_steps: int,
     on_episode: Callable[[], Any] = lambda: None,
 ) -> list[BudgetPoint]:
-    """Measure the mean action error of each pruner over all queries but the first of an episode.
+    """Measure the mean action error of each pruner over all policy calls but the first of an episode.
 
     Args:
         policy: any; its own pruner plays no part.
-        episodes: their queries, each [].
+        episodes: their calls, each [].
         pruners: number -> pruner.
         n_action_steps: actions of a chunk that are executed, and so compared.
         on_episode: called after each episode.
 
     Raises:
-        ValueError: if no episode has a second query.
+        ValueError: if no episode has a second call.
     """
     if not any(len(queries) > 1 for queries in episodes):
         raise InputError(
-            f"episodes: expected one with at least two queries, got {[len(q) for q in episodes]}"
+            f"episodes: expected one with at least two policy calls, got {[len(q) for q in episodes]}"
         )
     normalize = policy.normalizer.normalize_action
     errors, kept = ({number: [] for number in pruners} for _ in range(2))

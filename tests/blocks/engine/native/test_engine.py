@@ -98,7 +98,7 @@ def test_property_any_rate_and_rule(seed):
 def test_every_sampler(name):
     network, sampler = make_network(), Sampler.from_name(name)
     engine = NativeEngine(network, sampler)
-    for seed in range(2):  # the second query finds what the first one left in memory
+    for seed in range(2):  # the second policy call finds what the first one left in memory
         noise, cond, mask = make_query(network, sampler, seed=seed)
         expected = exact(network, sampler, noise, cond, mask)
         assert (engine.denoise(noise, cond, mask) - expected).abs().max() < 1e-5

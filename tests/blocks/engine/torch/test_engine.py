@@ -163,7 +163,7 @@ def test_packed_products_take_any_number_of_rows(gelu):
 
 
 def count_allocations(steps, dtype, rate, shape="small", batch=3):
-    """In one query after the first."""
+    """In one policy call after the first."""
     network, sampler = make_network(shape).to(dtype), Sampler("ddpm", steps)
     masks = make_masks(network, Sampler("ddpm", 10), batch, rate).repeat(1, steps // 10, 1)
     engine, query = TorchEngine(network, sampler), make_query(network, sampler, batch)

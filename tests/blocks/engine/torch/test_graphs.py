@@ -54,7 +54,7 @@ def test_a_dense_loop_is_one_graph(shape, kind):
 
 
 def test_batches_are_padded_so_that_few_sizes_are_captured():
-    """How many rows are due varies from query to query; each size that is captured takes dozens of graphs."""
+    """How many rows are due varies from policy call to call; each size that is captured takes dozens of graphs."""
     network, sampler, graphs = make_network("small"), Sampler("ddpm", 8), RecordedGraph()
     engine, made = captured_engine(network, sampler, graphs), {}
     for rows in (3, 4, 8, 5, 7, 6, 3):

@@ -37,16 +37,16 @@ MAX_THREADS = CONSTANTS["MAX_THREADS"]  # of a team, see team.h
 
 
 class NativeEngine:
-    """Runs queries in compiled code. Not differentiable.
+    """Runs policy calls in compiled code. Not differentiable.
 
     The weights are packed when the first engine of a network is made, and again when the network's have changed (see
     :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`); all engines of the network share them. A row of a batch is
     computed exactly as it would be alone, and with the same sums in the same order on any number of threads. Of a batch every
     thread takes whole rows; rows that are left and fewer than threads are each computed by all threads together, as a single
-    query is.
+    call is.
 
     Calls from several threads, and to several engines, may overlap: one of them has the threads, the others run in the
-    caller's. Between queries the threads sleep.
+    caller's. Between calls the threads sleep.
 
     Args:
         network: the denoiser, in eval mode; see `native_supports`.
@@ -57,12 +57,12 @@ class NativeEngine:
             8 bits by output, activations by token between the least and the largest of it, so that no data are needed
             to calibrate them; embedding, head, norms, softmax, cross-attention and the residual stream stay float32.
         instruction_set: one of ``INSTRUCTION_SETS``; None takes the widest that the CPU has.
-        threads: with the caller's; None takes ``torch.get_num_threads()`` at each call, of which a single query uses
+        threads: with the caller's; None takes ``torch.get_num_threads()`` at each call, of which a single call uses
             no more than one for each 32 of the embedding's size, and none at 1.
 
     Attributes:
         name: ``"native"``.
-        detail: instruction set, weight type and the threads of a single query.
+        detail: instruction set, weight type and the threads of a single call.
 
     Raises:
         ValueError: if the engine cannot run the network or the instruction set, with the reason.
@@ -173,7 +173,7 @@ class NativeEngine:
         """Return what :meth:`answer` reads of the network, as its weights are now.
 
         Raises:
-            ValueError: if a query does not fit them, or naming a weight that cannot be packed.
+            ValueError: if a policy call does not fit them, or naming a weight that cannot be packed.
         """
         packed = self._current()
         packed.check(noise=noise, cond=cond)
@@ -217,7 +217,7 @@ class NativeEngine:
         return min(torch.get_num_threads(), max(rows, -(-self._network.n_emb // PANEL)), MAX_THREADS)
 
     def refresh(self) -> None:
-        """Pack the weights anew in the next query."""
+        """Pack the weights again in the next policy call."""
         self._shared.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
@@ -255,7 +255,7 @@ class NativeEngine:
         return torch.empty(threads * packed.scratch, dtype=torch.float32, device="cpu")
 
     def _current(self) -> PackedNetwork:
-        """Return what the network and the sampler are packed into, anew if the network has changed."""
+        """Return what the network and the sampler are packed into, again if the network has changed."""
         weights, packed = self._shared.current(), self._packed
         if packed is None or packed.weights is not weights:
             packed = PackedNetwork(self._network, self._sampler, weights)

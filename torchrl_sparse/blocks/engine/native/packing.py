@@ -50,8 +50,8 @@ class PackedWeights:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
         dtype: type of the trunk's matrices and of the condition encoder's but the first, one of those of
             :func:`~torchrl_sparse.blocks.engine.native.arena.pack_panels`; of int8, the encoder's and what folds its
-            tokens, which are read once a query, stay f32.
-        narrow: keep f32 matrices that are read once a query as f16 where all their weights are f16 numbers, as those of
+            tokens, which are read once a policy call, stay f32.
+        narrow: keep f32 matrices that are read once a call as f16 where all their weights are f16 numbers, as those of
             files in fp16 are: the same numbers in half the memory.
 
     Attributes:
@@ -138,7 +138,7 @@ class PackedNetwork:
     Attributes:
         model: the structure that the engine reads.
         weights: as given.
-        scratch: floats that a thread needs for a query; the engine, which knows compiled code, says so.
+        scratch: floats that a thread needs for a policy call; the engine, which knows compiled code, says so.
     """
 
     scratch: int
@@ -169,7 +169,7 @@ class PackedNetwork:
             )
 
     def check(self, **query: Tensor) -> None:
-        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a query have the sizes that were packed."""
+        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a policy call have the sizes that were packed."""
         for name, tensor in query.items():
             if tuple(tensor.shape[1:]) != self._sizes[name]:
                 raise InputError(

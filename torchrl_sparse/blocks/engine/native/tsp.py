@@ -29,11 +29,11 @@ _BOTH = {field[0] for field in Header._fields_} & {field[0] for field in Model._
 
 @dataclass(frozen=True)
 class ExportedPlan:
-    """What a query skips, in a form that needs no Python.
+    """What a policy call skips, in a form that needs no Python.
 
     Attributes:
         slots: outputs that are kept, :func:`~torchrl_sparse.blocks.mask.num_buffers`.
-        mask: bool [K, 3L] of every query; None where nothing is pruned, or where a pruner decides.
+        mask: bool [K, 3L] of every call; None where nothing is pruned, or where a pruner decides.
         pruner: decides for each observation.
         rate: the pruner's input where it reads one, else None.
     """

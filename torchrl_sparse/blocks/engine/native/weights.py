@@ -1,4 +1,4 @@
-"""The packed weights of a network, once for all engines that run it, and how a query notices that they have changed."""
+"""The packed weights of a network, once for all engines that run it, and how a policy call notices that they have changed."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class SharedWeights:
         return types.get(dtype) or types.setdefault(dtype, cls(network, dtype))
 
     def current(self) -> PackedWeights:
-        """Return the packed weights, packed anew if the network has changed.
+        """Return the packed weights, packed again if the network has changed.
 
         Raises:
             ValueError: naming a weight that cannot be packed.
@@ -70,5 +70,5 @@ class SharedWeights:
         return packed
 
     def refresh(self) -> None:
-        """Pack the weights anew in the next query of any engine."""
+        """Pack the weights again in the next policy call of any engine."""
         self._watch.refresh()

@@ -81,7 +81,7 @@ class SelfAttention:
         hidden = (
             torch.full((horizon, horizon), -torch.inf).tril(-1) if network.causal_attn else torch.zeros(1)
         )
-        self._hidden = hidden.to(like)  # [key, query]: a later key
+        self._hidden = hidden.to(like)  # [key, policy call]: a later key
 
     def __call__(self, x: Tensor, out: Tensor, scratch: BlockScratch) -> Tensor:
         """Return what the block adds to ``x`` [N * H, d], perhaps in ``out``."""

@@ -1,6 +1,6 @@
 """The PyTorch engine: the reference's results in a fraction of its time, on a CPU or a GPU.
 
-What does not change within a query is done before its loop: time tokens are encoded and folded once per
+What does not change within a policy call is done before its loop: time tokens are encoded and folded once per
 network, observations once per query, cross-attention reads folded memory
 (:mod:`torchrl_sparse.blocks.engine.folding`), the sampler is a table, and a mask becomes a program
 (:mod:`torchrl_sparse.blocks.engine.program`), built once per distinct mask.
@@ -100,7 +100,7 @@ class TorchEngine:
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
     def refresh(self) -> None:
-        """Tabulate the weights anew in the next query."""
+        """Tabulate the weights again in the next policy call."""
         self._watch.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Folding memory tokens within a query, in memory that was allocated before it.
+"""Folding memory tokens within a policy call, in memory that was allocated before it.
 
 :func:`~torchrl_sparse.blocks.engine.folding.fold_tokens` says what is computed; here it is a few large products.
 """

@@ -48,7 +48,7 @@ class GraphCapture:
 
 
 def padded_batch(rows: int) -> int:
-    """Round a number of rows up to a power of two: the rows that are due vary, and each size is captured anew.
+    """Round a number of rows up to a power of two: the rows that are due vary, and each size is captured again.
 
     >>> [padded_batch(rows) for rows in (1, 2, 3, 5, 8, 9)]
     [1, 2, 4, 8, 8, 16]

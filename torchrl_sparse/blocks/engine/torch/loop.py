@@ -33,7 +33,7 @@ Segment = Callable[[], object]
 
 
 class Workspace:
-    """Everything that the queries of one batch size write to, allocated once; for one query at a time.
+    """Everything that the policy calls of one batch size write to, allocated once; for one call at a time.
 
     Args:
         tables: of the network.
@@ -43,7 +43,7 @@ class Workspace:
         capture: turns a segment into one that does the same faster; None leaves them as they are. With it, the whole
             dense loop is one segment, and a block that only some rows need computes all of them and keeps those: the
             number of rows is part of a captured segment, and one for each number would be a great many.
-        guided: whether every query has a guide, or none.
+        guided: whether every call has a guide, or none.
     """
 
     def __init__(
@@ -104,10 +104,10 @@ class Workspace:
             self._fold = capture(self._fold)
 
     def denoise(self, loop: Loop, noise: Tensor, cond: Tensor, guide: Guide | None = None) -> Tensor:
-        """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
+        """Return the actions [B, H, A] of one policy call, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`."""
         self._sample.copy_(noise[:, 0].flatten(0, 1))
         if guide is not None:
-            assert self._guide is not None  # a guided query is given a guided workspace
+            assert self._guide is not None  # a guided policy call is given a guided workspace
             for part, given in zip(self._guide, guide, strict=True):
                 part.copy_(given.flatten(0, 1))
         for earlier in self._earlier:

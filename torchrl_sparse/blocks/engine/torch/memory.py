@@ -47,7 +47,7 @@ class Memory:
             self._scratch = tables.fold.scratch(batch * observations)
 
     def begin(self, cond: Tensor) -> None:
-        """Take the observations [B, To, D] of a query."""
+        """Take the observations [B, To, D] of a policy call."""
         encoder = self._tables.encoder
         if encoder.separable:
             tokens = encoder.observation_tokens(cond).flatten(0, 1)

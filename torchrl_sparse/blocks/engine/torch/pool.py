@@ -1,4 +1,4 @@
-"""Workspaces of the PyTorch engine, kept for the queries to come."""
+"""Workspaces of the PyTorch engine, kept for the policy calls to come."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Capture = Callable[[Segment], Segment]
 
 
 class WorkspacePool:
-    """Workspaces that wait for their next query; a query that finds none gets a new one.
+    """Workspaces that wait for their next policy call; a call that finds none gets a new one.
 
     Args:
         tables: of the network.
@@ -45,7 +45,7 @@ class WorkspacePool:
     @contextmanager
     def take(self, batch: int, slots: int, guided: bool = False) -> Iterator[Workspace]:
         """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, drawn to a guide or not, for the caller alone."""
-        # On a GPU the next query may be launched before the last one has run, but in the same order only in one stream.
+        # On a GPU the next policy call may be launched before the last one has run, but in the same order only in one stream.
         stream = (
             torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None
         )
