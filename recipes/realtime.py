@@ -22,8 +22,8 @@ from torchrl_sparse.envs.for_policy import diffusion_env
 from torchrl_sparse.envs.tasks import RobosuiteTask, find_robosuite_task
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.evaluation.benchmarks.benchmark import BenchmarkOptions
+from torchrl_sparse.evaluation.benchmarks.delayed import RealtimeBenchmark
 from torchrl_sparse.evaluation.benchmarks.diffusion import make_methods
-from torchrl_sparse.evaluation.benchmarks.late import RealtimeBenchmark
 from torchrl_sparse.evaluation.results.realtime import format_realtime
 from torchrl_sparse.methods.diffusion import check_method
 from torchrl_sparse.methods.spec import MethodSpec

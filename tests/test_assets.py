@@ -90,7 +90,7 @@ def test_tables_count_the_episodes(folder):
             if name != "dense":
                 difference = paired_difference(ours, dense, paired.margin)
                 assert paired.diff == pytest.approx(difference.diff)
-                if results.until_decided is None:  # else the interval is wider, for all the looks
+                if results.until_conclusive is None:  # else the interval is wider, for all the looks
                     assert paired.verdict == difference.verdict
             tabled.add(name)
     assert tabled == played.keys()
@@ -119,7 +119,7 @@ def test_late_tables_count_the_late_episodes(path):
 @pytest.mark.parametrize("path", sorted(ASSETS.rglob("realtime.json")), ids=name)
 def test_without_latency_tables_count_ordinary_episodes(path):
     results = load_realtime(path)
-    folder = path.parent.parent if path.parent.name == "late" else path.parent
+    folder = path.parent.parent if path.parent.name == "delayed" else path.parent
     for method, told in results.methods.items():
         for point in (point for point in told.points if not point.delay_steps):
             seeds = evaluation_seeds(results.split, results.seed, point.success.n)

@@ -122,7 +122,7 @@ def test_the_second_on_one_output_is_told_who_the_first_is(fail, tmp_path):
             before = sorted(tmp_path.rglob("*"))
             line = fail(recipe, f"out={tmp_path / name}")
             assert sorted(tmp_path.rglob("*")) == before
-        told = f"out: expected one that nobody works on, got {tmp_path / name}, held by process {os.getpid()} on "
+        told = f"out: {tmp_path / name} is locked by process {os.getpid()} on "
         assert line.startswith(told)
 
 

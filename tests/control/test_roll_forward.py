@@ -16,7 +16,7 @@ from torchrl_sparse.training.state_model import fit_state_model
 WEIGHT = torch.tensor(
     [[-0.5, 0.0], [0.2, 0.0], [0.0, 0.0], [0.0, 0.9], [0.4, 0.1], [0.01, -0.02]], dtype=torch.float64
 )
-"""A hand that follows its commands late, and is guided toward something that drifts: 2 numbers, their change, an action and 1."""
+"""A hand that follows its commands late, guided toward something that drifts: 2 numbers, their change, an action and 1."""
 HOLD = TensorDictModule(lambda state: torch.zeros_like(state[..., :1]), [keys.STATE], [keys.HOLD])
 
 

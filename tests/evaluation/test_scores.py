@@ -69,7 +69,7 @@ def scored(mean, count=60, solved=False):
     return [EpisodeResult(seed, solved, 60, 3, 30.0, 0.0, score=score) for seed, score in enumerate(scores)]
 
 
-def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
+def test_a_task_that_is_graded_is_judged_by_its_scores(tmp_path):
     runs = {
         name: MethodRun(scored(mean), summarize_latency([1.0] * 5), (0.1, 0.4))
         for name, mean in {"dense": 0.7, "same": 0.74, "worse": 0.4}.items()
@@ -79,7 +79,7 @@ def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
         task="PushT",
         split="development",
         seed=0,
-        terms=Terms(Design(60), 60, by_degrees=True),
+        terms=Terms(Design(60), 60, graded=True),
         machine=MACHINE,
         policy=POLICY,
         pairs=[["worse", "same"]],
@@ -87,7 +87,7 @@ def test_a_task_that_is_done_by_degrees_is_judged_by_its_scores(tmp_path):
     save_results(results, tmp_path / "results.json")
     assert load_results(tmp_path / "results.json") == results
     worse, same = Played.of(results.methods["worse"]), Played.of(results.methods["same"])
-    assert worse.paired_vs_dense.verdict == "undecided"  # nothing was solved, and nothing lost by that
+    assert worse.paired_vs_dense.verdict == "inconclusive"  # nothing was solved, and nothing lost by that
     assert worse.verdicts == {"the score": "inferior"}
     assert (same.is_right, worse.is_right) == (True, False)
     assert worse.score.vs_dense.ci95 == pytest.approx(paired_t_test(runs["worse"], runs["dense"]))
@@ -111,7 +111,7 @@ def paired_t_test(ours, theirs):
 
 def test_episodes_of_such_a_task_go_on_until_the_score_is_decided():
     played = {"dense": scored(0.7, 300), "far": scored(0.4, 300), "close": scored(0.665, 300)}
-    terms = Terms(Design(300, 30), 60, by_degrees=True)
+    terms = Terms(Design(300, 30), 60, graded=True)
     episodes = play_rounds(["far", "close"], lambda name, count: played[name][:count], terms)
     assert len(episodes["far"]) < 100
     assert difference_z([0.5], [0.5], -0.05) == 0  # one pair says nothing

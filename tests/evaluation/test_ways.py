@@ -2,7 +2,7 @@
 
 from recipes.studies.pages.ways import way_rows
 from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
-from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
+from torchrl_sparse.evaluation.figures.ways import count_modes, plot_ways
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
 WAYS = {"dense": [0, 1, 0, 1], "ddim10": [0, 0, BETWEEN, NO_WAY]}
@@ -31,7 +31,7 @@ def test_every_episode_is_counted_once():
 
 def test_tasks_of_one_way_tell_none():
     plain = [EpisodeResult(0, True, 30, 4, 1e9, 0.0)]
-    assert told_ways({"dense": episodes([1, 0]), "other": plain}) == {"dense": [1, 0]}
+    assert count_modes({"dense": episodes([1, 0]), "other": plain}) == {"dense": [1, 0]}
 
 
 def test_the_picture_is_drawn_where_no_method_took_a_way(tmp_path):

@@ -11,7 +11,7 @@ from torchrl_sparse.blocks.schedule import CacheSchedule
 from torchrl_sparse.evaluation.rollouts.evaluate import evaluate
 from torchrl_sparse.runtime.wandb_run import wandb_arguments
 
-LOOKS = {"max_episodes": 20, "looks": 2}
+ANALYSES = {"max_episodes": 20, "analyses": 2}
 BENCHMARK = "torchrl_sparse.evaluation.benchmarks.benchmark"
 DIFFUSION = "torchrl_sparse.evaluation.benchmarks.diffusion"
 CALIBRATED = "torchrl_sparse.training.diffusion.calibration.calibrate_policy"
@@ -121,7 +121,9 @@ class TestOptions(OptionTests):
         ],
         [
             Row("task", "touch", results("task"), "Touch"),
-            Row("until", "decided", lambda run: run.json("results.json").get("until_decided"), LOOKS),
+            Row(
+                "until", "conclusive", lambda run: run.json("results.json").get("until_conclusive"), ANALYSES
+            ),
             Row("max_episodes", "20", lambda run: run.call(ROUNDS)["terms"].design.max_episodes, 20),
             "methods=[uniform]",
         ],

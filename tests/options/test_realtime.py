@@ -17,7 +17,7 @@ def timed(methods, queries, **_):
 
 BENCHMARK, LATE = (
     "torchrl_sparse.evaluation.benchmarks.benchmark",
-    "torchrl_sparse.evaluation.benchmarks.late",
+    "torchrl_sparse.evaluation.benchmarks.delayed",
 )
 CALIBRATED = "torchrl_sparse.training.diffusion.calibration.calibrate_policy"
 EVALUATED, TIMED, BUILT = f"{BENCHMARK}.evaluate", f"{LATE}.time_methods", f"{LATE}.build_realtime"

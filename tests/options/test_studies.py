@@ -100,12 +100,12 @@ class TestOfflineErrors(OptionTests):
 
 class TestStopping(OptionTests):
     recipe = "studies.simulate_stopping"
-    base = ("max_episodes=40", "looks=2", "trials=3")
+    base = ("max_episodes=40", "analyses=2", "trials=3")
     replaced = {"plot_stopping": returning(None)}
     groups = (
         [
             Row("max_episodes", "60", content("stopping.json", "max_episodes")),
-            Row("looks", "3", content("stopping.json", "looks")),
+            Row("analyses", "3", content("stopping.json", "analyses")),
             Row("trials", "4", content("stopping.json", "trials")),
             Row("seed", "5", content("stopping.json", "seed")),
             Row("out", "elsewhere", written("elsewhere/stopping.json"), True),

@@ -182,7 +182,7 @@ class TestBenchmark(OptionTests):
         ],
         [
             Row("task", "lift_crowded", argument(f"{BENCHMARK}.build_results", "task")),
-            Row("until", "decided", argument(f"{BENCHMARK}.make_design", "until")),
+            Row("until", "conclusive", argument(f"{BENCHMARK}.make_design", "until")),
             Row("max_episodes", "20", lambda run: run.call(f"{BENCHMARK}.build_results")["terms"].design.max_episodes, 20),
         ],
     )  # fmt: skip

@@ -51,7 +51,7 @@ def kill(process):
 def test_the_second_is_told_who_holds_it_and_leaves_nothing_behind(tmp_path, hold):
     process = hold(tmp_path / "run")
     before = sorted(tmp_path.rglob("*"))
-    told = rf"^out: expected one that nobody works on, got .*run, held by process {process.pid} on .* since 20\d\d-.*: -c "
+    told = rf"^out: .*run is locked by process {process.pid} on .* since 20\d\d-.*: -c "
     refused(tmp_path / "run", told)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -41,8 +41,8 @@ def test_the_fastest_that_is_non_inferior_in_both_is_named(results):
     name, remark = headline(results, goal=9)
     assert name == "ddim10"
     assert remark.startswith("as fast as asked for, 9×")
-    slow = change(results, ddim10=judged(results.methods["ddim10"], "non-inferior", "undecided"))
-    assert headline(slow, goal=9) == ("bac", "ddim10, 10.0×, is undecided in time")
+    slow = change(results, ddim10=judged(results.methods["ddim10"], "non-inferior", "inconclusive"))
+    assert headline(slow, goal=9) == ("bac", "ddim10, 10.0×, is inconclusive in time")
     assert headline(slow, goal=20) == ("bac", "no method is 20× as fast")
 
 
@@ -59,11 +59,11 @@ def test_it_says_which_verdict_does_not_survive_a_correction_for_all(results):
 def test_without_one_it_says_what_the_nearest_lacks(results):
     worse = change(
         results,
-        ddim10=judged(results.methods["ddim10"], "undecided", "inferior", ratio=1.5),
-        bac=judged(results.methods["bac"], "undecided", "undecided", ratio=1.2),
+        ddim10=judged(results.methods["ddim10"], "inconclusive", "inferior", ratio=1.5),
+        bac=judged(results.methods["bac"], "inconclusive", "inconclusive", ratio=1.2),
     )
-    assert headline(worse, goal=9) == (None, "ddim10, 10.0×, is undecided in success and inferior in time")
-    assert headline(worse, goal=5) == (None, "bac, 7.0×, is undecided in success and undecided in time")
+    assert headline(worse, goal=9) == (None, "ddim10, 10.0×, is inconclusive in success and inferior in time")
+    assert headline(worse, goal=5) == (None, "bac, 7.0×, is inconclusive in success and inconclusive in time")
     (row,) = headline_rows(worse)
     assert row["method"] == "none"
     assert set(row) == set(headline_rows(results)[0])

@@ -96,7 +96,7 @@ def test_they_are_kept_and_drawn(results, tmp_path):
     assert plot_offline(results, "a.json", tmp_path / "a.png").stat().st_size > 10_000
 
 
-def test_a_task_done_by_degrees_comes_to_its_scores():
+def test_a_graded_task_comes_to_its_scores():
     results = load_results("assets/pusht/shorter/results.json")
     found, entry = outcomes(results)["ddpm2_logsnr"], results.methods["ddpm2_logsnr"]
     assert found.success == entry.score.mean - results.dense.score.mean < -0.3

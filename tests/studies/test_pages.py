@@ -45,7 +45,7 @@ def test_only_what_lies_between_the_comments_changes(root):
 def test_rows_and_columns_are_those_asked_for_in_their_order(root):
     heading, *rows = table('results.json methods="bac | dense" columns="method | verdict | success, %"', root)
     assert heading == ["method", "verdict", "success, %"]
-    assert [row[:2] for row in rows] == [["bac", "undecided"], ["dense", "baseline"]]
+    assert [row[:2] for row in rows] == [["bac", "inconclusive"], ["dense", "baseline"]]
     assert [row[0] for row in table("results.json", root)[1:]] == ["dense", "ddim10", "bac"]
 
 
@@ -114,7 +114,7 @@ def test_files_of_one_policy_share_its_column():
         table(f"{files} {options.replace('Square', 'Lift')}", ASSETS)
 
 
-def test_a_task_that_is_done_by_degrees_stands_beside_others_with_its_score():
+def test_a_task_that_is_graded_stands_beside_others_with_its_score():
     files = "lift_two_ways/results.json pusht/results.json"
     cells = f'{files} methods="dense | bac" cells="success or score | time vs dense"'
     _, dense, bac = table(cells, ASSETS)

@@ -31,7 +31,10 @@ from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
-RIGHT, WRONG = "a random policy call is answered as by the reference", "a wrong policy call is answered or refused"
+RIGHT, WRONG = (
+    "a random policy call is answered as by the reference",
+    "a wrong policy call is answered or refused",
+)
 TOLERANCE = 2e-4
 """Largest difference to double precision, of actions in [-1, 1]."""
 

@@ -92,7 +92,9 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
     """
     check_form(mask, num_steps, num_layers, batch)
     first = mask.select(-2, 0)
-    if first.any():  # one operation where nothing is wrong: every policy call of every method comes through here
+    if (
+        first.any()
+    ):  # one operation where nothing is wrong: every policy call of every method comes through here
         pruned = first.reshape(-1, first.shape[-1]).any(dim=0).nonzero().flatten().tolist()
         names = ", ".join(block_name(column) for column in pruned)
         raise MaskError(

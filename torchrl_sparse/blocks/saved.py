@@ -90,7 +90,7 @@ def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] 
     unless its class is in :data:`PLANNERS`.
 
     Raises:
-        ValueError: if the planner looks at the observation and its class is not in the table; nothing is written.
+        ValueError: if the planner reads the observation and its class is not in the table; nothing is written.
 
     Examples:
         >>> import tempfile

@@ -110,7 +110,7 @@ OPTIONS: dict[str, Any] = {
     "table": Literal["short", "full"],
     "accelerate_policy.episodes": Whole,
     **dict.fromkeys(("finalists", "windows"), Count),
-    "until": Literal["episodes", "decided"],
+    "until": Literal["episodes", "conclusive"],
     **dict.fromkeys(("max_episodes", "eval_episodes", "probe_episodes"), Count),
     "seed": Whole,
     "evaluate_policy.seed": Whole | None,

@@ -35,14 +35,14 @@ class InstructedTask:
     Attributes:
         name: of the task in results.
         state_dim, action_dim: numbers that a policy reads beside images, and of an action.
-        early_cut, by_degrees: see `torchrl_sparse.envs.tasks.Task`.
+        early_cut, graded: see `torchrl_sparse.envs.tasks.Task`.
     """
 
     name: str
     state_dim: int
     action_dim: int
     early_cut: int | None = None
-    by_degrees: bool = False
+    graded: bool = False
 
 
 def find_instructed_task(name: str) -> InstructedTask:

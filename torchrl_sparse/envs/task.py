@@ -17,7 +17,7 @@ class Task(Protocol):
     Attributes:
         name: of the task in results.
         alias: short name for folders and command lines.
-        by_degrees: whether episodes are judged by their score, the highest reward of a step, since success is rare and says
+        graded: whether episodes are judged by their score, the highest reward of a step, since success is rare and says
             little.
         early_cut: steps within which a policy of the expert's speed is done; None where that was not measured.
         state_dim, action_dim: sizes of the low-dimensional observation and of the action.
@@ -35,7 +35,7 @@ class Task(Protocol):
     def alias(self) -> str: ...
 
     @property
-    def by_degrees(self) -> bool: ...
+    def graded(self) -> bool: ...
 
     @property
     def early_cut(self) -> int | None: ...

@@ -32,7 +32,7 @@ class _Named:
     name: str
     expert: str | None
     early_cut: int | None = None
-    by_degrees: bool = False
+    graded: bool = False
     way_of: str | None = None
 
     def load_way_of(self) -> Callable[[np.ndarray], int]:
@@ -152,7 +152,7 @@ class StateTask(_Named):
         environment: ``"module:class"`` of the environment.
         expert: ``"module:class"`` of the scripted expert, see `torchrl_sparse.envs.experts.demonstrators.StateExpert`; None
             without one.
-        early_cut, by_degrees, abs_action: see `Task`.
+        early_cut, graded, abs_action: see `Task`.
         way_of: see `RobosuiteTask`.
     """
 
@@ -164,7 +164,7 @@ class StateTask(_Named):
     expert: str | None = None
     early_cut: int | None = None
     way_of: str | None = None
-    by_degrees: bool = False
+    graded: bool = False
     abs_action: bool | None = None
 
     @property
@@ -261,9 +261,7 @@ _ROBOSUITE = (
     ),
 )
 _OTHERS: tuple[Task, ...] = (
-    StateTask(
-        "PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert"), by_degrees=True
-    ),
+    StateTask("PushT", "pusht", 20, 2, f"{_ENVS}.pusht:PushTEnv", _expert("pusht:PushTExpert"), graded=True),
     StateTask(
         *("BlockPush", "block_push", 16, 2, f"{_ENVS}.block_push:BlockPushEnv"),
         expert=_expert("block_push:BlockPushExpert"),

@@ -41,7 +41,7 @@ from torchrl_sparse.methods.spec import MethodSpec
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.policies.diffusion.realtime_chunking import RealtimeChunking
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart, WarmStart
 from torchrl_sparse.runtime.names import did_you_mean
 
 __all__ = [
@@ -100,7 +100,7 @@ class Method:
     controller: Callable[[tuple[float, ...]], TensorDictModuleBase | None] = move_rate
     color: str | None = None
     noise: int = 0
-    start: Callable[[MethodInputs], ColdStart | None] = lambda inputs: None
+    start: Callable[[MethodInputs], QueryStart | None] = lambda inputs: None
 
 
 def _dense(inputs: MethodInputs) -> tuple[Planner, Sampler]:

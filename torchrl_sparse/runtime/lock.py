@@ -113,7 +113,7 @@ def _lock(descriptor: int, path: Path, out: Path) -> None:
     holder = _read_holder(path)
     if holder is None or not holder.is_dead:
         raise BlockingIOError(
-            f"out: expected one that nobody works on, got {out}, held by {holder or 'another process'}"
+            f"out: {out} is locked by {holder or 'another process'}; expected one that no other run writes"
         )
     print(f"waiting for what {holder} has left running in {out}", flush=True)
     fcntl.flock(descriptor, fcntl.LOCK_EX)

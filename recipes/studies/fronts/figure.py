@@ -70,7 +70,7 @@ _FAMILIES = (
     _Family("BAC on ten stochastic steps", "bac_ddpm10", "#F2A19B", "P"),
     _Family("fixed interval on them", "uniform2_ddpm10", "#A6A6AB", "X"),
     _Family("L2C on them", "l2c_type70_ddpm10", "#66C2A5", "v"),
-    _Family("a pruner that looks, on them", "sag_type70_ddpm10", "#882255", "D"),
+    _Family("an observation-conditioned pruner, on them", "sag_type70_ddpm10", "#882255", "D"),
     _Family("the last two of five, from the last chunk", "ddpm5_logsnr_warm2", "#7F3C8D", "<"),
     _Family("searched mask and timesteps", "searched", "#D55E00", "*"),
     _Family("TTS", "tts", "#8C564B", "p"),
@@ -151,7 +151,7 @@ def _by_task(results: Sequence[Results]) -> dict[str, list[Results]]:
     tasks: dict[str, list[Results]] = {}
     for one in results:
         title = subject(one)
-        tasks.setdefault(f"{title}, score" if one.by_degrees else title, []).append(one)
+        tasks.setdefault(f"{title}, score" if one.graded else title, []).append(one)
     return tasks
 
 

@@ -3,8 +3,8 @@
     python -m recipes.studies.looking task=lift policy=assets/lift pruner=assets/lift/sag
 
 Without a pruner only the similarities of what could be reused are measured. With ``oracle.attempts=200`` masks for all policy
-calls, for each phase of an episode and for each call are climbed to, which says what a pruner that looks could gain, as far as
-a search finds it.
+calls, for each phase of an episode and for each call are climbed to, which says what an
+observation-conditioned pruner could gain, as far as a search finds it.
 """
 
 from __future__ import annotations

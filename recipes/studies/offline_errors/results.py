@@ -79,7 +79,7 @@ def save_offline(results: OfflineResults, path: str | os.PathLike) -> Path:
 
 
 def outcomes(results: Results) -> dict[str, Outcome]:
-    """Return what the methods of a table came to, but for dense itself; of a task done by degrees, in their scores."""
+    """Return what the methods of a table came to, but for dense itself; of a graded task, in their scores."""
     dense = results.dense
     return {
         name: Outcome(_reached(entry) - _reached(dense), entry.episode_length / dense.episode_length)

@@ -9,13 +9,13 @@ from recipes.studies.carried_noise.results import carried_noise_rows, load_carri
 from recipes.studies.offline_errors.agreement import load_agreement, together_rows
 from recipes.studies.offline_errors.results import agreement_rows, error_rows, load_offline
 from recipes.studies.pages.completed import completed_rows, told_completed
-from recipes.studies.pages.late_pairs import late_pair_rows
+from recipes.studies.pages.delayed_pairs import late_pair_rows
 from recipes.studies.pages.result_tables import acceleration_tables, realtime_tables, results_tables, subject
 from recipes.studies.pages.scores import score_rows, told_scores
 from recipes.studies.pages.ways import way_rows
 from recipes.studies.simulate_stopping.results import load_stopping, stopping_rows
 from torchrl_sparse.errors import InputError
-from torchrl_sparse.evaluation.figures.ways import told_ways
+from torchrl_sparse.evaluation.figures.ways import count_modes
 from torchrl_sparse.evaluation.results.build import Terms, compare_pair
 from torchrl_sparse.evaluation.results.realtime import load_realtime
 from torchrl_sparse.evaluation.results.report import comparison_rows
@@ -121,7 +121,7 @@ def _stopping(path: Path) -> dict[str, Table]:
 
 _OF_EPISODES: dict[str, tuple[Callable, Callable, str]] = {
     "completed": (told_completed, lambda told, _: completed_rows(told), "that count its parts"),
-    "ways": (told_ways, lambda told, _: way_rows(told), "that tell their ways"),
+    "ways": (count_modes, lambda told, _: way_rows(told), "that tell their ways"),
     "scores": (
         told_scores,
         lambda told, results: score_rows(told, results.dense.paired_vs_dense.margin),

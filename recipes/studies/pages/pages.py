@@ -10,7 +10,7 @@ Files are named from the root of the repository. Lists are separated by ``|`` an
 
 - ``methods``: which rows, in this order; all without it. Rows of ``engine.json`` are its variants.
 - ``columns``: which columns, in this order. Those of ``results*.json`` are named as the benchmark prints them, and there are
-  also ``success, %``, ``success or score`` (of a task done by degrees), ``action chunks per second`` and ``actions per
+  also ``success, %``, ``success or score`` (of a graded task), ``action chunks per second`` and ``actions per
   second``, ``mean time, steps``, ``early, %`` (solved within the task's early cut) and ``speed-up, 95 %``. An
   ``engine.json`` also has ``f32 arithmetic alone, ms``, and what reads its weights, ``memory alone, ms``.
 - ``rows``: which table of a file with several: ``played`` of an ``acceleration.json``, a shape of an ``engine.json``,

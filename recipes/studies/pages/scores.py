@@ -1,4 +1,4 @@
-"""How far episodes came, method by method, where a task succeeds by degrees: Push-T's overlap, parts that are done."""
+"""How far episodes came, method by method, where a task is graded: Push-T's overlap, parts that are done."""
 
 from __future__ import annotations
 

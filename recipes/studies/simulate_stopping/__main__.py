@@ -15,13 +15,13 @@ from recipes.studies.simulate_stopping.results import save_stopping, simulate_st
 from torchrl_sparse.cli.options import Count
 from torchrl_sparse.cli.recipe import recipe
 
-OPTIONS = {"max_episodes": Count, "looks": Count, "trials": Count}
+OPTIONS = {"max_episodes": Count, "analyses": Count, "trials": Count}
 """Options that no recipe of the library has -> type."""
 
 
 @recipe("simulate_stopping", options=OPTIONS)
 def main(config: DictConfig) -> None:
-    results = simulate_stopping(config.max_episodes, config.looks, config.trials, config.seed)
+    results = simulate_stopping(config.max_episodes, config.analyses, config.trials, config.seed)
     out = Path(config.out)
     save_stopping(results, out / "stopping.json")
     plot_stopping(results, out / "stopping.png")
@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
         print(f"{at}: {pair.success:.1%} of equal methods seem to differ in success, {pair.time:.1%} in time")
     for case in results.errors:
         print(
-            f"{case.looks} looks up to {case.max_episodes}: at most {case.non_inferior:.1%} non-inferior at the margin"
+            f"{case.analyses} analyses up to {case.max_episodes}: at most {case.non_inferior:.1%} non-inferior at the margin"
         )
     for case in results.aggregates:
         print(f"{case.tasks}: success covered {case.success:.1%} at least, time {case.time:.1%}")

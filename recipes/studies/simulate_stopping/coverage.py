@@ -56,11 +56,11 @@ def pair_rates(method: float, dense: float, correlation: float) -> PairRates | N
 def verdict_errors(
     pairs: PairRates, design: Design, trials: int, generator: np.random.Generator
 ) -> tuple[float, float]:
-    """Return how often a method that is worse by exactly the margin is called non-inferior at some look, and inferior.
+    """Return how often a method that is worse by exactly the margin is called non-inferior at some analysis, and inferior.
 
     Args:
         pairs: of the method and dense, with rates that differ by the margin.
-        design: when to look.
+        design: when to analyse.
         trials: simulated benchmarks.
         generator: of their episodes.
     """
@@ -87,7 +87,7 @@ def aggregate_coverage(
     Args:
         pairs: of each task.
         slower: times of solved episodes of the method, over dense's.
-        designs: of each task; one with several looks stops the task where it is decided on success.
+        designs: of each task; one with several analyses stops the task where it is decided on success.
         trials, generator: as `verdict_errors`.
     """
     truth = np.mean([one.won - one.lost for one in pairs])

@@ -34,7 +34,7 @@ def plot_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
     for axes in (left, right):
         axes.set_xlabel("true difference of success rates (points)")
         axes.set_ylim(-3, 103)
-    left.set_title(f"{results.looks} looks, {results.trials} simulated benchmarks a point", loc="left")
+    left.set_title(f"{results.analyses} analyses, {results.trials} simulated benchmarks a point", loc="left")
     right.set_title("decided (○), and found non-inferior by all episodes (×)", loc="left")
     left.legend(frameon=False)
     return save_figure(figure, path)

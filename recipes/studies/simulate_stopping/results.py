@@ -48,7 +48,7 @@ _PAIR_DIFFERENCES = (-0.2, -0.1, 0.0)  # of both from dense: stopped soon, later
 
 @dataclass(frozen=True)
 class TypeOne:
-    """How often non-inferiority is claimed at some look where a method is worse by exactly the margin."""
+    """How often non-inferiority is claimed at some analysis where a method is worse by exactly the margin."""
 
     task: str
     margin: Literal["success", "time, slower", "time, failing more"]
@@ -85,7 +85,7 @@ class StoppingResults:
 
     stopping: Literal[1]
     max_episodes: int
-    looks: int
+    analyses: int
     trials: int
     seed: int
     type_one: tuple[TypeOne, ...]
@@ -95,21 +95,23 @@ class StoppingResults:
     aggregates: tuple[Covered, ...] = ()
 
 
-def simulate_stopping(max_episodes: int, looks: int, trials: int, seed: int = 0) -> StoppingResults:
+def simulate_stopping(max_episodes: int, analyses: int, trials: int, seed: int = 0) -> StoppingResults:
     """Simulate every case.
 
     Args:
-        max_episodes, looks: of the `Design`.
+        max_episodes, analyses: of the `Design`.
         trials: benchmarks of each case.
         seed: of all.
 
     Raises:
         ValueError: for a design that is none.
     """
-    design = Design(max_episodes, looks)
+    design = Design(max_episodes, analyses)
     type_one, saved, pairs = (tuple(cases(design, trials, seed)) for cases in (_type_one, _savings, _pairs))
     errors, aggregates = simulate_errors(trials, seed), simulate_aggregates(trials, seed)
-    return StoppingResults(1, max_episodes, looks, trials, seed, type_one, saved, pairs, errors, aggregates)
+    return StoppingResults(
+        1, max_episodes, analyses, trials, seed, type_one, saved, pairs, errors, aggregates
+    )
 
 
 def _type_one(design: Design, trials: int, seed: int) -> Iterator[TypeOne]:
@@ -181,7 +183,7 @@ def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
     errors = [
         {
             "episodes, at most": str(one.max_episodes),
-            "looks": str(one.looks),
+            "analyses": str(one.analyses),
             "non-inferior all the same": f"{one.non_inferior:.1%}",
             "dense's rate there": f"{one.rate:g}",
             "correlation there": f"{one.correlation:g}",

@@ -27,7 +27,7 @@ _DESIGNS = (
     (300, 30),
     (600, 30),
     (1300, 30),
-)  # caps and looks
+)  # caps and analyses
 _ERROR_TRIALS = 10  # times as many of verdicts: they are cheap
 _AGGREGATES = {
     "2 of 5": [(5, 1)] * 2,
@@ -36,7 +36,7 @@ _AGGREGATES = {
     "3 of 30": [(30, 1)] * 3,
     "5 and 300": [(5, 1), (300, 1)],
     "3 of 1300": [(1300, 1)] * 3,
-    "3 until decided or 300": [(300, 30)] * 3,
+    "3 until conclusive or 300": [(300, 30)] * 3,
 }
 _AGGREGATED = ((0.5, 0.5), (0.95, 0.9), (0.99, 0.94), (0.8, 0.5))  # rates of dense and of the method
 _AGGREGATE_CORRELATIONS = (0.0, 0.6)
@@ -49,13 +49,13 @@ class VerdictErrors:
     """The largest errors over `RATES` and `CORRELATIONS` where a method is worse by exactly the margin of success.
 
     Attributes:
-        max_episodes, looks: of the design.
-        non_inferior, inferior: how often this is claimed at some look.
+        max_episodes, analyses: of the design.
+        non_inferior, inferior: how often this is claimed at some analysis.
         rate, correlation: of dense, where ``non_inferior`` is largest.
     """
 
     max_episodes: int
-    looks: int
+    analyses: int
     non_inferior: float
     inferior: float
     rate: float
@@ -77,7 +77,7 @@ class Covered:
 
 
 def simulate_errors(trials: int, seed: int = 0) -> tuple[VerdictErrors, ...]:
-    """Return the largest errors of verdicts on success under fixed numbers of episodes and under looks.
+    """Return the largest errors of verdicts on success under fixed numbers of episodes and under analyses.
 
     Args:
         trials: a tenth of the benchmarks of each rate, correlation and design.
@@ -93,7 +93,9 @@ def _errors(design: Design, trials: int, seed: int) -> VerdictErrors:
             if pairs := pair_rates(rate - DEFAULT_MARGIN, rate, correlation):
                 found.append((*verdict_errors(pairs, design, trials, generator), rate, correlation))
     most = max(found)
-    return VerdictErrors(design.max_episodes, design.looks, most[0], max(one[1] for one in found), *most[2:])
+    return VerdictErrors(
+        design.max_episodes, design.analyses, most[0], max(one[1] for one in found), *most[2:]
+    )
 
 
 def simulate_aggregates(trials: int, seed: int = 0) -> tuple[Covered, ...]:

@@ -20,7 +20,9 @@ from torchrl_sparse.evaluation.statistics.sequential import Design
 __all__ = ["Population", "Savings", "claim_rates", "pair_errors", "savings"]
 
 _SHAPE = 12.0  # of the gamma distribution of the steps to success: a spread of 29 %, dense's own on Can
-_Look = tuple[int, tuple[float, float]]  # episodes; standard errors above the margins of success and of time
+_Analysis = tuple[
+    int, tuple[float, float]
+]  # episodes; standard errors above the margins of success and of time
 
 
 @dataclass(frozen=True)
@@ -87,19 +89,19 @@ class Savings:
 
 
 def claim_rates(population: Population, design: Design, trials: int, seed: int = 0) -> tuple[float, float]:
-    """Return how often somebody who looks every time sees non-inferiority claimed at some look: in success, and in time.
+    """Return how often somebody who looks every time sees non-inferiority claimed at some analysis: in success, and in time.
 
     At a margin these are type-I errors.
 
     Args:
         population: of the episodes.
-        design: when to look.
+        design: when to analyse.
         trials: simulated benchmarks.
         seed: of their episodes.
     """
     claims = np.zeros(2)
-    for looks in _trials(population, design, trials, seed):
-        beyond = [[z > design.critical(n) for z in statistics] for n, statistics in looks]
+    for analyses in _trials(population, design, trials, seed):
+        beyond = [[z > design.critical(n) for z in statistics] for n, statistics in analyses]
         claims += np.any(beyond, axis=0)
     return float(claims[0]) / trials, float(claims[1]) / trials
 
@@ -111,10 +113,10 @@ def savings(population: Population, design: Design, trials: int, seed: int = 0) 
         population, design, trials, seed: see `claim_rates`.
     """
     fixed, totals = Design(design.max_episodes), np.zeros(4)
-    for looks in _trials(population, design, trials, seed):
-        looks = list(looks)
-        n, worst = _stop(looks, design)
-        at_cap = min(looks[-1][1]) > fixed.critical(design.max_episodes)
+    for analyses in _trials(population, design, trials, seed):
+        analyses = list(analyses)
+        n, worst = _stop(analyses, design)
+        at_cap = min(analyses[-1][1]) > fixed.critical(design.max_episodes)
         totals += 1 - n / design.max_episodes, worst > 0, worst < 0, at_cap
     return Savings(*(float(total) / trials for total in totals))
 
@@ -139,20 +141,20 @@ def pair_errors(population: Population, design: Design, trials: int, seed: int =
     return float(errors[0]) / trials, float(errors[1]) / trials
 
 
-def _stop(looks: Iterable[_Look], design: Design) -> tuple[int, float]:
+def _stop(analyses: Iterable[_Analysis], design: Design) -> tuple[int, float]:
     """Return the episodes after which a verdict is reached and the lesser of the statistics that reach it, 0 at an open end."""
-    return next(((n, min(z)) for n, z in looks if design.decides(n, *z)), (design.max_episodes, 0.0))
+    return next(((n, min(z)) for n, z in analyses if design.decides(n, *z)), (design.max_episodes, 0.0))
 
 
-def _trials(population: Population, design: Design, trials: int, seed: int) -> Iterator[Iterator[_Look]]:
-    """Yield the looks of each benchmark."""
+def _trials(population: Population, design: Design, trials: int, seed: int) -> Iterator[Iterator[_Analysis]]:
+    """Yield the analyses of each benchmark."""
     generator = np.random.default_rng(seed)
     for _ in range(trials):
         yield _looks(*population.draw(design.max_episodes, generator), design, population)
 
 
-def _looks(method: NDArray, dense: NDArray, design: Design, population: Population) -> Iterator[_Look]:
-    """Yield the number of episodes and both statistics at each look."""
+def _looks(method: NDArray, dense: NDArray, design: Design, population: Population) -> Iterator[_Analysis]:
+    """Yield the number of episodes and both statistics at each analysis."""
     return ((n, _statistics(method[:n], dense[:n], population.horizon)) for n in design.ends)
 
 

@@ -62,7 +62,7 @@ def test_of_the_right_ones_the_fastest_is_taken_or_within_a_budget_the_surest():
         "dense": played(0.0),
         "better": played(-0.01),
         "cache": played(-0.04),
-        "even": played(0.2, time="undecided"),
+        "even": played(0.2, time="inconclusive"),
     }
     assert choose(ranking, CANDIDATES, outcomes, 50) == "better"
     outcomes["good"] = played(-0.03)
@@ -70,6 +70,6 @@ def test_of_the_right_ones_the_fastest_is_taken_or_within_a_budget_the_surest():
 
 
 def test_where_none_is_right_the_nearest_is_taken_and_without_episodes_the_first():
-    outcomes = {"cache": played(-0.4, "undecided"), "even": played(-0.2, "undecided")}
+    outcomes = {"cache": played(-0.4, "inconclusive"), "even": played(-0.2, "inconclusive")}
     assert choose(["better", "cache", "even"], CANDIDATES, outcomes, None) == "even"
     assert choose(["better", "cache"], CANDIDATES, {}, None) == "better"

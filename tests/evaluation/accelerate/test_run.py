@@ -140,7 +140,7 @@ def test_finalists_are_played_until_they_are_decided_and_the_right_one_is_taken(
     assert found.played["ddpm2_logsnr"].paired_vs_dense.verdict == "inferior"
     assert found.played["ddpm2_logsnr"].success.n < 300
     results = load_results(tmp_path / "results.json")
-    assert results.until_decided.max_episodes == 300
+    assert results.until_conclusive.max_episodes == 300
     assert results.methods["ddim4"].speedup_vs_dense == pytest.approx(4.5)
     page = read_table(tmp_path / "acceleration.json", "played")
     assert [page.name(row) for row in page.rows] == ["dense", "ddpm2_logsnr", "ddim4 (chosen)"]

@@ -12,7 +12,7 @@ from torchrl_sparse.evaluation.results.build import MethodRun
 from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 
-TASK = SimpleNamespace(name="Lift", early_cut=None, by_degrees=False)
+TASK = SimpleNamespace(name="Lift", early_cut=None, graded=False)
 ASKED = {
     **{"task": "lift", "n_action_steps": 8, "episodes": 3, "horizon": 40, "margin": 0.05, "time_margin": 0.1},
     **{"threads": 1, "latency_repeats": 2, "seed": 5, "dense_log": None, "table": "short"},
@@ -74,7 +74,7 @@ def test_denses_episodes_may_lie_elsewhere(noted, tmp_path):
 
 
 def test_it_plays_until_it_is_decided(noted, tmp_path):
-    asked = ASKED | {"out": tmp_path, "until": "decided", "max_episodes": 400}
+    asked = ASKED | {"out": tmp_path, "until": "conclusive", "max_episodes": 400}
     results = Noted(BenchmarkOptions.of(asked), noted).run()
-    assert results.until_decided.max_episodes == 400
+    assert results.until_conclusive.max_episodes == 400
     assert results.methods["fast"].success.n < 400

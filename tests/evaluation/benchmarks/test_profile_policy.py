@@ -1,4 +1,4 @@
-"""One recipe tells where a call's time goes: of states, with cameras, under a planner that looks, or a VLA."""
+"""One recipe tells where a call's time goes: of states, with cameras, under an observation-conditioned planner, or a VLA."""
 
 import sys
 from functools import partial

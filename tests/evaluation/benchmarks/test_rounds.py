@@ -30,8 +30,8 @@ class Player:
         return episodes_of(name)[:n]
 
 
-def terms(looks):
-    return Terms(Design(1000, looks), episode_horizon=400)
+def terms(analyses):
+    return Terms(Design(1000, analyses), episode_horizon=400)
 
 
 def test_a_fixed_number_is_played_by_all():
@@ -69,12 +69,12 @@ def test_dense_alone_is_played_to_the_end():
 
 
 def test_a_design_is_a_number_or_a_cap():
-    assert make_design("decided", 5, 90).ends[-1] == 90
-    assert make_design("decided", 5, 90) == Design(90, 9)
+    assert make_design("conclusive", 5, 90).ends[-1] == 90
+    assert make_design("conclusive", 5, 90) == Design(90, 9)
     assert make_design("episodes", 5, 90) == Design(5)
-    assert make_design("decided", 5, 100).ends == tuple(range(10, 101, 10))  # not after every few episodes
-    assert make_design("decided", 5, 7).ends == (7,)
+    assert make_design("conclusive", 5, 100).ends == tuple(range(10, 101, 10))  # not after every few episodes
+    assert make_design("conclusive", 5, 7).ends == (7,)
     with refused("until"):
         make_design("bored", 5, 90)
-    with refused("looks"):
+    with refused("analyses"):
         make_design("episodes", 0, 90)

@@ -45,7 +45,9 @@ def test_every_method_answers_the_second_query_with_what_it_remembers_of_the_fir
             case.answer(name)[keys.CHUNK], case.answer(name)[keys.CHUNK]
         )  # nothing is left behind
     assert case.answer("dense")[keys.KEPT].item() == SPEC.num_visual
-    assert case.answer("frames")[keys.KEPT].item() == SPEC.num_visual / 2  # a first policy call would keep all
+    assert (
+        case.answer("frames")[keys.KEPT].item() == SPEC.num_visual / 2
+    )  # a first policy call would keep all
     depth = case.answer("specprune")[keys.TOKEN_DEPTH][0]
     assert SPEC.num_visual > (depth > 2).sum() > (depth == SPEC.num_layers).sum() > 0
 

@@ -3,7 +3,7 @@
 import pytest
 from PIL import Image
 
-from recipes.studies.pages.late_pairs import late_pair_rows
+from recipes.studies.pages.delayed_pairs import late_pair_rows
 from tests.evaluation.synthetic import MACHINE
 from tests.refusals import refused
 from torchrl_sparse.evaluation.figures.realtime import plot_realtime

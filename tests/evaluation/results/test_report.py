@@ -39,7 +39,7 @@ def test_build_computes_what_the_schema_promises():
     results = build({"dense": dense, "fast": fast}, margin=0.1)
     entry = results.methods["fast"]
     assert entry.success == Success(k=10, n=20, rate=0.5, ci95=wilson_interval(10, 20))
-    assert entry.paired_vs_dense == Difference(-0.25, tango_interval(0, 5, 20), 0.1, "undecided", 0.0625)
+    assert entry.paired_vs_dense == Difference(-0.25, tango_interval(0, 5, 20), 0.1, "inconclusive", 0.0625)
     assert entry.flops == Flops(per_query=2.0, ratio_to_dense=0.2)
     assert entry.latency_s == Percentiles(0.25, 0.25, 5)
     assert entry.speedup_vs_dense == 4.0
@@ -75,8 +75,9 @@ def test_planning_is_reported_where_it_was_timed():
     results = build({"dense": run([1, 0]), "sag": planned})
     assert results.methods["sag"].planning_s.p50 == 3e-4
     assert results.dense.planning_s is None
-    assert "Planning takes, of that and measured within policy calls, 0.3 ms (3.0 %) under sag." in format_table(
-        results
+    assert (
+        "Planning takes, of that and measured within policy calls, 0.3 ms (3.0 %) under sag."
+        in format_table(results)
     )
     assert "Planning takes" not in format_table(build({"dense": run([1, 0])}))
 
@@ -184,7 +185,7 @@ def test_table_covers_the_methods_that_ran():
 
 
 def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_look():
-    design = Design(40, looks=2)
+    design = Design(40, analyses=2)
     dense, slow = run([1, 1, 1, 0] * 10), run([1, 0, 1, 0] * 5)
     results = build({"dense": dense, "slow": slow}, design)
     entry, level = results.methods["slow"], design.confidence(20)

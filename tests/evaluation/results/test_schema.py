@@ -137,7 +137,7 @@ def test_all_methods_have_as_many_episodes():
 def test_methods_may_stop_early_where_the_file_says_so():
     results, fewer = make_results(20), make_results(10)
     stopped = {**results.methods, "bac": fewer.methods["bac"]}
-    early = replace(results, methods=stopped, until_decided=Stopping(20, 2))
+    early = replace(results, methods=stopped, until_conclusive=Stopping(20, 2))
     assert early.methods["bac"].success.n == 10
     more = {"dense": fewer.dense, "bac": results.methods["bac"]}
     with refused("methods.bac.success.n"):

@@ -113,13 +113,13 @@ def _coverage(intervals, n, p_won, p_lost):
 def test_verdicts():
     assert verdict((-0.049, 0.2)) == "non-inferior"
     assert verdict((-0.3, -0.051)) == "inferior"
-    assert verdict((-0.051, 0.2)) == "undecided"
+    assert verdict((-0.051, 0.2)) == "inconclusive"
     assert verdict((-0.08, 0.0), margin=0.1) == "non-inferior"
 
 
 def test_identical_outcomes_need_enough_episodes():
     needed = episodes_needed(0.05)
-    for n, expected in ((needed - 1, "undecided"), (needed, "non-inferior")):
+    for n, expected in ((needed - 1, "inconclusive"), (needed, "non-inferior")):
         assert paired_difference([True] * n, [True] * n).verdict == expected
 
 

@@ -14,15 +14,15 @@ from torchrl_sparse.evaluation.statistics.intervals import tango_interval, tango
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
 CAN, LIFT = Population(0.87, 0.0, 104), Population(0.9975, 0.0, 29)
-DESIGN, TRIALS = Design(1300, looks=30), 1000
+DESIGN, TRIALS = Design(1300, analyses=30), 1000
 
 
 @pytest.mark.parametrize(
-    ("shape", "looks", "constant"), [(0.5, 2, 2.178), (0.5, 5, 2.413), (0, 2, 1.977), (0, 5, 2.040)]
+    ("shape", "analyses", "constant"), [(0.5, 2, 2.178), (0.5, 5, 2.413), (0, 2, 1.977), (0, 5, 2.040)]
 )
-def test_the_ends_of_the_family_are_pococks_and_obrien_and_flemings(monkeypatch, shape, looks, constant):
+def test_the_ends_of_the_family_are_pococks_and_obrien_and_flemings(monkeypatch, shape, analyses, constant):
     monkeypatch.setattr(sequential, "_SHAPE", shape)
-    times = tuple((look + 1) / looks for look in range(looks))
+    times = tuple((analysis + 1) / analyses for analysis in range(analyses))
     assert sequential._crossing(constant, times) == pytest.approx(0.05, abs=1e-4)
 
 
@@ -77,7 +77,7 @@ def test_a_method_is_decided_by_both_measures_or_by_one_that_is_inferior():
 
 
 def test_p_values_count_the_looks():
-    design = Design(1000, looks=10)
+    design = Design(1000, analyses=10)
     for n in design.ends:
         assert design.p_value(design.critical(n), n) == pytest.approx(0.025, abs=1e-4)
     assert design.p_value(3.0, 1000) > Design(1000).p_value(3.0, 1000) == pytest.approx(0.00135, abs=1e-5)
@@ -85,9 +85,9 @@ def test_p_values_count_the_looks():
 
 
 def test_designs_that_are_none_are_refused():
-    with refused("looks"):
-        Design(10, looks=11)
-    with refused("looks"):
+    with refused("analyses"):
+        Design(10, analyses=11)
+    with refused("analyses"):
         Design(0)
     with refused("episodes"):
         DESIGN.critical(44)
@@ -95,7 +95,7 @@ def test_designs_that_are_none_are_refused():
 
 def test_published_simulations_are_what_their_command_makes():
     published = load_stopping("assets/statistics/stopping.json")
-    assert (published.max_episodes, published.looks, published.trials) == (1300, 30, 2000)
+    assert (published.max_episodes, published.analyses, published.trials) == (1300, 30, 2000)
     assert all(case.rate <= 0.05 for case in published.type_one)
     assert all(max(case.success, case.time) < 0.08 for case in published.pairs)
     few = simulate_stopping(130, 3, 2)
@@ -105,9 +105,9 @@ def test_published_simulations_are_what_their_command_makes():
 
 
 def test_equal_methods_that_dense_stopped_seem_to_differ_about_as_often_as_intervals_say():
-    """With one look nothing but the intervals is tested."""
+    """With one analysis nothing but the intervals is tested."""
     population = Population(0.8, -0.15, 100)
-    for design in (Design(200), Design(300, looks=15)):
+    for design in (Design(200), Design(300, analyses=15)):
         for rate in pair_errors(population, design, trials=1000):
             assert 0.022 < rate < 0.078  # 5 %, give or take four of its standard errors
 
@@ -116,8 +116,8 @@ def test_a_single_pair_decides_nothing():
     assert abs(time_z([30], [30], 400, 1.1)) < 1
 
 
-@pytest.mark.parametrize("looks", [1, 30])
-def test_a_p_value_never_grows_with_the_evidence(looks):
-    p_values = [Design(300, looks).p_value(z, 300) for z in (1, 2, 4, 8, 20, 60, math.inf)]
+@pytest.mark.parametrize("analyses", [1, 30])
+def test_a_p_value_never_grows_with_the_evidence(analyses):
+    p_values = [Design(300, analyses).p_value(z, 300) for z in (1, 2, 4, 8, 20, 60, math.inf)]
     assert p_values == sorted(p_values, reverse=True)
     assert p_values[-1] < 1e-12

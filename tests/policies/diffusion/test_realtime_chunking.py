@@ -107,7 +107,11 @@ class Asked(TensorDictModuleBase):
 
 @pytest.mark.parametrize(
     ("latency", "delays"),
-    [(0.1, [2, 2, 2, 2]), (0.0, [0, 0, 0, 0]), (None, [0, 1, 3, 2])],  # measured: that of the policy call before
+    [
+        (0.1, [2, 2, 2, 2]),
+        (0.0, [0, 0, 0, 0]),
+        (None, [0, 1, 3, 2]),
+    ],  # measured: that of the policy call before
 )
 def test_the_executor_says_how_late_the_answer_will_be(latency, delays):
     policy = Asked([0.05, 0.15, 0.1, 0.05])

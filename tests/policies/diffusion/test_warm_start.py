@@ -9,7 +9,7 @@ from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler, keys
 from torchrl_sparse.blocks.engine.native.library import native_available
 from torchrl_sparse.blocks.planner import StaticPlanner
 from torchrl_sparse.networks.diffusion.noise import sample_noise
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, shift_chunk
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart, WarmStart, shift_chunk
 
 ENGINES = ["reference", "torch", *(["native"] if native_available()[0] else [])]
 SAMPLERS = ["ddpm8", "ddpm_82_41_14", "ddim10_eta0.5", "unipc10", "sde2m5"]
@@ -166,7 +166,7 @@ def test_what_cannot_be_served_is_refused_and_changes_nothing(policy, tmp_path):
     assert not (tmp_path / "policy").exists()
 
 
-class Elsewhere(ColdStart):
+class Elsewhere(QueryStart):
     """A start of another package."""
 
 

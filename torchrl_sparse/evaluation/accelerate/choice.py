@@ -77,7 +77,7 @@ def choose(
 ) -> str:
     """Return the method to take.
 
-    Of the methods that are non-inferior to dense in success and in time, or in the score of a task done by degrees: with a
+    Of the methods that are non-inferior to dense in success and in time, or in the score of a graded task: with a
     budget, which all of them keep, the one that is surest; else the fastest. Where none is shown to be, the one whose interval
     reaches least below dense. Where none was played, the first of the ranking.
     """

@@ -47,7 +47,7 @@ class Finalists(DiffusionBenchmark):
         options = BenchmarkOptions(
             **{name: getattr(request, name) for name in shared},
             out=out,
-            until="decided",
+            until="conclusive",
             max_episodes=request.episodes,
             num_envs=1,  # in a batch all would be stepped on until the last, perhaps a failure, ends
             device=str(methods[DENSE].device),

@@ -104,7 +104,7 @@ class Benchmark(ABC):
         design = make_design(options.until, options.episodes, options.max_episodes)
         self.seeds = evaluation_seeds(options.split, options.seed, design.max_episodes)
         horizon, margins = episode_horizon(make_env, self.seeds), (options.margin, options.time_margin)
-        self.terms = Terms(design, horizon, task.early_cut, *margins, task.by_degrees)
+        self.terms = Terms(design, horizon, task.early_cut, *margins, task.graded)
         self.settings = {name: getattr(options, name) for name in ("task", "horizon", "n_action_steps")}
 
     def run(self) -> Results:

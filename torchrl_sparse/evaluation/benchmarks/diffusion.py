@@ -26,7 +26,7 @@ from torchrl_sparse.evaluation.figures.plots import (
     plot_schedule,
     plot_similarity,
 )
-from torchrl_sparse.evaluation.figures.ways import plot_ways, told_ways
+from torchrl_sparse.evaluation.figures.ways import count_modes, plot_ways
 from torchrl_sparse.evaluation.latency.measure import Latency
 from torchrl_sparse.evaluation.latency.queries import time_planning, time_queries
 from torchrl_sparse.evaluation.results.build import MethodRun
@@ -99,7 +99,7 @@ class DiffusionBenchmark(Benchmark):
 
     def draw(self, results: Results, episodes: Episodes) -> None:
         draw_methods(results, self.methods, self.queries, self.calibration(), self.out)
-        if ways := told_ways(episodes):
+        if ways := count_modes(episodes):
             title = f"{results.task}, {results.split} seeds: ways that were taken"
             plot_ways(ways, self.out / "ways.png", title=title)
         self.film(self.options.videos)

@@ -16,32 +16,32 @@ from torchrl_sparse.evaluation.statistics.sequential import Design
 
 __all__ = ["episode_horizon", "make_design", "play_rounds"]
 
-_LOOKS = 30  # of a benchmark that goes on until it is decided, at most
-_BETWEEN = 10  # episodes from one look to the next, at least: each makes its environments again
-_UNTIL = ("episodes", "decided")
+_ANALYSES = 30  # of a benchmark that goes on until it is decided, at most
+_BETWEEN = 10  # episodes from one analysis to the next, at least: each makes its environments again
+_UNTIL = ("episodes", "conclusive")
 
 
 def make_design(until: str, episodes: int, max_episodes: int) -> Design:
-    """Return when a benchmark looks at its episodes.
+    """Return when a benchmark analyses its episodes.
 
     Args:
-        until: "episodes" for a fixed number, "decided" to go on until a method's verdicts are reached.
+        until: "episodes" for a fixed number, "conclusive" to go on until a method's verdicts are reached.
         episodes: that fixed number.
         max_episodes: cap of the others; part of the design, and so not to be raised once episodes were seen.
 
     Raises:
         ValueError: for another ``until``, or a number below 1.
 
-    >>> make_design("episodes", 400, 1300).ends, make_design("decided", 400, 1300).ends[:2]
+    >>> make_design("episodes", 400, 1300).ends, make_design("conclusive", 400, 1300).ends[:2]
     ((400,), (43, 86))
-    >>> make_design("decided", 1, 60).ends
+    >>> make_design("conclusive", 1, 60).ends
     (10, 20, 30, 40, 50, 60)
     """
     if until not in _UNTIL:
         raise InputError(f"until: expected {' or '.join(_UNTIL)}, got {until!r}")
     if until == "episodes":
         return Design(episodes)
-    return Design(max_episodes, max(1, min(_LOOKS, max_episodes // _BETWEEN)))
+    return Design(max_episodes, max(1, min(_ANALYSES, max_episodes // _BETWEEN)))
 
 
 def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> int:
@@ -60,7 +60,7 @@ def play_rounds(
 ) -> dict[str, list[EpisodeResult]]:
     """Play every method until its verdict is reached or the cap is, and dense as far as any of them.
 
-    Nothing but the episodes decides, look by look, so a benchmark that was killed stops where it would have stopped.
+    Nothing but the episodes decides, analysis by analysis, so a benchmark that was killed stops where it would have stopped.
 
     Args:
         names: of methods, dense among them or not.

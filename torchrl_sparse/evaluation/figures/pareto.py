@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["plain_log_ticks", "plot_pareto"]
 
 _FRONT_COLOR = "#B5B5BA"
-_MARKERS = {"non-inferior": "o", "undecided": "D", "inferior": "X"}
+_MARKERS = {"non-inferior": "o", "inconclusive": "D", "inferior": "X"}
 
 
 def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
@@ -48,7 +48,7 @@ def plot_pareto(results: Results, path: str | os.PathLike) -> Path:
     _set_limits(axes, points, min(low for low, _ in intervals.values()))
     _draw_margin(axes, points[DENSE][1], 100 * results.dense.paired_vs_dense.margin, colors[DENSE])
     axes.set_xlabel("latency per policy call, median (ms, log scale)")
-    what = "score, % of the highest" if results.by_degrees else "success (%)"
+    what = "score, % of the highest" if results.graded else "success (%)"
     axes.set_ylabel(f"{what}, 95 % interval")
     title = f"{results.task}: {results.dense.success.n} paired episodes; {results.machine.cpu}"
     axes.set_title(f"{title}, {threads_text(results.machine.threads)}", loc="left")

@@ -11,13 +11,13 @@ from torchrl_sparse.envs.seeded import BETWEEN, NO_WAY
 from torchrl_sparse.evaluation.rollouts.episodes import EpisodeResult
 from torchrl_sparse.evaluation.statistics.ways import way_entropy
 
-__all__ = ["plot_ways", "told_ways"]
+__all__ = ["plot_ways", "count_modes"]
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#8C6BB1")  # of ways, from 0 on
 _OTHERS = {BETWEEN: ("went between", "#B2182B"), NO_WAY: ("none", "#D0D0D4")}
 
 
-def told_ways(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
+def count_modes(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
     """Return the ways of each method's episodes; a method whose task tells none is left out."""
     ways = {name: [e.way for e in played if e.way is not None] for name, played in episodes.items()}
     return {name: told for name, told in ways.items() if told}

@@ -63,7 +63,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
     """Measure the median seconds of a policy call in the native engine, and of what happens in it, interleaved.
 
     Args:
-        policy: of states, on the CPU, with a planner that does not look at the observation.
+        policy: of states, on the CPU, with a planner that ignores the observation.
         repeats: timed rounds.
         warmup: untimed rounds before them.
 
@@ -88,9 +88,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
     if not isinstance(engine, NativeEngine):
         raise InputError(f"engine: expected native, got {engine.name}")
     if not policy.plan.is_static:
-        raise InputError(
-            f"plan: expected one that does not look at the observation, got {type(policy.plan).__name__}"
-        )
+        raise InputError(f"plan: expected one that ignores the observation, got {type(policy.plan).__name__}")
     noise, state, seed = policy.sample_noise(torch.tensor([1])), query["history", "state"], torch.tensor([1])
     mask, watch = policy.plan.static_mask, NativeWatch(policy.network)
     chunk = policy(query.copy())[keys.CHUNK]

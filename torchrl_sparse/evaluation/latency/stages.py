@@ -99,7 +99,7 @@ def stage_seconds(
 
     Returns:
         ``"query"``, the whole of it; ``"encode"``, of which, with cameras, ``"pixels"`` (crop and units of all images) and, by
-        camera, ``"camera <name>"`` (its network) are parts; ``"plan"``, of a planner that looks at the observation;
+        camera, ``"camera <name>"`` (its network) are parts; ``"plan"``, of an observation-conditioned planner;
         ``"denoise"``, with all its steps; ``"rest"``, what is none of these: keys and Python. With cameras, ``"encode, plain"``
         is what their networks take on weights that are not packed, for comparison.
     """

@@ -76,7 +76,7 @@ class Played:
 
     @property
     def judged(self) -> Difference:
-        """What it is judged by: success, or the score of a task that is done by degrees."""
+        """What it is judged by: success, or the score of a task that is graded."""
         return self.score.vs_dense if self.score else self.paired_vs_dense
 
     @property

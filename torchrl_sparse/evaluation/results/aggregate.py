@@ -61,14 +61,14 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: naming the file, if one is of a task that is done by degrees, dense solved nothing in it, or
+        ValueError: naming the file, if one is of a task that is graded, dense solved nothing in it, or
             its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
     for path, results in found.items():
-        if results.by_degrees:
+        if results.graded:
             raise InputError(
-                f"{path}: expected a task that success and time decide, got {results.task}, by degrees"
+                f"{path}: expected a task that success and time decide, got {results.task}, graded"
             )
         if results.dense_did_nothing:
             raise InputError(f"{path}: {NONE_SOLVED}")
@@ -104,10 +104,10 @@ def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:
 
 
 def _pairs(name: str, path: Path, results: Results) -> TaskPairs:
-    n, stopping = results.methods[name].success.n, results.until_decided
+    n, stopping = results.methods[name].success.n, results.until_conclusive
     ours, theirs = (_episodes(path, method, results.first_seed, n) for method in (name, DENSE))
     pairs = pair_episodes(name, ours, DENSE, theirs)
-    design = Design(stopping.max_episodes, stopping.looks) if stopping else None
+    design = Design(stopping.max_episodes, stopping.analyses) if stopping else None
     return TaskPairs(pairs.solved, pairs.times(results.episode_horizon), results.episode_horizon, design)
 
 

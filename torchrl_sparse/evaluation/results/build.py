@@ -47,7 +47,7 @@ class MethodRun:
         latency: of one policy call, measured interleaved with the other methods.
         action_error: (mean, maximum) absolute difference of its chunks to the dense policy's, on the same
             observations and the same noise; (0, 0) for the dense policy.
-        planning: of the planner alone, within a call; where it looks at the observation.
+        planning: of the planner alone, within a call; where it reads the observation.
         every: environment steps from one call to the next, of a method that says so itself.
         executed_flops: of a call, that the engine really does; None where that is not counted.
     """
@@ -68,9 +68,9 @@ class Terms:
         design: when the episodes are looked at.
         episode_horizon: steps after which an episode is truncated.
         early_cut: of the task, see `torchrl_sparse.envs.tasks`; None for a task without one.
-        margin: of success: a difference of rates; of a task that is done by degrees, of mean scores.
+        margin: of success: a difference of rates; of a task that is graded, of mean scores.
         time_margin: of the restricted mean time: a share of dense's.
-        by_degrees: whether scores decide instead of success and time, see `torchrl_sparse.envs.task.Task`.
+        graded: whether scores decide instead of success and time, see `torchrl_sparse.envs.task.Task`.
     """
 
     design: Design
@@ -78,7 +78,7 @@ class Terms:
     early_cut: int | None = None
     margin: float = DEFAULT_MARGIN
     time_margin: float = DEFAULT_TIME_MARGIN
-    by_degrees: bool = False
+    graded: bool = False
 
     def statistics(self, pairs: EpisodePairs) -> tuple[float, float]:
         """Return by how many standard errors success and time are better than their margins."""
@@ -89,8 +89,8 @@ class Terms:
         return pairs.score_statistic(self.margin)
 
     def decided(self, pairs: EpisodePairs) -> bool:
-        """Tell whether the verdict of a method on these episodes, at a look of the design, is reached."""
-        deciding = (self.score_statistic(pairs),) if self.by_degrees else self.statistics(pairs)
+        """Tell whether the verdict of a method on these episodes, at an analysis of the design, is reached."""
+        deciding = (self.score_statistic(pairs),) if self.graded else self.statistics(pairs)
         return self.design.decides(len(pairs.method), *deciding)
 
 
@@ -136,7 +136,7 @@ def build_results(
         policy,
         {name: _entry(name, run, runs[DENSE], terms, uneven=uneven) for name, run in runs.items()},
         early_cut=terms.early_cut,
-        until_decided=Stopping(design.max_episodes, design.looks) if design.looks > 1 else None,
+        until_conclusive=Stopping(design.max_episodes, design.analyses) if design.analyses > 1 else None,
         pairs=tuple(_pair(pair, runs, terms) for pair in pairs) or None,
         settings=None if settings is None else dict(settings),
     )
@@ -193,7 +193,7 @@ def _pair(names: Sequence[str], runs: Mapping[str, MethodRun], terms: Terms) -> 
     if len(names) != 2 or not set(names) <= set(runs):
         raise InputError(f"pairs: expected two of {', '.join(runs)}, got {list(names)}")
     first, second = (runs[name].episodes for name in names)
-    if terms.design.looks > 1:  # methods may have stopped after different numbers of episodes
+    if terms.design.analyses > 1:  # methods may have stopped after different numbers of episodes
         shared = {episode.seed for episode in first} & {episode.seed for episode in second}
         first, second = ([e for e in episodes if e.seed in shared] for episodes in (first, second))
     return compare_pair(names[0], first, names[1], second, terms)
@@ -225,7 +225,7 @@ def compare_pair(
         n=len(pairs.method),
         success=solved,
         time=times,
-        score=_gain(pairs, terms.margin) if terms.by_degrees else None,
+        score=_gain(pairs, terms.margin) if terms.graded else None,
     )
 
 
@@ -252,7 +252,7 @@ def compare_episodes(
         "restricted_mean_time": float(ours.mean()),
         "success_within": {str(step): share for step, share in shares.items()},
         "correlation_with_dense": correlation(ours, theirs),
-        "score": _score(name, pairs, terms) if terms.by_degrees else None,
+        "score": _score(name, pairs, terms) if terms.graded else None,
     }
 
 
@@ -277,7 +277,7 @@ def _to_dense(pairs: EpisodePairs, terms: Terms) -> dict[str, Any]:
     times = pairs.time_ratio(horizon, terms.time_margin, confidence)
     p_values = [design.p_value(abs(z), n) for z in terms.statistics(pairs)]
     if not any(map(any, pairs.solved)):  # as alike as two policies that do nothing
-        solved, times = (replace(one, verdict="undecided") for one in (solved, times))
+        solved, times = (replace(one, verdict="inconclusive") for one in (solved, times))
         p_values = [0.5, 0.5]
     return {
         "paired_vs_dense": solved,

@@ -13,12 +13,12 @@ __all__ = ["num_comparisons", "survivors", "surviving"]
 
 def num_comparisons(results: Results) -> int:
     """Return the verdicts of the table: on success and on time, or on the score alone, of every method but dense."""
-    return (1 if results.by_degrees else 2) * (len(results.methods) - 1)
+    return (1 if results.graded else 2) * (len(results.methods) - 1)
 
 
 def survivors(results: Results) -> set[str]:
     """Return which verdicts, as ``"NAME success"`` and ``"NAME time"``, survive Holm's correction."""
-    if results.by_degrees:
+    if results.graded:
         scores = {name: method.score.p_value for name, method in results.methods.items()}
         p_values = {f"{name} success": p for name, p in scores.items() if p is not None}
         return holm(p_values, num_comparisons(results))

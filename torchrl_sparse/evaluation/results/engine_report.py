@@ -197,7 +197,10 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
     steps = [f"{1e6 * seconds:.1f} µs in {name}" for name, seconds in shape.all_pruned_step_s.items()]
     text = [head, table, f"A step that computes nothing takes {', '.join(steps)}."]
     if shape.image_parts_s:
-        text += ["Whole policy calls, cameras included.", markdown_table(image_part_rows(shape.image_parts_s))]
+        text += [
+            "Whole policy calls, cameras included.",
+            markdown_table(image_part_rows(shape.image_parts_s)),
+        ]
     return "\n\n".join(text)
 
 

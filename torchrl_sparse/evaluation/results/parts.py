@@ -72,7 +72,7 @@ class Success:
 
 @dataclass(frozen=True)
 class Score:
-    """Mean score of episodes, of a task that is done by degrees, with Student's 95 % interval, and beside dense's.
+    """Mean score of episodes, of a task that is graded, with Student's 95 % interval, and beside dense's.
 
     Attributes:
         vs_dense: mean paired difference; see `Difference`.
@@ -182,7 +182,7 @@ class PairedEntry:
         n: episodes of each.
         success: of the first minus that of the second.
         time: restricted mean time of the first over that of the second.
-        score: mean score of the first minus that of the second, where a task is done by degrees.
+        score: mean score of the first minus that of the second, where a task is graded.
     """
 
     method: str
@@ -195,7 +195,7 @@ class PairedEntry:
 
     @property
     def judged(self) -> Difference:
-        """What the verdict is on: the score, where a task is done by degrees, else success."""
+        """What the verdict is on: the score, where a task is graded, else success."""
         return self.score or self.success
 
     def __post_init__(self) -> None:

@@ -138,7 +138,7 @@ def results_note(results: Results) -> str:
     """Return the lines that explain the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
     n, margin = _num_pairs(results), dense.paired_vs_dense.margin
-    compared, scored = "difference to dense with Tango's", results.by_degrees
+    compared, scored = "difference to dense with Tango's", results.graded
     if scored:
         compared = "score, the highest reward of an episode, and its difference to dense with Student's; verdicts are on it"
     steps, flops = f"{policy.num_inference_steps} denoising steps", "planner and denoiser, as published"
@@ -150,9 +150,9 @@ def results_note(results: Results) -> str:
         f"{results.task}, {episodes_text(results)}: the same initial states "
         f"and seeds of noise for every method. Success with Wilson's 95 % interval, {compared}.",
         f"Verdict against a margin of {100 * margin:g} points: non-inferior if the whole interval lies above "
-        f"-{100 * margin:g}, inferior if it lies below, else undecided (too few episodes to tell); worse if it lies "
+        f"-{100 * margin:g}, inferior if it lies below, else inconclusive (too few episodes to tell); worse if it lies "
         "below 0, whatever the margin.",
-        *(() if scored else [_MCNEMAR + (_STOPPED if results.until_decided else ".")]),
+        *(() if scored else [_MCNEMAR + (_STOPPED if results.until_conclusive else ".")]),
         *([] if scored else [_time_line(results)]),
         f"{num_comparisons(results)} comparisons with dense in this table; † marks a verdict that does not survive Holm's "
         "correction for them.",
@@ -188,10 +188,10 @@ def episodes_text(results: Results) -> str:
     """Say how many episodes a method has played, and on which seeds."""
     n = _num_pairs(results)
     seeds = f"{results.split} seeds from {results.first_seed}"
-    if (stopping := results.until_decided) is None:
+    if (stopping := results.until_conclusive) is None:
         return f"{n} paired episodes a method ({seeds})"
     return (
-        f"paired episodes ({seeds}) until a method's verdicts are reached, looked at {stopping.looks} times up to "
+        f"paired episodes ({seeds}) until a method's verdicts are reached, with {stopping.analyses} interim analyses up to "
         f"{stopping.max_episodes}; intervals of differences are as much wider as that takes"
     )
 
@@ -206,7 +206,7 @@ def _time_line(results: Results) -> str:
 
 
 def _planning(methods: Mapping[str, MethodEntry]) -> Iterator[str]:
-    """Yield what each planner that looks at the observation takes, and its share of a policy call."""
+    """Yield what each observation-conditioned planner takes, and its share of a policy call."""
     for name, method in methods.items():
         if method.planning_s:
             seconds = method.planning_s.p50

@@ -63,7 +63,7 @@ class MethodEntry:
         speedup_vs_dense: ratio of the medians.
         action_error_vs_dense: of its actions.
         episode_length: mean, environment steps.
-        planning_s: part of a call in which the planner decides; where it looks at the observation.
+        planning_s: part of a call in which the planner decides; where it reads the observation.
         tokens: that it keeps; of policies with visual tokens.
         restricted_mean_time: steps to success, mean; an episode that is not solved counts the horizon.
         time_vs_dense: its ratio to the dense policy's.
@@ -71,7 +71,7 @@ class MethodEntry:
         correlation_with_dense: Pearson's, of times over the seeds; None where times never differ.
         p_values: of the two verdicts; None of dense.
         speedup_ci95: interval of ``speedup_vs_dense``, from the rounds of the measurement; None in older files.
-        score: of a task that is done by degrees; its verdict is the one that counts there.
+        score: of a task that is graded; its verdict is the one that counts there.
         per_episode: what an episode costs; of policies with visual tokens, whose calls differ, or where methods are asked
             unequally often.
     """
@@ -115,7 +115,7 @@ class Stopping:
     """Of a benchmark that went on until verdicts were reached: see `torchrl_sparse.evaluation.statistics.sequential.Design`."""
 
     max_episodes: int
-    looks: int
+    analyses: int
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Results:
         policy: the dense one.
         methods: name -> entry.
         early_cut: steps of the task's pre-registered early cut; None for a task without one.
-        until_decided: where methods have as many episodes as their verdicts took; None where all have the same.
+        until_conclusive: where methods have as many episodes as their verdicts took; None where all have the same.
         pairs: methods against each other; None where none were asked for.
         settings: what else the methods depend on, such as the options of pruners and controllers, and the shares at which
             methods match another's tokens; None in older files.
@@ -146,12 +146,12 @@ class Results:
     policy: PolicyShape
     methods: dict[str, MethodEntry]
     early_cut: int | None = None
-    until_decided: Stopping | None = None
+    until_conclusive: Stopping | None = None
     pairs: tuple[PairedEntry, ...] | None = None
     settings: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        same_episodes = self.until_decided is None
+        same_episodes = self.until_conclusive is None
         require(DENSE in self.methods, "methods", f"the key {DENSE!r}", sorted(self.methods))
         n = self.dense.success.n
         expected = f"{n}, as every method" if same_episodes else f"at most {n}, as dense"
@@ -164,8 +164,8 @@ class Results:
             require(known, "pairs", f"two of {', '.join(self.methods)}", [pair.method, pair.against])
 
     @property
-    def by_degrees(self) -> bool:
-        """Whether the task is done by degrees, so that verdicts are those of scores."""
+    def graded(self) -> bool:
+        """Whether the task is graded, so that verdicts are those of scores."""
         return self.dense.score is not None
 
     @property

@@ -76,7 +76,7 @@ def p_text(p: float | None) -> str:
 def ratio_text(difference: TimeDifference) -> str:
     """Return a ratio of times with its interval.
 
-    >>> ratio_text(TimeDifference(1.06, (0.951, 1.182), 0.1, "undecided"))
+    >>> ratio_text(TimeDifference(1.06, (0.951, 1.182), 0.1, "inconclusive"))
     '1.06 [0.95, 1.18]'
     """
     low, high = (f"{limit:.2f}" for limit in difference.ci95)
@@ -89,7 +89,7 @@ def verdict_text(difference: Difference | TimeDifference, survives: bool = True)
     >>> verdict_text(Difference(-0.03, (-0.045, -0.015), 0.05, "non-inferior"), survives=False)
     'non-inferior†, worse'
     """
-    decided = difference.verdict != "undecided"
+    decided = difference.verdict != "inconclusive"
     mark = "†" if decided and not survives else ""
     worse = ", worse" if difference.worse and difference.verdict != "inferior" else ""
     return f"{difference.verdict}{mark}{worse}"

@@ -134,7 +134,11 @@ def format_vla_table(results: VLALatency) -> str:
 def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
     """Return the rows of the table of parts: column -> text."""
     return [
-        {"part of a dense policy call": name, "p50, ms": f"{1e3 * part.p50_s:.2f}", "share": f"{part.share:.1%}"}
+        {
+            "part of a dense policy call": name,
+            "p50, ms": f"{1e3 * part.p50_s:.2f}",
+            "share": f"{part.share:.1%}",
+        }
         for name, part in results.parts.items()
     ]
 

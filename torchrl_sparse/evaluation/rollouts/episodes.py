@@ -171,8 +171,8 @@ class EpisodeLog:
         self.episodes: dict[int, EpisodeResult] = {}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         header = asdict(_Header(1, self.identity))
-        lying = _lying(self.path)
-        content = _content(lying)
+        stored = _log_path(self.path)
+        content = _content(stored)
         if _line(header).encode().startswith(content):
             # A new log, or one killed while its header was written.
             self.path.write_bytes(b"")
@@ -190,7 +190,7 @@ class EpisodeLog:
         for number, line in enumerate(lines, start=2):
             episode = parse_json(line, EpisodeResult, f"{self.path}:{number}")
             self.episodes.setdefault(episode.seed, episode)
-        if lying != self.path:
+        if stored != self.path:
             with atomic_path(self.path) as temporary:
                 temporary.write_bytes(whole)
         else:
@@ -242,7 +242,7 @@ def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
         FileNotFoundError: if there is neither.
         ValueError: naming file and line, if one is damaged.
     """
-    path = _lying(path)
+    path = _log_path(path)
     lines = _lines(path)
     next(lines, None)
     for number, line in enumerate(lines, start=2):
@@ -251,11 +251,11 @@ def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
 
 def read_identity(path: str | os.PathLike) -> dict[str, Any]:
     """Return what the episodes of a log belong to, see `EpisodeLog`; errors are those of `read_episodes`."""
-    path = _lying(path)
+    path = _log_path(path)
     return parse_json(next(_lines(path), b""), _Header, f"{path}:1").identity
 
 
-def _lying(path: str | os.PathLike) -> Path:
+def _log_path(path: str | os.PathLike) -> Path:
     """Return where a log is: there, or compressed beside it."""
     path = Path(path)
     packed = path.with_name(f"{path.name}.gz")

@@ -101,13 +101,13 @@ def pair_by_design(
     Args:
         name, other: of the methods, for errors.
         episodes: of the first.
-        others: of the second; more of them only where the design has several looks, after which methods stop.
+        others: of the second; more of them only where the design has several analyses, after which methods stop.
         design: of the benchmark.
 
     Raises:
         ValueError: if the seeds do not fit.
     """
-    if design.looks > 1:
+    if design.analyses > 1:
         seeds = {episode.seed for episode in episodes}
         others = [episode for episode in others if episode.seed in seeds]
     return pair_episodes(name, episodes, other, others)

@@ -11,7 +11,7 @@ the mean time, times what a failure costs (see `durations`). h is the half width
 degrees of freedom. Pairs that all agree give ``±t² a``, never ±0; where failures are common, a h vanishes beside V. Nothing is
 resampled: draws from a few concordant pairs are all alike.
 
-Tasks that stopped when they were decided have wider quantiles, those of their look (`Design`), since their intervals hold
+Tasks that stopped when they were decided have wider quantiles, those of their analysis (`Design`), since their intervals hold
 whatever stopped them. The study `simulate_stopping` simulates the coverage, and tests enumerate it where pairs are few.
 """
 
@@ -46,7 +46,7 @@ class TaskPairs:
         solved: whether the method solved each episode, and whether dense did; [n] each, n at least 2.
         times: their `restricted_times`, [n] each, steps.
         horizon: the largest that a time can be, steps.
-        design: after which of whose looks the task stopped; None for a number that was fixed.
+        design: after which of whose analyses the task stopped; None for a number that was fixed.
     """
 
     solved: tuple[Sequence[bool], Sequence[bool]]

@@ -10,7 +10,7 @@ from torchrl_sparse.errors import InputError
 __all__ = ["Difference", "Interval", "TimeDifference", "Verdict", "check_interval", "require"]
 
 Interval = tuple[float, float]
-Verdict = Literal["non-inferior", "inferior", "undecided"]
+Verdict = Literal["non-inferior", "inferior", "inconclusive"]
 
 
 @dataclass(frozen=True)

@@ -148,14 +148,14 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
     """Judge an interval of a ratio of times: all of it below ``1 + margin``, all above, or neither.
 
     >>> time_verdict((0.97, 1.06)), time_verdict((1.2, 1.4)), time_verdict((0.95, 1.15))
-    ('non-inferior', 'inferior', 'undecided')
+    ('non-inferior', 'inferior', 'inconclusive')
     """
     if not 0 < margin < 1:
         raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     low, high = ci
     if high < 1 + margin:
         return "non-inferior"
-    return "inferior" if low > 1 + margin else "undecided"
+    return "inferior" if low > 1 + margin else "inconclusive"
 
 
 def allowed_steps(horizon: int, early_cut: int | None = None) -> list[int]:

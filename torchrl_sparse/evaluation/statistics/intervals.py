@@ -129,7 +129,7 @@ def mcnemar_p(won: int, lost: int) -> float:
 
     Given their number, the pairs that only one solved are Binomial(won + lost, 1/2) where both methods are as good (Q. McNemar,
     Psychometrika 12, 1947). Twice the smaller tail, at most 1; as the coin is fair, the sum over all splits that are as
-    unlikely is the same. It is of a number of pairs that was fixed: a sequential design's looks are not counted.
+    unlikely is the same. It is of a number of pairs that was fixed: a sequential design's analyses are not counted.
 
     >>> mcnemar_p(1, 7), mcnemar_p(0, 0), mcnemar_p(3, 3)
     (0.0703125, 1.0, 1.0)
@@ -143,17 +143,17 @@ def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
     """Judge an interval of a paired difference by a non-inferiority margin.
 
     ``"non-inferior"`` if the whole interval lies above ``-margin``, ``"inferior"`` if all of it lies below,
-    else ``"undecided"``: the episodes do not suffice to tell.
+    else ``"inconclusive"``: the episodes do not suffice to tell.
 
     >>> verdict((-0.03, 0.01)), verdict((-0.30, -0.12)), verdict((-0.11, 0.02))
-    ('non-inferior', 'inferior', 'undecided')
+    ('non-inferior', 'inferior', 'inconclusive')
     """
     if not 0 < margin < 1:
         raise InputError(f"margin: expected a number strictly between 0 and 1, got {margin}")
     low, high = ci
     if low > -margin:
         return "non-inferior"
-    return "inferior" if high < -margin else "undecided"
+    return "inferior" if high < -margin else "inconclusive"
 
 
 def paired_difference(
@@ -174,7 +174,7 @@ def paired_difference(
 
     >>> result = paired_difference([True, True, False, True], [True, True, True, True])
     >>> result.diff, result.mcnemar_p, result.verdict
-    (-0.25, 1.0, 'undecided')
+    (-0.25, 1.0, 'inconclusive')
     """
     won, lost, n = discordant_pairs(method, other)
     ci = tango_interval(won, lost, n, confidence)

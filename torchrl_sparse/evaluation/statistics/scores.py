@@ -1,4 +1,4 @@
-"""Means of scores, and of their differences, with Student's intervals: for tasks that succeed by degrees.
+"""Means of scores, and of their differences, with Student's intervals: for graded tasks.
 
 Numbers that are all the same show no spread, which does not say that there is none. Scores lie in [0, 1]; the interval then is
 Tango's of as many pairs of which none differs, ``±z²/(n + z²)``.

@@ -1,16 +1,16 @@
 """When to stop: episodes go on until the verdict is reached, and looking at them again and again costs no error.
 
-A `Design` looks at the episodes after equal numbers of them, up to a cap. A look uses the ordinary intervals at a higher
+A `Design` analyses the episodes after equal numbers of them, up to a cap. An analysis uses the ordinary intervals at a higher
 level, ``2 Φ(c) - 1`` with the critical value ``c = C t^(1/4 - 1/2)`` of Wang and Tsiatis' family (Biometrics 43, 1987), t being
-the share of the cap. C makes a Brownian motion cross one of the limits with 5 % at any of the looks (Armitage, McPherson and
-Rowe, JRSS A 132, 1969), so that the intervals of *all* looks hold together with 95 %: they are repeated confidence intervals
+the share of the cap. C makes a Brownian motion cross one of the limits with 5 % at any of the analyses (Armitage, McPherson and
+Rowe, JRSS A 132, 1969), so that the intervals of *all* analyses hold together with 95 %: they are repeated confidence intervals
 (Jennison and Turnbull, JRSS B 51, 1989), valid whatever rule stops. A verdict at the margin is wrong with at most 2.5 %, as
 that of a fixed number of episodes.
 
 STEP (arXiv:2503.10966), the anchor of sequential comparisons of policies, spends its error over a known cap too, for unpaired
 successes and the null of no difference; here episodes are paired, the null is a margin, and times are judged beside successes.
 N-SCORE (arXiv:2603.13616) bets on bounded scores and holds without a cap and without the normal approximation; a cap that is
-known makes the limits here closer. How the approximation holds with 30 looks is simulated (the study `simulate_stopping`).
+known makes the limits here closer. How the approximation holds with 30 analyses is simulated (the study `simulate_stopping`).
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ _LARGEST_Z = 8.0  # beyond, a p-value is below 1e-15, and the nodes of the integ
 
 @dataclass(frozen=True)
 class Design:
-    """After how many episodes to look, and at which level.
+    """After how many episodes to analyse them, and at which level.
 
     Attributes:
         max_episodes: the cap.
-        looks: at most so many, the last at the cap. One look is the ordinary fixed number of episodes.
+        analyses: at most so many, the last at the cap. One analysis is the ordinary fixed number of episodes.
 
     Raises:
-        ValueError: if a number is below 1 or there are more looks than episodes.
+        ValueError: if a number is below 1 or there are more analyses than episodes.
 
-    >>> design = Design(1300, looks=30)
+    >>> design = Design(1300, analyses=30)
     >>> design.ends[:3], design.ends[-1]
     ((43, 86, 130), 1300)
     >>> round(design.confidence(1300), 4), Design(400).confidence(400)
@@ -53,45 +53,49 @@ class Design:
     """
 
     max_episodes: int
-    looks: int = 1
+    analyses: int = 1
 
     def __post_init__(self) -> None:
-        if not 1 <= self.looks <= self.max_episodes:
-            raise InputError(f"looks: expected 1 to max_episodes = {self.max_episodes}, got {self.looks}")
+        if not 1 <= self.analyses <= self.max_episodes:
+            raise InputError(
+                f"analyses: expected 1 to max_episodes = {self.max_episodes}, got {self.analyses}"
+            )
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
-        """Episodes at each look."""
-        return tuple(self.max_episodes * look // self.looks for look in range(1, self.looks + 1))
+        """Episodes at each analysis."""
+        return tuple(
+            self.max_episodes * analysis // self.analyses for analysis in range(1, self.analyses + 1)
+        )
 
     def critical(self, episodes: int) -> float:
-        """Return the standard errors beyond which a look decides.
+        """Return the standard errors beyond which an analysis decides.
 
         Raises:
-            ValueError: if there is no look after so many episodes.
+            ValueError: if there is no analysis after so many episodes.
         """
         if episodes not in self.ends:
-            raise InputError(f"episodes: expected a look of the design ({self.ends}), got {episodes}")
+            raise InputError(f"episodes: expected an analysis of the design ({self.ends}), got {episodes}")
         return _constant(self._times) * self._time(episodes) ** (_SHAPE - 0.5)
 
     def confidence(self, episodes: int) -> float:
-        """Return the two-sided level of the intervals at a look; those of all looks hold together with 95 %."""
-        if self.looks == 1:
+        """Return the two-sided level of the intervals at an analysis; those of all analyses hold together with 95 %."""
+        if self.analyses == 1:
             return 1 - _ERROR
         return 1 - 2 * float(ndtr(-self.critical(episodes)))
 
     def decides(self, episodes: int, *statistics: float) -> bool:
-        """Tell whether a method's verdict is reached at a look: non-inferior in every statistic, or inferior in one.
+        """Tell whether a method's verdict is reached at an analysis: non-inferior in every statistic, or inferior in one.
 
         Args:
-            episodes: at the look.
+            episodes: at the analysis.
             statistics: standard errors above the margin: `tango_z` of successes, `time_z` of times.
         """
         critical = self.critical(episodes)
         return min(statistics) > critical or min(statistics) < -critical
 
     def p_value(self, z: float, episodes: int) -> float:
-        """Return the one-sided p-value of a statistic at a look: the error at which its limit would just be reached.
+        """Return the one-sided p-value of a statistic at an analysis: the error at which its limit would just be reached.
 
         >>> round(Design(400).p_value(1.96, 400), 4), round(Design(400, 20).p_value(1.96, 400), 3)
         (0.025, 0.052)
@@ -99,7 +103,7 @@ class Design:
         if z <= 0:
             return 0.5
         z = min(z, _LARGEST_Z)
-        if self.looks == 1:
+        if self.analyses == 1:
             return float(ndtr(-z))
         constant = z * self._time(episodes) ** (0.5 - _SHAPE)
         return max(_crossing(constant, self._times) / 2, float(ndtr(-z)))

@@ -23,7 +23,7 @@ from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.policies.diffusion.denoiser import ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart
 
 __all__ = ["export_policy"]
 
@@ -31,7 +31,7 @@ __all__ = ["export_policy"]
 def export_policy(
     path: Path,
     encode: ObservationEncoder,
-    start: ColdStart,
+    start: QueryStart,
     plan: Planner,
     denoise: ActionDenoiser,
     *,
@@ -48,7 +48,7 @@ def export_policy(
 
     Raises:
         ValueError: naming what cannot be exported: cameras, a warm start, a network that the native engine does not run, or a
-            planner of one's own that looks at the observation.
+            observation-conditioned planner of one's own.
 
     Examples:
         >>> import tempfile
@@ -93,7 +93,7 @@ def _exported_plan(plan: Planner, network: TransformerForDiffusion) -> ExportedP
         return ExportedPlan(slots, mask if mask.any() else None)
     if not isinstance(plan, SAGPruner):
         raise InputError(
-            f"plan: expected one that does not look at the observation, or a SAGPruner, got {type(plan).__name__}"
+            f"plan: expected one that ignores the observation, or a SAGPruner, got {type(plan).__name__}"
         )
     if plan.network.fuse_obs.out_features > MAX_HIDDEN:
         raise InputError(

@@ -34,7 +34,7 @@ from torchrl_sparse.policies.diffusion.export import export_policy
 from torchrl_sparse.policies.diffusion.freezing import FreezablePolicy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart, WarmStart, stored_start
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart, WarmStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.convention import source_convention
 from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
@@ -89,7 +89,7 @@ class DiffusionPolicy(FreezablePolicy):
     ):
         stages = OrderedDict(
             encode=ObservationEncoder(network, normalizer, vision),
-            start=ColdStart(),
+            start=QueryStart(),
             plan=Dense(),
             denoise=ActionDenoiser(network, normalizer, sampler or Sampler(), engine),
         )
@@ -108,11 +108,11 @@ class DiffusionPolicy(FreezablePolicy):
         self._install(plan, self.sampler, self.start)
 
     @property
-    def start(self) -> ColdStart:
+    def start(self) -> QueryStart:
         return self.module["start"]
 
     @start.setter
-    def start(self, start: ColdStart | None) -> None:
+    def start(self, start: QueryStart | None) -> None:
         self._install(self.plan, self.sampler, start)
 
     @property
@@ -130,10 +130,10 @@ class DiffusionPolicy(FreezablePolicy):
         else:
             super().__setattr__(name, value)
 
-    def _install(self, plan: Planner | None, sampler: Sampler, start: ColdStart | None) -> None:
+    def _install(self, plan: Planner | None, sampler: Sampler, start: QueryStart | None) -> None:
         """Change planner, sampler and start together, or, if one cannot serve that sampler, nothing."""
-        plan, start = Dense() if plan is None else plan, ColdStart() if start is None else start
-        check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, ColdStart))
+        plan, start = Dense() if plan is None else plan, QueryStart() if start is None else start
+        check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, QueryStart))
         check_trained(sampler, self.sampler)
         start.bind(self.network, self.normalizer, sampler)
         plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
@@ -146,7 +146,7 @@ class DiffusionPolicy(FreezablePolicy):
         self.out_keys = [*out_keys, keys.LATENCY]
 
     def with_plan(
-        self, plan: Planner | None, sampler: Sampler | None = None, start: ColdStart | None = None
+        self, plan: Planner | None, sampler: Sampler | None = None, start: QueryStart | None = None
     ) -> DiffusionPolicy:
         """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
 

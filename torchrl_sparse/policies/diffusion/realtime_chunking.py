@@ -26,7 +26,7 @@ from torchrl_sparse import keys
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart, shift_chunk
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart, shift_chunk
 
 __all__ = ["RealtimeChunking", "chunk_pull"]
 
@@ -47,7 +47,7 @@ def chunk_pull(delay: Tensor, left: Tensor, length: int) -> Tensor:
     return torch.where(index < delay, 1.0, soft)
 
 
-class RealtimeChunking(ColdStart):
+class RealtimeChunking(QueryStart):
     """Has policy calls go on from the last chunk, see the module; ``policy.start = RealtimeChunking()`` is all that it takes.
 
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands

@@ -24,7 +24,7 @@ from torchrl_sparse.networks.frozen import Frozen
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
-from torchrl_sparse.policies.diffusion.warm_start import ColdStart
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart
 
 __all__ = ["Parts", "answer_directly"]
 
@@ -73,7 +73,7 @@ def answer_directly(
     parts: Parts | None,
     tensordict: TensorDictBase,
     encode: ObservationEncoder,
-    start: ColdStart,
+    start: QueryStart,
     plan: Planner,
     denoise: ActionDenoiser,
 ) -> bool:
@@ -130,7 +130,7 @@ def _stay_unseen(*stages: TensorDictModuleBase) -> bool:
     return (
         kind.forward is Planner.forward
         and getattr(kind, "masks", None) is StaticPlanner.masks
-        and type(start) is ColdStart
+        and type(start) is QueryStart
         and not any(stage._forward_hooks or stage._forward_pre_hooks for stage in stages)
     )
 

@@ -35,7 +35,7 @@ from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
-__all__ = ["ColdStart", "WarmStart", "shift_chunk", "stored_start"]
+__all__ = ["QueryStart", "WarmStart", "shift_chunk", "stored_start"]
 
 
 def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
@@ -52,7 +52,7 @@ def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
     return chunk.gather(-2, index[..., None].expand(*index.shape, chunk.shape[-1]))
 
 
-class ColdStart(TensorDictModuleBase):
+class QueryStart(TensorDictModuleBase):
     """Has every policy call begin from noise: it reads and writes nothing.
 
     A stage of one's own subclasses it, reads what it likes, and writes ``("diffusion", "start")`` f32 [*B, H, A], a
@@ -80,7 +80,7 @@ class ColdStart(TensorDictModuleBase):
         return tensordict
 
 
-class WarmStart(ColdStart):
+class WarmStart(QueryStart):
     """Has policy calls begin from the last chunk, see the module; ``policy.start = WarmStart(1)`` is all that it takes.
 
     Reads ``("control", "last_chunk")`` and ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for
@@ -136,15 +136,15 @@ class WarmStart(ColdStart):
         return tensordict.set(keys.NUM_STEPS, torch.where(warm, self.num_steps, sampler.num_inference_steps))
 
 
-def stored_start(start: ColdStart) -> int | None:
+def stored_start(start: QueryStart) -> int | None:
     """Return what a policy's file says of its start: the steps of a warm policy call, None where all begin from noise.
 
     Raises:
         ValueError: for a start of another class.
 
-    >>> stored_start(WarmStart(2)), stored_start(ColdStart())
+    >>> stored_start(WarmStart(2)), stored_start(QueryStart())
     (2, None)
     """
-    if type(start) not in (ColdStart, WarmStart):
+    if type(start) not in (QueryStart, WarmStart):
         raise InputError(f"start: expected None or a WarmStart, to save it, got {type(start).__name__}")
     return start.num_steps if isinstance(start, WarmStart) else None

@@ -44,7 +44,7 @@ class WorkspacePool:
 
     @contextmanager
     def take(self, batch: int, slots: int, guided: bool = False) -> Iterator[Workspace]:
-        """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, drawn to a guide or not, for the caller alone."""
+        """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, guided or not, for the caller alone."""
         # On a GPU the next policy call may be launched before the last one has run, but in the same order only in one stream.
         stream = (
             torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None
