@@ -10,12 +10,19 @@ install: $(VENV)/.installed
 NATIVE := torchrl_sparse/blocks/engine/native
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
+# pip cannot override robosuite's pin of mink, which Python 3.13 needs (see pyproject.toml): there uv installs.
+define editable
+	if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then \
+		$(BIN)/python -m pip install --quiet uv && $(BIN)/uv pip install --quiet --python $(BIN)/python --editable "$(1)"; \
+	else $(BIN)/python -m pip install --quiet --no-compile --editable "$(1)"; fi
+endef
+
 # Of what is installed the tests import a quarter: Python compiles that when it first does, if it may write.
 unexport PYTHONDONTWRITEBYTECODE
 $(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --no-compile --editable ".[dev]"
+	$(call editable,.[dev])
 	touch $@
 
 demo: install
@@ -35,12 +42,13 @@ test-rest: $(VENV)/.ray
 test-all: test test-rest
 
 $(VENV)/.ray: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --no-compile --editable ".[ray]"
+	$(call editable,.[ray])
 	touch $@
 
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 

@@ -4,7 +4,7 @@
 # Versions: gymnasium 1.4.0.
 # Guess: after an episode's end the next `step` plays its action in the new episode.
 # What happens: the default autoreset spends that step on the reset: the action is ignored, reward is 0, flags are false. A policy
-#   that plays chunks of four actions 0 1 2 3, asked anew at each end, has the new episode begin with action 1. Episodes of
+#   that plays chunks of four actions 0 1 2 3, asked again at each end, has the new episode begin with action 1. Episodes of
 #   3 steps give 3 plays in 4 calls. Which mode is set stands in `env.metadata["autoreset_mode"]`.
 # Hurts: chunked policies (every episode but the first starts one action late) and recorded data (one empty step an episode,
 #   which looks like any other).
@@ -43,7 +43,7 @@ def played(**options):
         _, reward, ended, _, _ = env.step(np.array([chunk.pop(0)]))
         rewards.append(float(reward[0]))
         if ended[0] or not chunk:
-            chunk = [0, 1, 2, 3]  # the policy is asked anew
+            chunk = [0, 1, 2, 3]  # the policy is asked again
     return [episode for episode in env.envs[0].episodes if episode], rewards
 
 default, rewards = played()

@@ -6,10 +6,10 @@
 # What happens: `mj_step` computes positions first and then moves the joints. What is read afterwards, sensors too, is of the
 #   state before: a slide at 1 m/s is observed 2 mm behind itself. robosuite observes so: its joint angles are new and its hand is old, 0.5 mm
 #   at full speed, until something calls `forward`, as its `reset` and a restored state do.
-# Hurts: observations that are made anew from recorded states: they differ from those that were recorded, most where the hand is fast, and
+# Hurts: observations that are made again from recorded states: they differ from those that were recorded, most where the hand is fast, and
 #   "the replay is exact" fails at the fourth decimal.
 # Live with it: `mj_forward` before reading, on both sides; or a tolerance that knows of it.
-# torchrl_sparse: knows: observations that `convert_demos` makes anew are the state's own, 2 ms newer than an environment's;
+# torchrl_sparse: knows: observations that `convert_demos` makes again are the state's own, 2 ms newer than an environment's;
 #   `data/absolute.py` and the page of recipes say so.
 set -eu
 dir=$(mktemp -d)

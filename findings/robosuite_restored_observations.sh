@@ -5,7 +5,7 @@
 # Guess: `sim.set_state_from_flattened(state)`, `sim.forward()` and `_get_observations()` show the restored state.
 # What happens: observations are those that the environment last sampled: the hand is 12 cm from where it now is. With
 #   `_get_observations(force_update=True)` they are of the restored state, to the last bit. The simulation itself is right.
-# Hurts: demonstrations whose observations are made anew from recorded states, as robomimic's files ask for: each row is then the row
+# Hurts: demonstrations whose observations are made again from recorded states, as robomimic's files ask for: each row is then the row
 #   of another state, and a policy is trained on a delay that it will not meet.
 # Live with it: `force_update=True` after every restore.
 # torchrl_sparse: right; it forces the update wherever it observes, and a test restores a state after others.

@@ -38,15 +38,15 @@ def packed(answer: dict[str, Tensor]) -> dict[str, Tensor]:
     return {**answer, "mask": torch.from_numpy(stored)}
 
 
-def main(anew: set[str]) -> None:
-    """Record what is new, and the assets in ``anew``; what is no more is dropped."""
-    stored = {case: answer for case, answer in load_actions().items() if case.partition("/")[0] not in anew}
+def main(again: set[str]) -> None:
+    """Record what is new, and the assets in ``again``; what is no more is dropped."""
+    stored = {case: answer for case, answer in load_actions().items() if case.partition("/")[0] not in again}
     answers = {
         name: stored.get(name) or packed(case.answer()) for case in actions.cases() if (name := str(case))
     }
     tensors = {f"{case}/{name}": value for case, answer in answers.items() for name, value in answer.items()}
     save_file({name: value.contiguous() for name, value in tensors.items()}, actions.STORED)
-    lines = {name: lines for name, lines in load_tables().items() if name.partition("/")[0] not in anew}
+    lines = {name: lines for name, lines in load_tables().items() if name.partition("/")[0] not in again}
     made = {name: lines.get(name) or tables.table(name) for name in tables.names()}
     tables.STORED.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 

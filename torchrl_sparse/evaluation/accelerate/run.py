@@ -195,7 +195,7 @@ def _measure_errors(
         }
         return Errors("torchrl_sparse.errors/1", settings, errors)
 
-    return read_or_make(out / "errors.json", Errors, settings, make, anew=True).errors
+    return read_or_make(out / "errors.json", Errors, settings, make, remake=True).errors
 
 
 def _time(
@@ -225,5 +225,5 @@ def _time(
             )
         return Timings("torchrl_sparse.timings/1", settings, machine, timings)
 
-    found = read_or_make(out / "timings.json", Timings, settings, make, anew=True)
+    found = read_or_make(out / "timings.json", Timings, settings, make, remake=True)
     return found.machine, found.timings

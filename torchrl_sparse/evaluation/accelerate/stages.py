@@ -55,7 +55,7 @@ class Timings:
 
 
 def read_or_make(
-    path: Path, kind: type[S], made_for: Mapping[str, Any], make: Callable[[], S], *, anew: bool = False
+    path: Path, kind: type[S], made_for: Mapping[str, Any], make: Callable[[], S], *, remake: bool = False
 ) -> S:
     """Return what the file holds or, where there is none, make and write it.
 
@@ -64,7 +64,7 @@ def read_or_make(
         kind: dataclass of its content.
         made_for: what the content depends on; JSON values.
         make: called at most once.
-        again: whether to make again, instead of refusing, what was made for something else.
+        remake: whether to make again, instead of refusing, what was made for something else.
 
     Raises:
         ValueError: naming the file, if it is malformed, or was made for something else.
@@ -81,7 +81,7 @@ def read_or_make(
         differing = describe_differences(found.made_for, to_plain(made_for))
         if not differing:
             return found
-        if not anew:
+        if not remake:
             raise InputError(
                 f"{path}: made with other settings: {differing}; choose another out or move it away"
             )
