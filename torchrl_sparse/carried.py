@@ -80,7 +80,7 @@ def make_primer(entries: Mapping[NestedKey, Entry]) -> TensorDictPrimer:
 
 
 def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going_on: Tensor) -> None:
-    """Raise ValueError if a row in mid-episode lacks what the step before left.
+    """Raise InputError if a row in mid-episode lacks what the step before left.
 
     Args:
         tensordict: [*B].
@@ -117,7 +117,7 @@ def dense(tensordict: TensorDictBase, module: TensorDictModuleBase) -> TensorDic
 
 
 def refuse(key: NestedKey, lost: Tensor) -> None:
-    """Raise ValueError if the rows ``lost``, bool [*B, 1], are any: the environment dropped ``key``."""
+    """Raise InputError if the rows ``lost``, bool [*B, 1], are any: the environment dropped ``key``."""
     if lost.any():
         raise InputError(
             f"{key}: expected what the step before left, since 'is_init' is False, got none in {int(lost.sum())} of "
@@ -147,7 +147,7 @@ class TensorKeys:
         """Give keys other names; None is the default's.
 
         Raises:
-            ValueError: for what has no key here; nothing is changed.
+            InputError: for what has no key here; nothing is changed.
         """
         defaults = type(self).tensor_keys
         for name in names:

@@ -28,7 +28,7 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
     """Convert [..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
 
     Raises:
-        ValueError: if the last axis is not 6, or the two rows are parallel, zero or beyond measure.
+        InputError: if the last axis is not 6, or the two rows are parallel, zero or beyond measure.
     """
     if rot6d.shape[-1] != 6:
         raise InputError(f"rot6d: expected a last axis of 6, got shape {tuple(rot6d.shape)}")
@@ -55,7 +55,7 @@ def rotvec_to_rot6d(rotvec: np.ndarray) -> np.ndarray:
     """Convert [..., 3] rotation vectors (rad) to [..., 6].
 
     Raises:
-        ValueError: if one is longer than a hundred radians: nobody turns that far, and of 1e30 no angle is left.
+        InputError: if one is longer than a hundred radians: nobody turns that far, and of 1e30 no angle is left.
 
     >>> rotvec_to_rot6d(np.zeros(3))
     array([1., 0., 0., 0., 1., 0.])

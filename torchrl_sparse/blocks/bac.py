@@ -63,7 +63,7 @@ def acs(similarity: Tensor, num_updates: int, objective: Objective = "anchor") -
         M increasing steps in execution order.
 
     Raises:
-        ValueError: on a matrix that is not square or not finite, M out of range or an unknown objective.
+        InputError: on a matrix that is not square or not finite, M out of range or an unknown objective.
 
     Examples:
         >>> similarity = torch.eye(6)
@@ -136,7 +136,7 @@ def bubbling_union(
         the new schedules, in column order.
 
     Raises:
-        ValueError: if ``errors`` does not have one finite score per schedule or ``top_k`` is out of range.
+        InputError: if ``errors`` does not have one finite score per schedule or ``top_k`` is out of range.
 
     Examples:
         >>> bubbling_union([[0, 1], [0, 2], [0, 3]], errors=[9.0, 0.0, 1.0], top_k=1)
@@ -212,7 +212,7 @@ def bac_schedule(
         top_k: blocks that BUA enlarges; the paper's value is 5.
 
     Raises:
-        ValueError: as :func:`acs` and :func:`bubbling_union` do.
+        InputError: as :func:`acs` and :func:`bubbling_union` do.
     """
     alone = bac_blockwise_schedule(
         calibration, num_updates, policy=policy, objective=objective, force_last=force_last
@@ -238,7 +238,7 @@ class BAC(SchedulePlanner):
         schedule: what a function of :data:`SCHEDULES` made.
 
     Raises:
-        ValueError: if the schedule was made by another method.
+        InputError: if the schedule was made by another method.
     """
 
     def __init__(self, schedule: CacheSchedule) -> None:

@@ -79,7 +79,7 @@ def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor,
         cond: encoded observations f32 [N, To, D].
 
     Raises:
-        ValueError: if the network is in training mode, there is no sample, or shapes do not fit.
+        InputError: if the network is in training mode, there is no sample, or shapes do not fit.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler

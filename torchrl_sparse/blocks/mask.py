@@ -124,7 +124,7 @@ def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[in
 
 
 def check_reuse(reuse: str) -> None:
-    """Raise ValueError unless ``reuse`` names a reuse rule."""
+    """Raise InputError unless ``reuse`` names a reuse rule."""
     if reuse not in REUSE_RULES:
         raise InputError(f"reuse: expected one of {list(REUSE_RULES)}, got {reuse!r}")
 
@@ -241,7 +241,7 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
         f32 [*B].
 
     Raises:
-        ValueError: if ``mask`` is no prune mask for a network of this depth.
+        InputError: if ``mask`` is no prune mask for a network of this depth.
 
     >>> lift = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
     >>> round(query_flops(lift, torch.zeros(100, 24, dtype=torch.bool)).item() / 1e9, 2)

@@ -47,7 +47,7 @@ class PlanSpec:
         return len(BLOCK_TYPES) * self.num_layers
 
     def check_is(self, asked: PlanSpec, who: str) -> None:
-        """Raise ValueError, in the name of ``who`` was made for this, unless ``asked`` is the same.
+        """Raise InputError, in the name of ``who`` was made for this, unless ``asked`` is the same.
 
         Where another sampler is asked for, the message says in which order plan and sampler are assigned.
 
@@ -126,7 +126,7 @@ class Planner(TensorDictModuleBase):
         """Prepare to serve ``spec``; a policy calls it when it is given the planner or another sampler.
 
         Raises:
-            ValueError: if the planner was made for another, or its ``reuse`` is no rule; it then stays as it was.
+            InputError: if the planner was made for another, or its ``reuse`` is no rule; it then stays as it was.
         """
         check_reuse(self.reuse)
         if self.made_for is not None:
@@ -135,7 +135,7 @@ class Planner(TensorDictModuleBase):
         self._spec = spec
 
     def _prepare(self, spec: PlanSpec) -> None:
-        """Make what :meth:`masks` needs for ``spec``, or raise ValueError and leave everything as it is."""
+        """Make what :meth:`masks` needs for ``spec``, or raise InputError and leave everything as it is."""
 
     @property
     def fingerprint(self) -> str:
@@ -155,7 +155,7 @@ class Planner(TensorDictModuleBase):
 
         Raises:
             RuntimeError: if the planner is not bound.
-            ValueError: if :meth:`masks` returns anything but bool tensors [B, K, 3L] for the bound spec.
+            InputError: if :meth:`masks` returns anything but bool tensors [B, K, 3L] for the bound spec.
         """
         spec = self.spec
         cond = read(tensordict, COND)
@@ -195,7 +195,7 @@ class StaticPlanner(Planner):
         """Return the mask bool [K, 3L] of every policy call for ``spec``, row 0 all False.
 
         Raises:
-            ValueError: if the planner cannot serve ``spec``.
+            InputError: if the planner cannot serve ``spec``.
         """
         raise NotImplementedError(f"{type(self).__name__} must define mask(spec)")
 

@@ -37,7 +37,7 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming the file, if its format is not in :data:`PLANNERS` or it was made for another spec, or as the
+        InputError: naming the file, if its format is not in :data:`PLANNERS` or it was made for another spec, or as the
             planner's class raises it.
 
     Examples:
@@ -90,7 +90,7 @@ def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] 
     unless its class is in :data:`PLANNERS`.
 
     Raises:
-        ValueError: if the planner reads the observation and its class is not in the table; nothing is written.
+        InputError: if the planner reads the observation and its class is not in the table; nothing is written.
 
     Examples:
         >>> import tempfile

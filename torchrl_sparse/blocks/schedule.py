@@ -71,7 +71,7 @@ class _ScheduleFile:
     computed_steps: dict[str, list[int]]
 
     def schedule(self) -> CacheSchedule:
-        """Return the schedule; ValueError if its blocks are not those of the network."""
+        """Return the schedule; InputError if its blocks are not those of the network."""
         steps = self.computed_steps
         names = [block_name(column) for column in range(len(steps))]
         if missing := [name for name in names if name not in steps]:
@@ -104,7 +104,7 @@ class CacheSchedule:
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
 
     Raises:
-        ValueError: if a field does not hold what is described here.
+        InputError: if a field does not hold what is described here.
 
     Examples:
         >>> schedule = CacheSchedule("by hand", "a policy", 4, 1, computed_steps=((0, 2), (0,), (0, 1, 3)))
@@ -152,7 +152,7 @@ class CacheSchedule:
         """Make the schedule of a mask bool [K, 3L].
 
         Raises:
-            ValueError: if ``mask`` is no prune mask.
+            InputError: if ``mask`` is no prune mask.
         """
         num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
         num_layers = max(1, num_blocks // len(BLOCK_TYPES))
@@ -186,7 +186,7 @@ class CacheSchedule:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: naming file and field, what was expected and what came, if it is no valid schedule.
+            InputError: naming file and field, what was expected and what came, if it is no valid schedule.
         """
         stored = read_json(path, _ScheduleFile)
         try:

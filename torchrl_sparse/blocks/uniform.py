@@ -40,7 +40,7 @@ class Uniform(StaticPlanner):
         last: also compute the last denoising step.
 
     Raises:
-        ValueError: if ``interval`` is not a whole number of at least 1.
+        InputError: if ``interval`` is not a whole number of at least 1.
 
     Examples:
         >>> spec = PlanSpec(num_inference_steps=100, num_layers=8, policy="any")

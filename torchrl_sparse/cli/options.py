@@ -233,7 +233,7 @@ OmegaConf.register_new_resolver(
 
 
 def check_options(recipe: str, options: Mapping[str, Any], table: Mapping[str, Any] = OPTIONS) -> None:
-    """Raise ValueError, ``key: expected …, got …``, for the first option that is not as `OPTIONS` says.
+    """Raise InputError, ``key: expected …, got …``, for the first option that is not as `OPTIONS` says.
 
     Args:
         recipe: name of the recipe.
@@ -266,11 +266,11 @@ def _lookup(recipe: str, key: str, table: Mapping[str, Any]) -> Any:
 
 
 def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> None:
-    """Raise ValueError if a benchmark's ``methods`` or ``videos`` name what is none, or its ``pairs`` what it does not measure.
+    """Raise InputError if a benchmark's ``methods`` or ``videos`` name what is none, or its ``pairs`` what it does not measure.
 
     Args:
         options: of the benchmark.
-        check: raises ValueError, ``methods: …``, for a name that is no method.
+        check: raises InputError, ``methods: …``, for a name that is no method.
 
     >>> options = {"methods": ["bac"], "videos": [], "pairs": [["dense", "sag"]]}
     >>> check_names(options, lambda name: None)

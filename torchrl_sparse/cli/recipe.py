@@ -89,7 +89,7 @@ def check_command(program: Path, words: Sequence[str]) -> None:
         words: of the command line, after the program.
 
     Raises:
-        ValueError: in one line, for the first word that the recipe would refuse.
+        InputError: in one line, for the first word that the recipe would refuse.
     """
     options = program.resolve().with_suffix(".yaml")
     if not options.is_file():
@@ -103,7 +103,7 @@ def check_command(program: Path, words: Sequence[str]) -> None:
 
 
 def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: str) -> None:
-    """Raise ValueError for the first of the options ``names`` that is given though nothing would read it.
+    """Raise InputError for the first of the options ``names`` that is given though nothing would read it.
 
     Args:
         config: of a recipe.

@@ -41,7 +41,7 @@ def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
     Raises:
         FileNotFoundError: if there is none.
         ImportError: without the ``sweeps`` package.
-        ValueError: if wandb would refuse it, an entry would not be honoured, or its trials would see test seeds; the message
+        InputError: if wandb would refuse it, an entry would not be honoured, or its trials would see test seeds; the message
             names file and entry.
     """
     written = read_yaml(path)

@@ -71,7 +71,7 @@ class LocalSweep:
             as a grid does.
 
     Raises:
-        ValueError: if the folder holds another sweep, or a search without end has no ``count``.
+        InputError: if the folder holds another sweep, or a search without end has no ``count``.
     """
 
     def __init__(self, config: Mapping[str, Any], out: str | os.PathLike, count: int | None = None) -> None:
@@ -185,7 +185,7 @@ def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
     is the first trial's.
 
     Raises:
-        ValueError: if there is no trial, or trials differ in their numbers of episodes.
+        InputError: if there is no trial, or trials differ in their numbers of episodes.
     """
     if not trials:
         raise InputError("trials: expected at least one finished, got none")

@@ -26,7 +26,7 @@ def check_trials(file: Path, settings: Mapping[str, Any]) -> None:
     """Read every trial's command line as its recipe will, before the first one runs.
 
     Raises:
-        ValueError: naming file, trial and option.
+        InputError: naming file, trial and option.
     """
     program = find_program(settings["program"])
     with patch.dict(os.environ, WANDB_RUN_ID="trial"):  # which options may refer to

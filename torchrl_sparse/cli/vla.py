@@ -37,7 +37,7 @@ def load_vla(config: DictConfig, data_set: str | None) -> VLAPolicy:
         data_set: whose statistics normalise a published policy's actions; None where its file has one only.
 
     Raises:
-        FileNotFoundError, ValueError: as of `VLAPolicy.from_pretrained`; also for options that a folder does not need.
+        FileNotFoundError, InputError: as of `VLAPolicy.from_pretrained`; also for options that a folder does not need.
     """
     options = {"heads": config.heads} | OmegaConf.to_container(config.published)
     if unknown := options.keys() - {*_UNSAID}:

@@ -35,7 +35,7 @@ class Thresholds:
         leave_translation, leave_rotation, leave_rise: one faster than any of them leaves it.
 
     Raises:
-        ValueError: if one would leave at a motion that enters, which would switch back and forth.
+        InputError: if one would leave at a motion that enters, which would switch back and forth.
     """
 
     translation: float
@@ -175,7 +175,7 @@ class ActionAwareController(TensorDictModuleBase):
             of them.
 
     Raises:
-        ValueError: for an unknown ``on``, thresholds that are not for it, fewer than one warm-up step, or actions that are not
+        InputError: for an unknown ``on``, thresholds that are not for it, fewer than one warm-up step, or actions that are not
             deltas.
 
     Examples:
@@ -250,7 +250,7 @@ class ActionAwareController(TensorDictModuleBase):
         """Make a controller from plain values, as a recipe's section ``controller`` has them; see `ControllerOptions`.
 
         Raises:
-            ValueError: ``controller: key: expected …, got …``.
+            InputError: ``controller: key: expected …, got …``.
 
         Examples:
             >>> ActionAwareController.from_options(fine=36.0).budgets

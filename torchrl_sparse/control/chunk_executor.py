@@ -58,7 +58,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
             :mod:`torchrl_sparse.control.selectors`; with ``num_samples`` above 1, and only then.
 
     Raises:
-        ValueError: if a chunk is shorter than ``n_action_steps``, or the environment drops what a step leaves to the next.
+        InputError: if a chunk is shorter than ``n_action_steps``, or the environment drops what a step leaves to the next.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -154,7 +154,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         return [keys.QUERIED, keys.CHUNK, *controlled, *carried_keys(self.policy)]
 
     def _check_carried(self, tensordict: TensorDictBase) -> None:
-        """Raise ValueError where an environment dropped what the step before left, or hands zeros back in its place."""
+        """Raise InputError where an environment dropped what the step before left, or hands zeros back in its place."""
         going_on = ~keys.read(tensordict, keys.IS_INIT)
         if not going_on.any():
             return
@@ -172,7 +172,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
             seed: of the noise, the same as in an environment's episode of this seed; None for torch's global generator.
 
         Raises:
-            ValueError: if the policy is none that observes a state, such as a VLA.
+            InputError: if the policy is none that observes a state, such as a VLA.
         """
         self._plain = PlainLoop(self, seed)
 
@@ -186,7 +186,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
                 for an `ActionAwareController`. Histories are kept here.
 
         Raises:
-            ValueError: naming what is missing, unknown, or of another dtype or shape; nothing is kept of that observation.
+            InputError: naming what is missing, unknown, or of another dtype or shape; nothing is kept of that observation.
 
         Examples:
             >>> from torchrl_sparse import DiffusionPolicy, Sampler

@@ -45,7 +45,7 @@ class RealtimeExecutor(ChunkExecutor):
         num_samples, selector: as for `ChunkExecutor`.
 
     Raises:
-        ValueError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
+        InputError: if ``latency`` is negative or not finite, or as in `ChunkExecutor`.
 
     Examples:
         >>> from torchrl_sparse import DiffusionPolicy, Sampler, make_env

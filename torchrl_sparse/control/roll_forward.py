@@ -57,7 +57,7 @@ class StateModel(nn.Module):
             episodes: states [T, Ds] and the actions [T, A] that were taken in them, in environment units.
 
         Raises:
-            ValueError: if no episode has the three steps that a change and what comes of it need.
+            InputError: if no episode has the three steps that a change and what comes of it need.
         """
         long_enough = [episode for episode in episodes if len(episode[0]) > 2]
         if not long_enough:
@@ -83,7 +83,7 @@ class StateModel(nn.Module):
             steps: d >= 1.
 
         Raises:
-            ValueError: if no episode is long enough for a single prediction.
+            InputError: if no episode is long enough for a single prediction.
         """
         rolled, stale = [], []
         for state, action in episodes:
@@ -119,7 +119,7 @@ class RollForward(TensorDictModuleBase):
         model: of its environment.
 
     Raises:
-        ValueError: if the policy reads no history of states; at a call, if that is of fewer than two.
+        InputError: if the policy reads no history of states; at a call, if that is of fewer than two.
 
     Examples:
         >>> from torchrl_sparse import DiffusionPolicy

@@ -65,7 +65,7 @@ class CoherentChunk(TensorDictModuleBase):
         decay: rho of the backward coherence, in (0, 1].
 
     Raises:
-        ValueError: if a number is out of its range.
+        InputError: if a number is out of its range.
     """
 
     in_keys = [keys.CANDIDATES, keys.LAST_CHUNK, keys.ELAPSED]

@@ -43,7 +43,7 @@ class TemporalEnsemble(TensorDictModuleBase):
         coeff: of the weights above; 0 is the plain mean, positive favours old predictions, negative new ones. ACT's is 0.01.
 
     Raises:
-        ValueError: if ``coeff`` is not finite.
+        InputError: if ``coeff`` is not finite.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -72,7 +72,7 @@ def convert_demos(path: str | Path, out: str | Path, *, poses: bool = False) -> 
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming file and demonstration, if the file is damaged or not of a known task with Pandas under
+        InputError: naming file and demonstration, if the file is damaged or not of a known task with Pandas under
             OSC_POSE at 20 actions a second, its recorded hand is not where its states put it, or its actions are not what its
             controller or ``poses`` says; or if ``out`` was made of another file.
 
@@ -111,7 +111,7 @@ class AbsoluteActions:
         control: how the actions were meant.
 
     Raises:
-        ValueError: if the task is unknown.
+        InputError: if the task is unknown.
 
     Examples:
         >>> absolute = AbsoluteActions(RecordedControl("Lift"))
@@ -140,7 +140,7 @@ class AbsoluteActions:
             beyond the controller's input and were clipped.
 
         Raises:
-            ValueError: if the sizes are not those of the task, or the actions are not what the controller says: poses that no
+            InputError: if the sizes are not those of the task, or the actions are not what the controller says: poses that no
                 hand could follow, or deltas that are poses.
         """
         sim = self.env.sim_env.sim

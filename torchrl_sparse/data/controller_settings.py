@@ -93,7 +93,7 @@ _BODY_PARTS: dict[str, Choice] = dict.fromkeys(
 
 
 def check_entries(where: str, entries: Any, known: Mapping[str, Choice]) -> None:
-    """Raise ValueError, beginning with ``where``, for an entry that is not known or has another value than those known.
+    """Raise InputError, beginning with ``where``, for an entry that is not known or has another value than those known.
 
     >>> check_entries("env_kwargs", {"control_freq": 10}, {"control_freq": (20,)})
     Traceback (most recent call last):
@@ -115,7 +115,7 @@ def check_entries(where: str, entries: Any, known: Mapping[str, Choice]) -> None
 
 
 def check_env_kwargs(where: str, env_kwargs: Any) -> None:
-    """Raise ValueError for an entry under which actions or steps mean something else than in this library."""
+    """Raise InputError for an entry under which actions or steps mean something else than in this library."""
     check_entries(where, env_kwargs, _ENV_KWARGS)
     for name in ("robots", "controller_configs"):
         if name not in env_kwargs:
@@ -131,7 +131,7 @@ def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
         is_old: they were written by robosuite 1.4 or earlier.
 
     Raises:
-        ValueError: naming the entry, if arms differ, or it is any other controller than OSC_POSE of this library's gains.
+        InputError: naming the entry, if arms differ, or it is any other controller than OSC_POSE of this library's gains.
     """
     each = configs if isinstance(configs, list) and configs else [configs]
     if any(other != each[0] for other in each):

@@ -53,7 +53,7 @@ class Driving:
         mixing: probability that the expert takes over before a policy call that is not the episode's first.
 
     Raises:
-        ValueError: if a value is out of its range.
+        InputError: if a value is out of its range.
     """
 
     policy: str
@@ -121,7 +121,7 @@ def load_driver(task: str, driving: Driving) -> Driver:
     """Load the policy that drives, once in a process.
 
     Raises:
-        FileNotFoundError, ValueError: if it cannot be read, is of other weights than ``driving`` says or of another task,
+        FileNotFoundError, InputError: if it cannot be read, is of other weights than ``driving`` says or of another task,
             has cameras, or the method is unknown or needs a calibration.
     """
     path = Path(driving.policy)

@@ -41,7 +41,7 @@ def in_order(
         backend: "process" or "ray", see `backend_runtime`.
 
     Raises:
-        ValueError: for an unknown backend.
+        InputError: for an unknown backend.
         ImportError: if Ray is asked for and not installed.
         RunFailed: if workers die three times in a row without anything done between.
         Exception: whatever ``task`` raises.

@@ -33,7 +33,7 @@ def demonstrate(
         driver: drives until the expert takes over; None for the expert alone.
 
     Raises:
-        ValueError: if the task has no expert or the quality is unknown.
+        InputError: if the task has no expert or the quality is unknown.
 
     Examples:
         >>> from torchrl_sparse.envs.tasks import find_task

@@ -47,7 +47,7 @@ class Collection:
         driving: the policy that drives first, of an episode that the expert finishes; None for the expert alone.
 
     Raises:
-        ValueError: if a value is out of its range, a seed is one of tests, or the task has no expert or not of that quality.
+        InputError: if a value is out of its range, a seed is one of tests, or the task has no expert or not of that quality.
     """
 
     task: str
@@ -128,7 +128,7 @@ def collect(
         on_episode: called with the tally so far, after episodes found on disk and after each new one.
 
     Raises:
-        ValueError: if ``path`` or its parts were collected with other settings, an option is out of range, or the policy that
+        InputError: if ``path`` or its parts were collected with other settings, an option is out of range, or the policy that
             is to drive cannot, see `load_driver`.
     """
     path = Path(path)
@@ -203,7 +203,7 @@ def read_initial_state(path: str | Path, index: int) -> InitialState:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming file and demonstration, if there is none of that number, it is damaged, or its model is of robosuite
+        InputError: naming file and demonstration, if there is none of that number, it is damaged, or its model is of robosuite
             1.4 or earlier, which robosuite 1.5 cannot play.
     """
     with open_demos(path) as file:

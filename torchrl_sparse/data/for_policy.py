@@ -34,7 +34,7 @@ def policy_demos(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: as `read_demos` and `policy_contract`; so if the file has no images of the policy's cameras.
+        InputError: as `read_demos` and `policy_contract`; so if the file has no images of the policy's cameras.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
@@ -55,7 +55,7 @@ def contract_demos(
         options: ``filter_key`` and ``image_folder`` of `read_demos`.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_demos`.
+        FileNotFoundError, InputError: as `read_demos`.
     """
     task = find_task(str(contract.task))
     return read_demos(
@@ -86,7 +86,7 @@ def instructed_demos(
         options: as of `contract_demos`.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_demos` and, with a policy, `check_instructed`.
+        FileNotFoundError, InputError: as `read_demos` and, with a policy, `check_instructed`.
     """
     if policy is not None:
         check_instructed(task, policy, cameras)

@@ -52,7 +52,7 @@ class Room:
         """Count an array, of whose numbers each will take ``itemsize`` bytes, and return how it is kept.
 
         Raises:
-            ValueError: if there is no room for it, or it is not kept as numbers in the file itself.
+            InputError: if there is no room for it, or it is not kept as numbers in the file itself.
         """
         layout = array.layout()
         if layout.is_elsewhere or layout.shape is None or layout.dtype.kind not in "fiub":

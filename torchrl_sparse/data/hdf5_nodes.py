@@ -101,7 +101,7 @@ class Node:
             where: what errors of that entry begin with; this one's and ``path`` by default.
 
         Raises:
-            ValueError: if it is damaged or a link to elsewhere.
+            InputError: if it is damaged or a link to elsewhere.
         """
         where, item = where or f"{self.where}, {path}", self._item
         for part in path.split("/"):
@@ -133,7 +133,7 @@ class Node:
         """Return the group at ``path``.
 
         Raises:
-            ValueError: as `find`, and if there is none or another kind of entry.
+            InputError: as `find`, and if there is none or another kind of entry.
         """
         found = self.find(path)
         if found is None or not found.is_group:
@@ -158,7 +158,7 @@ class Node:
         """Return the attribute ``name``, a whole number.
 
         Raises:
-            ValueError: if it is anything else, or missing without a default.
+            InputError: if it is anything else, or missing without a default.
         """
         found = self._attribute(name)
         if found is None and default is not None:
@@ -177,7 +177,7 @@ class Node:
         """Return the attribute ``name``, a text; None if there is none.
 
         Raises:
-            ValueError: if it is anything else.
+            InputError: if it is anything else.
         """
         if (found := self._attribute(name)) is None:
             return None
@@ -192,7 +192,7 @@ class Node:
         """Return the attribute ``name``, true or false.
 
         Raises:
-            ValueError: if it is missing or anything else.
+            InputError: if it is missing or anything else.
         """
         found = self._attribute(name)
         if found is None or found[0] != () or found[1].kind != "b":

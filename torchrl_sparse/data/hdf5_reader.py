@@ -28,7 +28,7 @@ def open_demos(path: str | Path) -> Iterator[Node]:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is no complete HDF5 file; of a truncated one the message names the first demonstration that is
+        InputError: if it is no complete HDF5 file; of a truncated one the message names the first demonstration that is
             damaged, unless the index of demonstrations is lost with it.
     """
     path = Path(path)
@@ -62,7 +62,7 @@ def demo_names(file: Node, filter_key: str | None = None) -> list[str]:
         filter_key: only those that the file lists as ``mask/<filter_key>``, e.g. "train" or "better".
 
     Raises:
-        ValueError: if there are none, or no such filter key, or it lists a demonstration that is not there.
+        InputError: if there are none, or no such filter key, or it lists a demonstration that is not there.
 
     Examples:
         >>> with h5py.File("in memory", "w", driver="core", backing_store=False) as file:
@@ -88,7 +88,7 @@ def demo_group(file: Node) -> Node:
     """Return the group of an open file's demonstrations; `open_demo` opens one of them.
 
     Raises:
-        ValueError: naming the file, if there is none.
+        InputError: naming the file, if there is none.
     """
     data = file.find("data", where=file.where)
     if data is None or not data.is_group:
@@ -100,7 +100,7 @@ def open_demo(data: Node, name: str) -> tuple[Node, int]:
     """Return the demonstration ``name`` of the group of demonstrations and its number of steps, the attribute ``num_samples``.
 
     Raises:
-        ValueError: if the demonstration is damaged or elsewhere, or does not tell.
+        InputError: if the demonstration is damaged or elsewhere, or does not tell.
     """
     demo = data.group(name)
     return demo, demo.count("num_samples")
@@ -121,7 +121,7 @@ class ArrayReader:
         """Return one array f64 [length, n] of a demonstration, all of its numbers finite.
 
         Raises:
-            ValueError: naming it, if it is missing, damaged, too large or of another shape.
+            InputError: naming it, if it is missing, damaged, too large or of another shape.
         """
         array = _array(demo, name)
         shape = self._room.enter(array, np.dtype(np.float64).itemsize).shape or ()
@@ -138,7 +138,7 @@ class ArrayReader:
         """Return images u8 [length, h, w, 3] of a demonstration.
 
         Raises:
-            ValueError: naming them, if they are missing, damaged, too many or of another shape or type.
+            InputError: naming them, if they are missing, damaged, too many or of another shape or type.
         """
         array = _array(demo, name)
         layout = self._room.enter(array, 1)

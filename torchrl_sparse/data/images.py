@@ -59,7 +59,7 @@ def read_images(files: Sequence[RecordedImages], key: str, folder: str | Path | 
         folder: where to put a memory-mapped file, which appears when it is complete; None keeps the images in memory.
 
     Raises:
-        ValueError: naming file, demonstration and observation, if images are missing, damaged or of another
+        InputError: naming file, demonstration and observation, if images are missing, damaged or of another
             size than those before.
     """
     episodes = _of_one_size(chain.from_iterable(file.episodes(key) for file in files))

@@ -19,7 +19,7 @@ def read_instruction(demo: Node) -> str | None:
     """Read the instruction of one demonstration; None if it has none.
 
     Raises:
-        ValueError: if ``ep_meta`` is no json object or its ``lang`` is no text.
+        InputError: if ``ep_meta`` is no json object or its ``lang`` is no text.
     """
     text = demo.text("ep_meta") or "{}"
     try:
@@ -38,7 +38,7 @@ def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming file and demonstration, if one has no instruction.
+        InputError: naming file and demonstration, if one has no instruction.
 
     Examples:
         >>> read_instructions("data/lift_named_proficient.h5")[0]  # doctest: +SKIP

@@ -25,7 +25,7 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
     """Make the folder of parts of ``path``, or find it again for the same settings; without a part it is anybody's.
 
     Raises:
-        ValueError: if it holds parts that were made with other settings.
+        InputError: if it holds parts that were made with other settings.
     """
     parts = parts_of(path)
     parts.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
 
 
 def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    """Raise ValueError unless ``where`` was made with the settings asked for."""
+    """Raise InputError unless ``where`` was made with the settings asked for."""
     asked_of_it = {key: found[key] for key in asked if key in found}
     if differing := describe_differences(asked_of_it, asked):
         raise InputError(

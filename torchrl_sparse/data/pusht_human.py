@@ -57,7 +57,7 @@ def convert_pusht(path: str | Path, out: str | Path) -> int:
 
     Raises:
         FileNotFoundError: if there is no ``path``.
-        ValueError: naming file and array, if it is not such a file, or its keypoints are not those of its states.
+        InputError: naming file and array, if it is not such a file, or its keypoints are not those of its states.
 
     Examples:
         >>> convert_pusht("pusht_human.npz", "data/pusht_human.h5")  # doctest: +SKIP

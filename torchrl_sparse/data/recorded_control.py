@@ -75,7 +75,7 @@ def check_recorded_task(file: Node, task: str | None, *, poses: bool) -> str:
     """Return the task that a file says its demonstrations are of.
 
     Raises:
-        ValueError: unless it is ``task``, or any known one where that is None. Of a task whose actions are no ``poses``, whose
+        InputError: unless it is ``task``, or any known one where that is None. Of a task whose actions are no ``poses``, whose
             environments take no options, the file may say nothing else.
     """
     args = _env_args(file)
@@ -100,7 +100,7 @@ def read_control(file: Node, *, poses: bool = False) -> RecordedControl:
             Policy (arXiv:2303.04137) publishes as ``*_abs.hdf5``.
 
     Raises:
-        ValueError: naming file and entry, if ``env_args`` are missing or damaged, or say anything but a known task of robosuite
+        InputError: naming file and entry, if ``env_args`` are missing or damaged, or say anything but a known task of robosuite
             with Pandas under OSC_POSE as this library plays it.
     """
     args, where = _env_args(file), f"{file.where}, env_args"

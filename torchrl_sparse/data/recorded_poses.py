@@ -40,7 +40,7 @@ def check_poses(
         quaternions: the same of its grip site [T, 4], xyzw.
 
     Raises:
-        ValueError: naming the first such step.
+        InputError: naming the first such step.
     """
     far, turn = steps_out_of_reach(actions, positions, quaternions)
     for values, limit, what, unit in ((far, REACH, "position", "m"), (turn, TURN, "rotation", "rad")):

@@ -40,7 +40,7 @@ def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, i
     Raises:
         FileNotFoundError: if there is no file.
         RuntimeError: if no GL library is installed.
-        ValueError: naming the demonstration, if one is damaged or its model is none of robosuite 1.5; if there is no such
+        InputError: naming the demonstration, if one is damaged or its model is none of robosuite 1.5; if there is no such
             camera, it has images of one already, or ``out`` is ``path``.
     """
     if Path(path).resolve() == Path(out).resolve():

@@ -95,7 +95,7 @@ class Demonstrations:
             episodes: episodes to cut; all by default.
 
         Raises:
-            ValueError: if a size is below 1, or ``n_obs_steps - 1 + n_action_steps`` exceeds ``horizon``, or
+            InputError: if a size is below 1, or ``n_obs_steps - 1 + n_action_steps`` exceeds ``horizon``, or
                 no window fits.
         """
         _check_window(horizon, n_obs_steps, n_action_steps)
@@ -157,7 +157,7 @@ def read_demos(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if a file is truncated or malformed, does not say what it is of, its actions are deltas or were played by
+        InputError: if a file is truncated or malformed, does not say what it is of, its actions are deltas or were played by
             another controller, robot or at another rate, it is of another task, there is no such filter key, or its objects
             cannot be had in that convention; the message names file, demonstration and dataset. As `join_demos` if files
             differ.
@@ -210,7 +210,7 @@ def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
     """Lay several sets of demonstrations end to end, in memory, such as those of DAgger's rounds.
 
     Raises:
-        ValueError: if there is none, or they differ in what they observe, in its meaning or in sizes.
+        InputError: if there is none, or they differ in what they observe, in its meaning or in sizes.
     """
     shapes = sorted(
         {str({key: part.data[key].shape[1:] for key in part.data.keys(True, True)}) for part in parts}

@@ -77,7 +77,7 @@ def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
         policy: any.
 
     Raises:
-        ValueError: if the policy was trained for another task, has cameras and its ``source`` does not say which, or observes
+        InputError: if the policy was trained for another task, has cameras and its ``source`` does not say which, or observes
             or acts in other names, sizes or at another rate than the task's; the message names both.
 
     >>> policy_contract("lift", DiffusionPolicy.from_pretrained("assets/lift")).state_keys[0]
@@ -120,7 +120,7 @@ def check_contract(policy: DiffusionPolicy, shown: Contract | None) -> None:
         shown: meaning of what it would be shown; None if nobody noted it.
 
     Raises:
-        ValueError: naming what its ``source`` says and what is shown; also as of `policy_contract`.
+        InputError: naming what its ``source`` says and what is shown; also as of `policy_contract`.
     """
     if shown is None:
         return
@@ -160,7 +160,7 @@ def continued_source(task: str, policy: DiffusionPolicy) -> dict[str, Any]:
         policy: that is trained on.
 
     Raises:
-        ValueError: as of `policy_contract`, if what it observes and commands is not the task's.
+        InputError: as of `policy_contract`, if what it observes and commands is not the task's.
 
     >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
     >>> policy.source = {"weights": "model", "task": "lift_lowdim"}

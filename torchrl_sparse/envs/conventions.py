@@ -49,7 +49,7 @@ _NEGATED = ("gripper_to_cube_pos",)
 
 
 def check_convention(convention: str, task: str) -> None:
-    """Raise ValueError unless observations of the robosuite task can be had in that convention."""
+    """Raise InputError unless observations of the robosuite task can be had in that convention."""
     known = get_args(Convention) if task in _PARTS else ("1.5",)
     if convention not in known:
         raise InputError(f"convention: expected {' or '.join(known)} for {task}, got {convention!r}")
@@ -84,7 +84,7 @@ def translate_objects(
         observed, wanted: see `Convention`.
 
     Raises:
-        ValueError: if the task is not known in both, or the state is of another size than the task's.
+        InputError: if the task is not known in both, or the state is of another size than the task's.
 
     >>> translate_objects("Lift", np.arange(10.0), observed="1.4", wanted="1.5")[-3:]
     array([-7., -8., -9.])

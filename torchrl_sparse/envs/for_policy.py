@@ -30,7 +30,7 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
         horizon: steps until an episode is truncated; None for the task's own.
 
     Raises:
-        ValueError: as of `policy_contract`; so for cameras that no environment has.
+        InputError: as of `policy_contract`; so for cameras that no environment has.
 
     Examples:
         >>> make = diffusion_env("lift", DiffusionPolicy.from_pretrained("assets/lift"))

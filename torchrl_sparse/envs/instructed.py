@@ -50,7 +50,7 @@ def find_instructed_task(name: str) -> InstructedTask:
 
     Raises:
         ImportError: for a suite without LIBERO, with the command that installs it.
-        ValueError: if there is none; the message lists those there are.
+        InputError: if there is none; the message lists those there are.
 
     >>> find_instructed_task("lift_named").state_dim
     9
@@ -81,7 +81,7 @@ def instructed_env(
         horizon: steps until an episode is truncated; None for the task's own.
 
     Raises:
-        ValueError: if the policy was trained for another task, with other cameras, or reads or acts in other sizes than the
+        InputError: if the policy was trained for another task, with other cameras, or reads or acts in other sizes than the
             task's; the message names both.
 
     Examples:
@@ -115,7 +115,7 @@ def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -
         cameras: name of an observation here -> name of the images in demonstrations; not read for a suite of LIBERO.
 
     Raises:
-        ValueError: as of `instructed_env`.
+        InputError: as of `instructed_env`.
     """
     found, trained = find_instructed_task(task), policy.source.task
     if trained is not None and _known(trained) not in (None, found.name):
@@ -135,7 +135,7 @@ def continued_vla_source(task: str, policy: VLAPolicy, cameras: Mapping[str, str
         cameras: of the demonstrations; noted where its ``source`` names none.
 
     Raises:
-        ValueError: if what it observes and commands is not the task's, or its cameras are others.
+        InputError: if what it observes and commands is not the task's, or its cameras are others.
     """
     found = find_instructed_task(task)
     _check_sizes(found, policy)

@@ -66,7 +66,7 @@ def make_libero_env(
     Raises:
         ImportError: without LIBERO, with the command that installs it.
         FileNotFoundError: without its scenes, with the command that links them.
-        ValueError: on an unknown suite.
+        InputError: on an unknown suite.
 
     Examples:
         >>> env = make_libero_env("libero_spatial", 0)  # doctest: +SKIP
@@ -99,7 +99,7 @@ def suite_horizon(suite: str) -> int:
     """Return the steps of `SUITES`.
 
     Raises:
-        ValueError: on an unknown suite.
+        InputError: on an unknown suite.
     """
     if suite not in SUITES:
         raise InputError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")

@@ -32,7 +32,7 @@ def scene_of(seed: int) -> tuple[int, int | None]:
     the test is seen before.
 
     Raises:
-        ValueError: for a test seed beyond the 500.
+        InputError: for a test seed beyond the 500.
 
     >>> scene_of(210_000), scene_of(210_013), scene_of(100_013)
     ((0, 0), (3, 1), (3, None))
@@ -68,7 +68,7 @@ class LiberoSuite(SeededEnv):
 
     Raises:
         ImportError: without LIBERO, with the command that installs it.
-        ValueError: on an unknown suite, or a seed that `scene_of` refuses.
+        InputError: on an unknown suite, or a seed that `scene_of` refuses.
     """
 
     action_mode = "delta"

@@ -84,7 +84,7 @@ class CameraRenderer:
         """Return u8 [height, width, 3], top row first.
 
         Raises:
-            ValueError: if the model has no camera of that name.
+            InputError: if the model has no camera of that name.
         """
         mujoco = self._mujoco
         camera_id = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)

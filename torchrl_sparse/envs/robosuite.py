@@ -69,7 +69,7 @@ class RobosuiteEnv(SeededEnv):
         reward_shaping: robosuite's dense reward instead of 1 on success.
 
     Raises:
-        ValueError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, ``seen_frames`` below
+        InputError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, ``seen_frames`` below
             1, or an action of a wrong size or that is not finite.
 
     Examples:

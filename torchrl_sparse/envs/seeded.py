@@ -47,7 +47,7 @@ class SeededEnv(EnvBase):
         tells_way: write ``("episode", "way")``, which of its ways the task is being done, from `_way`.
 
     Raises:
-        ValueError: for an empty ``seeds``, a seed that is no whole number, or an action of a wrong size or that is not finite.
+        InputError: for an empty ``seeds``, a seed that is no whole number, or an action of a wrong size or that is not finite.
     """
 
     action_mode: str = "absolute"

@@ -47,7 +47,7 @@ def evaluation_seeds(split: str, offset: int, episodes: int) -> range:
         episodes: how many.
 
     Raises:
-        ValueError: for another split, or seeds that would leave its range.
+        InputError: for another split, or seeds that would leave its range.
 
     >>> evaluation_seeds("development", 200, 3), evaluation_seeds("test", 0, 2)
     (range(100200, 100203), range(210000, 210002))
@@ -70,7 +70,7 @@ def tuning_seeds(first: int, episodes: int) -> range:
         episodes: how many.
 
     Raises:
-        ValueError: if one of them is for tests.
+        InputError: if one of them is for tests.
 
     >>> tuning_seeds(CALIBRATION_SEED, 2)
     range(180000, 180002)
@@ -85,7 +85,7 @@ def whole_seed(seed: Any) -> int:
     """Return a seed as an integer, of any type that stands for one.
 
     Raises:
-        ValueError: if it is a fraction, which would silently be another episode, negative, or of more than 63 bits.
+        InputError: if it is a fraction, which would silently be another episode, negative, or of more than 63 bits.
 
     >>> whole_seed(1.7)
     Traceback (most recent call last):

@@ -68,12 +68,12 @@ class Task(Protocol):
         """Import the function that tells the way of an episode from its states, f32 [T, Ds], as the environment does.
 
         Raises:
-            ValueError: if the task's episodes tell none.
+            InputError: if the task's episodes tell none.
         """
 
     def load_expert(self) -> type[Any]:
         """Import the class of the task's scripted expert.
 
         Raises:
-            ValueError: if there is none; the message lists the tasks that have one.
+            InputError: if there is none; the message lists the tasks that have one.
         """

@@ -85,7 +85,7 @@ class RobosuiteTask(_Named):
         return len(self.instructions) > 1
 
     def check_instruction(self, words: str) -> None:
-        """Raise ValueError unless ``words`` are one of `instructions`."""
+        """Raise InputError unless ``words`` are one of `instructions`."""
         if words not in self.instructions:
             expected = ", ".join(map(repr, self.instructions))
             raise InputError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
@@ -174,7 +174,7 @@ class StateTask(_Named):
 
     @property
     def proprioception_keys(self) -> tuple[str, ...]:
-        """Raise ValueError: no camera shows the rest."""
+        """Raise InputError: no camera shows the rest."""
         raise InputError(f"cameras: expected none for {self.name}, whose policies see its state")
 
     @property
@@ -277,7 +277,7 @@ TASKS: dict[str, Task] = {task.name: task for task in (*_ROBOSUITE, *_OTHERS)}
 
 
 def find_task(name: str) -> Task:
-    """Find a task by its name or alias; ValueError if there is none.
+    """Find a task by its name or alias; InputError if there is none.
 
     >>> find_task("pusht").state_dim, find_task("can").state_dim
     (20, 23)

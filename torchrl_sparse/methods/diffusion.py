@@ -149,7 +149,7 @@ SAVED = Method(_saved)
 
 
 def check_method(method: MethodSpec | str, planners: Path) -> None:
-    """Raise ValueError unless a label is written as `MethodSpec` says, and the method is known or saved in ``planners``."""
+    """Raise InputError unless a label is written as `MethodSpec` says, and the method is known or saved in ``planners``."""
     _find(method, planners)
 
 
@@ -170,7 +170,7 @@ def make_method(
             with another M, is computed.
 
     Raises:
-        ValueError: for an unknown name, a planner that was made for another policy, or a rate that it does not take.
+        InputError: for an unknown name, a planner that was made for another policy, or a rate that it does not take.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")

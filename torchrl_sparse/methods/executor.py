@@ -28,7 +28,7 @@ def executed_every(method: MethodSpec | str, policy: DiffusionPolicy, n_action_s
         n_action_steps: of methods that do not say.
 
     Raises:
-        ValueError: if a chunk has fewer actions than the method says.
+        InputError: if a chunk has fewer actions than the method says.
     """
     every, length = MethodSpec.parse(method).every, policy.horizon - policy.n_obs_steps + 1
     if every is not None and every > length:
@@ -47,7 +47,7 @@ def make_executor(method: MethodSpec | str, policy: DiffusionPolicy, n_action_st
     """Return what executes the chunks of a method; the arguments are those of `executed_every`.
 
     Raises:
-        ValueError: as `executed_every`, and for a method that looks ahead to when its answer begins: this world waits.
+        InputError: as `executed_every`, and for a method that looks ahead to when its answer begins: this world waits.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
@@ -81,7 +81,7 @@ def make_realtime_executor(
         model: what methods named ``_ahead`` roll the state forward with.
 
     Raises:
-        ValueError: as `executed_every`, and for an ``_ahead`` without a model.
+        InputError: as `executed_every`, and for an ``_ahead`` without a model.
     """
     asked: TensorDictModuleBase = policy
     if MethodSpec.parse(method).ahead:

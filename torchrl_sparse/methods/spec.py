@@ -53,7 +53,7 @@ class MethodSpec:
         like: label of the token method whose tokens are matched.
 
     Raises:
-        ValueError: naming the field, for values that no label says.
+        InputError: naming the field, for values that no label says.
 
     Examples:
         >>> str(MethodSpec(sampler="ddpm5_logsnr", weights="int8"))
@@ -87,7 +87,7 @@ class MethodSpec:
         """Return the method of a label, and one that is read already as it is.
 
         Raises:
-            ValueError: unless the label is written as the module says.
+            InputError: unless the label is written as the module says.
         """
         return method if isinstance(method, MethodSpec) else cls(*_read(method))
 

@@ -49,7 +49,7 @@ class TokenBudget:
         settings: further arguments of the method, for SpecPrune the fields of `SpecPruneOptions` that differ from the paper's.
 
     Raises:
-        ValueError: if there is no such method, it has no number, or its pruner refuses the number or a setting.
+        InputError: if there is no such method, it has no number, or its pruner refuses the number or a setting.
 
     Examples:
         >>> points = (BudgetPoint(0.5, 90.0, 0.03), BudgetPoint(1.0, 150.0, 0.01))
@@ -81,7 +81,7 @@ class TokenBudget:
         """Load what `save_pretrained` wrote.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
 
         Examples:
             >>> TokenBudget.from_pretrained("assets/vla/specprune.json").number
@@ -99,7 +99,7 @@ def numbered_pruner(method: str, number: float, settings: dict[str, Any]) -> Tok
         settings: its further arguments; empty for methods that have none.
 
     Raises:
-        ValueError: see `TokenBudget`.
+        InputError: see `TokenBudget`.
 
     >>> numbered_pruner("fastv", 0.3, {}).share
     0.3
@@ -124,7 +124,7 @@ def fewest_tokens(points: Sequence[BudgetPoint], tolerance: float) -> float:
     Numbers that keep as many tokens, as all of VLA-Cache do, go from the smallest to the largest.
 
     Raises:
-        ValueError: if even the one that keeps most does; the message lists all.
+        InputError: if even the one that keeps most does; the message lists all.
     """
     chosen = None
     for point in sorted(points, key=lambda point: (-point.kept, point.number)):

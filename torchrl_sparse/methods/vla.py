@@ -137,7 +137,7 @@ tokens, ``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the word
 
 
 def parse_token_method(method: MethodSpec | str) -> MethodSpec:
-    """Return a method that is in the table; ValueError if it is not, or is asked for what it does not take.
+    """Return a method that is in the table; InputError if it is not, or is asked for what it does not take.
 
     >>> parse_token_method("random@specprune@0.4").like
     'specprune@0.4'
@@ -159,7 +159,7 @@ def parse_token_method(method: MethodSpec | str) -> MethodSpec:
 
 
 def check_matches(texts: Iterable[str]) -> None:
-    """Raise ValueError if a method matches one that is not among ``texts``, or that matches another itself.
+    """Raise InputError if a method matches one that is not among ``texts``, or that matches another itself.
 
     >>> check_matches(["dense", "fastv@specprune"])
     Traceback (most recent call last):
@@ -184,7 +184,7 @@ def make_pruner(
         settings: sections of further arguments, see `TokenMethod`.
 
     Raises:
-        ValueError: for a number that the method does not take.
+        InputError: for a number that the method does not take.
 
     Examples:
         >>> make_pruner("specprune@0.8", settings={"specprune": {"budget": 20.0}}).options.alpha

@@ -30,7 +30,7 @@ class Normalizer(nn.Module):
         action_scale, action_offset: f32 [A].
 
     Raises:
-        ValueError: if a scale and its offset differ in shape, are not vectors, or are not finite, or if a
+        InputError: if a scale and its offset differ in shape, are not vectors, or are not finite, or if a
             scale has a zero.
 
     Examples:
@@ -76,7 +76,7 @@ class Normalizer(nn.Module):
                 for the benchmarks outside robosuite.
 
         Raises:
-            ValueError: if the shapes do not fit, a value is not finite or ``state_mode`` is unknown.
+            InputError: if the shapes do not fit, a value is not finite or ``state_mode`` is unknown.
         """
         _check_data(state, action, poses)
         if state_mode == "global":

@@ -21,7 +21,7 @@ class WorkerDied(RuntimeError):
 
 
 def check_backend(backend: str, workers: int) -> None:
-    """Raise ValueError for an unknown backend or no worker."""
+    """Raise InputError for an unknown backend or no worker."""
     if backend not in _BACKENDS:
         raise InputError(f"backend: expected one of {', '.join(_BACKENDS)}, got {backend!r}")
     if workers < 1:
@@ -35,7 +35,7 @@ def backend_runtime(backend: str, workers: int) -> AbstractContextManager[None]:
     made on this machine), is used and left running. Otherwise a local one of ``workers`` CPUs lives as long as the block.
 
     Raises:
-        ValueError: see `check_backend`.
+        InputError: see `check_backend`.
         ImportError: if Ray is asked for and not installed.
 
     >>> with backend_runtime("process", workers=2):

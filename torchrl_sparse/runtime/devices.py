@@ -13,7 +13,7 @@ def check_device(name: str) -> str:
     """Return the name of a device that this machine and PyTorch have.
 
     Raises:
-        ValueError: if it has none of that name.
+        InputError: if it has none of that name.
 
     >>> check_device("cpu")
     'cpu'

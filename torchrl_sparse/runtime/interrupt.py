@@ -18,7 +18,7 @@ class StopSignal:
         name: of the signal that came, e.g. ``"SIGTERM"``; None while there was none.
 
     Raises:
-        ValueError: by Python when entered elsewhere than in the main thread.
+        InputError: by Python when entered elsewhere than in the main thread.
 
     Examples:
         >>> with StopSignal() as stop:

@@ -15,7 +15,7 @@ def num_threads(threads: int | None) -> Iterator[None]:
     """Run a block with ``threads`` intra-op threads of PyTorch (None: as many as now); restore them afterwards.
 
     Raises:
-        ValueError: for fewer than one thread.
+        InputError: for fewer than one thread.
 
     >>> with num_threads(1):
     ...     torch.get_num_threads()

@@ -107,7 +107,7 @@ def read_pretrained(path: Path) -> StoredPolicy:
 
     Raises:
         FileNotFoundError: if a file is not there.
-        ValueError: naming the file, what was expected and what came.
+        InputError: naming the file, what was expected and what came.
     """
     check_folder(path)
     config = read_json(path / "config.json", _Config)

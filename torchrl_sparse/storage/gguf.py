@@ -77,7 +77,7 @@ class GGUF:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming the file, if it is damaged, cut off, or no such file.
+        InputError: naming the file, if it is damaged, cut off, or no such file.
     """
 
     def __init__(self, path: Path):
@@ -109,7 +109,7 @@ class GGUF:
         """Return a tensor, f32.
 
         Raises:
-            ValueError: if it is of a type that is not read, cut off, or its numbers are not finite.
+            InputError: if it is of a type that is not read, cut off, or its numbers are not finite.
         """
         stored = self._tensors[name]
         if stored.kind not in _TYPES:

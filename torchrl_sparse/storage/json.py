@@ -38,7 +38,7 @@ def read_json(path: str | os.PathLike, kind: type[T]) -> T:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: ``FILE: key: expected …, got …``, also for a file that is huge or deep or of too many parts.
+        InputError: ``FILE: key: expected …, got …``, also for a file that is huge or deep or of too many parts.
 
     Examples:
         >>> import tempfile
@@ -67,7 +67,7 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
         where: names the text in errors.
 
     Raises:
-        ValueError: ``WHERE: key: expected …, got …``.
+        InputError: ``WHERE: key: expected …, got …``.
 
     >>> parse_json('{"solved": true}', dict[str, int], "line 3")
     Traceback (most recent call last):
@@ -103,7 +103,7 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
     """Check plain values, as strictly as `read_json` does those of a file, and return what they make.
 
     Raises:
-        ValueError: ``WHERE: key: expected …, got …``.
+        InputError: ``WHERE: key: expected …, got …``.
 
     >>> check_plain("few", int, "episodes")
     Traceback (most recent call last):
@@ -126,7 +126,7 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
 
     Raises:
         TypeError: if ``value`` holds something that JSON cannot.
-        ValueError: naming file and key, if `read_json` would refuse the file.
+        InputError: naming file and key, if `read_json` would refuse the file.
     """
     path = Path(path)
     try:

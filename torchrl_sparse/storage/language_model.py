@@ -73,7 +73,7 @@ def read_language_model(path: str | Path) -> LanguageModel:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming the file, what was expected in it and what was found.
+        InputError: naming the file, what was expected in it and what was found.
     """
     file = GGUF(Path(path))
     for name, value in _FIXED.items():

@@ -46,7 +46,7 @@ def read_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> di
 
     Raises:
         FileNotFoundError: if it is not there.
-        ValueError: naming the file, if it is damaged or holds anything else, or a number that is not finite.
+        InputError: naming the file, if it is damaged or holds anything else, or a number that is not finite.
     """
     if not path.is_file():
         raise FileNotFoundError(f"expected a file {path}, got none")
@@ -90,7 +90,7 @@ def shapes_of(tensors: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 def check_shapes(
     where: str, found: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]
 ) -> None:
-    """Raise ValueError, beginning with ``where``, unless ``found`` has exactly the names and shapes ``expected``.
+    """Raise InputError, beginning with ``where``, unless ``found`` has exactly the names and shapes ``expected``.
 
     >>> check_shapes("a.safetensors", {"w": (2, 3)}, {"w": (2, 4)})
     Traceback (most recent call last):
@@ -111,7 +111,7 @@ def _first(names: list[str]) -> str:
 
 
 def check_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
-    """Raise ValueError, beginning with ``where``, if a tensor holds NaN or infinity."""
+    """Raise InputError, beginning with ``where``, if a tensor holds NaN or infinity."""
     for name, value in tensors.items():
         if not value.isfinite().all():
             raise InputError(f"{where}: {name}: expected finite numbers, got NaN or infinity")

@@ -40,7 +40,7 @@ def read_checkpoint(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming the file, what was expected and what came.
+        InputError: naming the file, what was expected and what came.
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

@@ -119,7 +119,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = 
 
     Raises:
         FileNotFoundError: if a file is not there.
-        ValueError: naming the file, what was expected and what came.
+        InputError: naming the file, what was expected and what came.
     """
     where = path / "config.json"
     check_folder(path)

@@ -77,7 +77,7 @@ def read_yaml(path: str | os.PathLike) -> Any:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming the file and the line or entry, for what is no YAML, a name that stands twice, or another value.
+        InputError: naming the file and the line or entry, for what is no YAML, a name that stands twice, or another value.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "sweep.yaml"

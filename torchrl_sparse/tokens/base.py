@@ -61,7 +61,7 @@ class TokenPruner(LayerHooks):
         """Take note of the model that the pruner is assigned to: one that carries keys keeps it as ``self.spec``.
 
         Raises:
-            ValueError: if the pruner does not fit it, for instance a budget larger than its tokens.
+            InputError: if the pruner does not fit it, for instance a budget larger than its tokens.
         """
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:

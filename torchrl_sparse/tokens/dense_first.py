@@ -25,7 +25,7 @@ class DenseFirst(TokenPruner):
         inner: that pruner.
 
     Raises:
-        ValueError: when it is assigned to a model, if ``inner`` skips layers, which it does for a whole batch.
+        InputError: when it is assigned to a model, if ``inner`` skips layers, which it does for a whole batch.
 
     Examples:
         >>> from torchrl_sparse.tokens.random import RandomPruner

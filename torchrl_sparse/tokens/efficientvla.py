@@ -129,7 +129,7 @@ def redundant_layers(similarity: Tensor, count: int) -> list[int]:
         count: layers to skip.
 
     Raises:
-        ValueError: if there are not so many.
+        InputError: if there are not so many.
 
     Examples:
         >>> redundant_layers(torch.tensor([[0.0, 0.9, 0.3, 0.8, 0.5]]), 2)

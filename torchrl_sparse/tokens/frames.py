@@ -20,7 +20,7 @@ def past_frame_keys(furthest: int) -> list[NestedKey]:
     """Return what `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` calls back; the first it writes as well.
 
     Raises:
-        ValueError: if that is less than one call.
+        InputError: if that is less than one call.
     """
     if furthest < 1:
         raise InputError(f"look_back: expected at least 1 policy call, got {furthest}")
@@ -35,7 +35,7 @@ def patches(frames: Tensor, grid: tuple[int, int]) -> Tensor:
         grid: rows and columns, which divide h and w.
 
     Raises:
-        ValueError: if they do not.
+        InputError: if they do not.
 
     Examples:
         >>> patches(torch.arange(4, dtype=torch.uint8).reshape(1, 1, 1, 2, 2), (2, 2)).flatten().tolist()

@@ -71,7 +71,7 @@ def check_budget(name: str, budget: float, spec: VisualSpec) -> None:
     """Refuse a number of tokens per camera that the model does not have.
 
     Raises:
-        ValueError: naming the budget and the model's tokens.
+        InputError: naming the budget and the model's tokens.
     """
     if not 0 < budget <= spec.per_camera:
         raise InputError(
@@ -83,7 +83,7 @@ def check_share(name: str, share: float) -> None:
     """Refuse a share outside (0, 1].
 
     Raises:
-        ValueError: naming it.
+        InputError: naming it.
     """
     if not 0 < share <= 1:
         raise InputError(f"{name}: expected more than 0 and at most 1, got {share:g}")

@@ -102,7 +102,7 @@ class SparseVLMPruner(TokenPruner):
             ``"embeddings"``, as the authors' release, once and before the decoder.
 
     Raises:
-        ValueError: for a share outside (0, 1], or other raters.
+        InputError: for a share outside (0, 1], or other raters.
     """
 
     def __init__(

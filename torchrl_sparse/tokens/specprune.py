@@ -185,7 +185,7 @@ class SpecPrune(TokenPruner):
         changes: `SpecPruneOptions` that differ from the preset's.
 
     Raises:
-        ValueError: for an unknown preset or an option out of its range; and when it is assigned to a model, or run, with a
+        InputError: for an unknown preset or an option out of its range; and when it is assigned to a model, or run, with a
             budget larger than the model's tokens.
 
     Examples:

@@ -45,7 +45,7 @@ def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike
         rate: the target.
 
     Raises:
-        ValueError: if a curve is missing.
+        InputError: if a curve is missing.
     """
     needed = ["train/fidelity", "train/rate_cost", *(f"train/rate_{kind}" for kind in BLOCK_TYPES)]
     if missing := [name for name in needed if name not in curves]:

@@ -38,7 +38,7 @@ class TrainConfig:
         seed: fixes everything random.
 
     Raises:
-        ValueError: if a value is out of its range.
+        InputError: if a value is out of its range.
     """
 
     max_steps: int
@@ -174,7 +174,7 @@ def split_windows(
         val_ratio: share of the episodes.
 
     Raises:
-        ValueError: if that leaves no episode to train on.
+        InputError: if that leaves no episode to train on.
     """
     num_val = math.ceil(val_ratio * len(demos))
     if num_val >= len(demos):

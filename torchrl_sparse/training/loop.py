@@ -48,7 +48,7 @@ def train(
     are taken again, is removed first.
 
     Raises:
-        ValueError: if the checkpoint belongs to another training, see `Trainer.load`.
+        InputError: if the checkpoint belongs to another training, see `Trainer.load`.
     """
     checkpoint = Path(settings["out"]) / CHECKPOINT
     if checkpoint.exists():

@@ -22,7 +22,7 @@ def fit_state_model(demos: Demonstrations, steps: int) -> tuple[StateModel, floa
         mean over the numbers, the model's over the other's.
 
     Raises:
-        ValueError: for fewer episodes, or if they are too short.
+        InputError: for fewer episodes, or if they are too short.
     """
     if len(demos) < 2:
         raise InputError(f"demos: expected 2 demonstrations or more, got {len(demos)}")

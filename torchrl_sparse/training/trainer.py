@@ -171,7 +171,7 @@ class Trainer(ABC):
 
         Raises:
             FileNotFoundError: if there is none.
-            ValueError: if it is no checkpoint of this class, its header is another but for the length, or it is past `total`.
+            InputError: if it is no checkpoint of this class, its header is another but for the length, or it is past `total`.
         """
         header = self.header()
         fields = header.keys() | self.state().keys()

@@ -65,7 +65,7 @@ def carried_noise(
         on_progress: called with the network calls that were made, in samples.
 
     Raises:
-        ValueError: for fewer than three draws or no calls.
+        InputError: for fewer than three draws or no calls.
 
     Examples:
         >>> from tensordict import TensorDict

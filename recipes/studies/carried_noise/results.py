@@ -38,7 +38,7 @@ def load_carried_noise(path: str | os.PathLike) -> CarriedNoiseResults:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind.
+        InputError: naming file and key, if it is of another kind.
     """
     return read_json(path, CarriedNoiseResults)
 

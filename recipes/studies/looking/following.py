@@ -81,7 +81,7 @@ def looking(
         seed: of whose mask a call gets as another's.
 
     Raises:
-        ValueError: if there are fewer than two episodes.
+        InputError: if there are fewer than two episodes.
     """
     policy = policy.with_plan(policy.plan)
     encoded = planned_queries(policy, queries)
@@ -128,7 +128,7 @@ def episode_rows(queries: TensorDictBase) -> list[Tensor]:
     """Return the rows of each episode, in their order.
 
     Raises:
-        ValueError: if there are fewer than two.
+        InputError: if there are fewer than two.
     """
     episodes = queries[keys.EPISODE_SEED].flatten()
     rows = [(episodes == number).nonzero().flatten() for number in episodes.unique()]

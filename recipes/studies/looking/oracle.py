@@ -182,7 +182,7 @@ def oracle(
         on_attempt: called after each, ``3 * attempts`` times.
 
     Raises:
-        ValueError: if there are fewer than two episodes.
+        InputError: if there are fewer than two episodes.
     """
     policy = policy.with_plan(policy.plan)
     encoded = planned_queries(policy, queries)

@@ -70,7 +70,7 @@ def reuse_sources(policy: DiffusionPolicy, queries: TensorDictBase) -> ReuseSour
         queries: [N], of `torchrl_sparse.control.queries.record_queries`, episode by episode.
 
     Raises:
-        ValueError: if no call has another before it.
+        InputError: if no call has another before it.
     """
     encoded = policy.module["encode"](queries.select(*policy.in_keys, strict=False))
     noise = policy.sample_noise(encoded[keys.SEED].flatten())

@@ -69,7 +69,7 @@ def load_agreement(path: str | os.PathLike) -> OfflineAgreement:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind.
+        InputError: naming file and key, if it is of another kind.
     """
     return read_json(path, OfflineAgreement)
 
@@ -83,7 +83,7 @@ def agreement_of(results: Sequence[OfflineResults]) -> OfflineAgreement:
     """Put all tables of several tasks together, by the errors of the file that holds them.
 
     Raises:
-        ValueError: for a table that is in two files.
+        InputError: for a table that is in two files.
     """
     groups = [(_short(path), one, table) for one in results for path, table in one.played.items()]
     methods = {name: len(table) for name, _, table in groups}

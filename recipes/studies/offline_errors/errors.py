@@ -72,7 +72,7 @@ def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> Offl
         dense: f32 [N, T, D], dense's answers to the same calls; of its own draws, not those of ``answers``.
 
     Raises:
-        ValueError: for fewer than two draws.
+        InputError: for fewer than two draws.
 
     Examples:
         >>> draws = torch.tensor([[[0.0], [2.0]]])

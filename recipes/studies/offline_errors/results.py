@@ -68,7 +68,7 @@ def load_offline(path: str | os.PathLike) -> OfflineResults:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind.
+        InputError: naming file and key, if it is of another kind.
     """
     return read_json(path, OfflineResults)
 

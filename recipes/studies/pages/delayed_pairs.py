@@ -29,7 +29,7 @@ def late_pair_rows(path: Path, pairs: Sequence[tuple[str, str]]) -> list[dict[st
 
     Raises:
         FileNotFoundError: if the file or a log is not there.
-        ValueError: if the file has no such late point.
+        InputError: if the file has no such late point.
 
     >>> (row,) = late_pair_rows(Path("assets/lift/realtime.json"), [("ddim10 +1", "dense_noise +3")])
     >>> row["success"], row["difference, points"]

@@ -40,7 +40,7 @@ def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, 
 
     Raises:
         FileNotFoundError: if the file is not there.
-        ValueError: if its name is of no kind, the file is of no use, or it has no such table.
+        InputError: if its name is of no kind, the file is of no use, or it has no such table.
     """
     if not path.name.startswith((*_READERS,)):
         names = ", ".join(f"{kind}*.json" for kind in _READERS)

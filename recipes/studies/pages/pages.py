@@ -98,7 +98,7 @@ def write_pages(root: str | os.PathLike, *, dry: bool = False) -> list[Path]:
 
     Raises:
         FileNotFoundError: if a page names a file that is not there.
-        ValueError: naming page and line, if a comment cannot be followed.
+        InputError: naming page and line, if a comment cannot be followed.
     """
     changed = []
     for page in find_pages(root):
@@ -122,7 +122,7 @@ def write_tables(text: str, root: str | os.PathLike, name: str = "page") -> str:
         name: of the page, for errors.
 
     Raises:
-        FileNotFoundError, ValueError: as `write_pages`.
+        FileNotFoundError, InputError: as `write_pages`.
     """
     lines, out, number = text.split("\n"), [], 0
     while number < len(lines):

@@ -60,7 +60,7 @@ def side_by_side(
         titles: task -> heading of its column, where that is another.
 
     Raises:
-        ValueError: if a method is in none of the tables, or a column not in all.
+        InputError: if a method is in none of the tables, or a column not in all.
     """
     found: dict[str, dict[str, str]] = {table.task: {} for table in tables}
     for table in tables:

@@ -67,7 +67,7 @@ class Evolution:
         seed: of everything random.
 
     Raises:
-        ValueError: for a population or a number of generations below 1.
+        InputError: for a population or a number of generations below 1.
     """
 
     population: int = 16
@@ -91,7 +91,7 @@ class ChainSpace:
         num_train_timesteps: timesteps lie below it.
 
     Raises:
-        ValueError: for a budget of 1 or less, no lengths, some below 2 or above ``num_train_timesteps``, or weights that are
+        InputError: for a budget of 1 or less, no lengths, some below 2 or above ``num_train_timesteps``, or weights that are
             not positive.
 
     Examples:

@@ -174,7 +174,7 @@ def search_schedule(
         The space, and the fitness of all chains that were tried, the best first.
 
     Raises:
-        ValueError: if there is no such space, or naming the file, if it is malformed or was made for something else.
+        InputError: if there is no such space, or naming the file, if it is malformed or was made for something else.
     """
     made_for = to_plain(made_for)
     before = _read(path, made_for)

@@ -104,7 +104,7 @@ def simulate_stopping(max_episodes: int, analyses: int, trials: int, seed: int =
         seed: of all.
 
     Raises:
-        ValueError: for a design that is none.
+        InputError: for a design that is none.
     """
     design = Design(max_episodes, analyses)
     type_one, saved, pairs = (tuple(cases(design, trials, seed)) for cases in (_type_one, _savings, _pairs))
@@ -143,7 +143,7 @@ def load_stopping(path: str | os.PathLike) -> StoppingResults:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind.
+        InputError: naming file and key, if it is of another kind.
     """
     return read_json(path, StoppingResults)
 

@@ -66,7 +66,7 @@ class Engine(Protocol):
             guide: actions that the call is guided toward; of the network's type and device.
 
         Raises:
-            ValueError: naming what was expected and what came (:func:`check_query`).
+            InputError: naming what was expected and what came (:func:`check_query`).
         """
         ...
 
@@ -99,8 +99,8 @@ def check_query(
     """Refuse what no engine can run; the arguments are those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
     Raises:
-        MaskError: a ValueError, if the mask is no prune mask for the policy call.
-        ValueError: naming what was expected and what came.
+        MaskError: an InputError, if the mask is no prune mask for the policy call.
+        InputError: naming what was expected and what came.
     """
     num_steps, batch = (
         sampler.num_inference_steps,
@@ -122,7 +122,7 @@ def check_query(
 
 
 def check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
-    """Raise ValueError unless ``tensor`` is dense, of this shape, and of the type and device of ``like``."""
+    """Raise InputError unless ``tensor`` is dense, of this shape, and of the type and device of ``like``."""
     if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested:
         came = f"layout {tensor.layout}" if isinstance(tensor, Tensor) else type(tensor).__name__
         raise InputError(f"{name}: expected a dense tensor, got {came}")

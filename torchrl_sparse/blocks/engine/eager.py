@@ -31,7 +31,7 @@ def published_forward(
 
 
 def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
-    """Make diffusers' own, or raise ValueError if it would step elsewhere."""
+    """Make diffusers' own, or raise InputError if it would step elsewhere."""
     options = {"num_train_timesteps": sampler.num_train_timesteps, "beta_schedule": "squaredcos_cap_v2"}
     options |= {"clip_sample_range": sampler.clip_sample_range}
     if sampler.kind == "ddpm":
@@ -54,7 +54,7 @@ class EagerBaseline:
         compiled: put :func:`published_forward` through ``torch.compile``; on a GPU with CUDA graphs, which make it fastest.
 
     Raises:
-        ValueError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down
+        InputError: for a sampler that diffusers does not have: its solvers do not clip, and its DDIM always steps down
             by T // K.
 
     Examples:

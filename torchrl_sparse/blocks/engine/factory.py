@@ -29,7 +29,7 @@ class EngineEntry(NamedTuple):
     """An engine in :data:`ENGINES`.
 
     Attributes:
-        make: makes it for a network and a sampler; raises ValueError where it does not apply.
+        make: makes it for a network and a sampler; raises InputError where it does not apply.
         applies: says whether it can run a network on this machine, and if not, why.
 
     Examples:
@@ -54,7 +54,7 @@ ENGINES: dict[str, EngineEntry] = {
 
 
 def check_engine(name: str) -> None:
-    """Raise ValueError unless ``name`` is in :data:`ENGINES`, or ``"auto"``."""
+    """Raise InputError unless ``name`` is in :data:`ENGINES`, or ``"auto"``."""
     names = ["auto", *ENGINES]
     if name not in names:
         raise InputError(f"engine: expected one of {names}, got {name!r}")
@@ -66,7 +66,7 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sam
     ``"auto"`` takes the first of :data:`ENGINES` that applies: native on a CPU where it was built, else torch.
 
     Raises:
-        ValueError: on an unknown name, or if the engine cannot run the network here; the message says why.
+        InputError: on an unknown name, or if the engine cannot run the network here; the message says why.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -95,7 +95,7 @@ class EngineSlot:
         name: of the engine to make, see :func:`make_engine`.
 
     Raises:
-        ValueError: on an unknown name.
+        InputError: on an unknown name.
     """
 
     def __init__(self, name: EngineName) -> None:
@@ -108,7 +108,7 @@ class EngineSlot:
         """Return the engine for ``network`` and ``sampler``.
 
         Raises:
-            ValueError: if the chosen engine cannot run the network.
+            InputError: if the chosen engine cannot run the network.
         """
         parameter = network.pos_emb
         wanted = (network, sampler, parameter.device, parameter.dtype)

@@ -82,7 +82,7 @@ def denoise(
         normalised actions [B, H, A].
 
     Raises:
-        ValueError: naming what was expected and what came, on a wrong shape, a wrong mask or an unknown
+        InputError: naming what was expected and what came, on a wrong shape, a wrong mask or an unknown
         ``reuse``.
 
     Examples:
@@ -165,7 +165,7 @@ class ReferenceEngine:
         sampler: the sampler.
 
     Raises:
-        ValueError: if the network has weights without values, on the meta device, or such as are no floating-point numbers.
+        InputError: if the network has weights without values, on the meta device, or such as are no floating-point numbers.
     """
 
     name = "reference"

@@ -74,7 +74,7 @@ class WeightWatch:
         """Return what compares equal as long as the weights are the same.
 
         Raises:
-            ValueError: naming a weight that has no values, on the meta device, or that is no floating-point number.
+            InputError: naming a weight that has no values, on the meta device, or that is no floating-point number.
             FrozenError: naming a frozen weight that was written through what was taken of it before.
         """
         frozen = Frozen.of(self.network)
@@ -141,7 +141,7 @@ def _first_values(weight: Tensor) -> Tensor:
 
 
 def check_weights(network: nn.Module) -> None:
-    """Raise ValueError, naming it, if ``network`` has a weight without values, or one that is no floating-point number."""
+    """Raise InputError, naming it, if ``network`` has a weight without values, or one that is no floating-point number."""
     for name, parameter in network.named_parameters():
         if not parameter.is_floating_point():
             raise InputError(f"network: expected floating-point weights, got {name!r} of {parameter.dtype}")

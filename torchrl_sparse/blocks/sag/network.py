@@ -47,7 +47,7 @@ class PrunerNetwork(nn.Module):
         unseen: leading columns of the observations that are not read, as those of the cameras' features.
 
     Raises:
-        ValueError: if a size is no positive number or far too large, or ``width`` no multiple of ``n_head``.
+        InputError: if a size is no positive number or far too large, or ``width`` no multiple of ``n_head``.
 
     Examples:
         >>> network = PrunerNetwork([3, 2, 1, 0], num_blocks=6, cond_shape=(2, 5))

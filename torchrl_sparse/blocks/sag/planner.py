@@ -76,7 +76,7 @@ class PrunerInfo:
         settings: how it was trained, for people and reports.
 
     Raises:
-        ValueError: if a field does not hold what is described here.
+        InputError: if a field does not hold what is described here.
     """
 
     policy: str
@@ -102,7 +102,7 @@ class _Config(PrunerInfo):
 
 
 def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
-    """Raise ValueError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
+    """Raise InputError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
     if not 0 < rate < 1:
         raise InputError(f"rate: expected a prune rate in (0, 1), got {rate}")
     if rate_range is not None:
@@ -174,7 +174,7 @@ class SAGPruner(Planner):
         """Return the rate of every policy call, if it is an input.
 
         Raises:
-            ValueError: if a rate is out of the range that the pruner was trained for.
+            InputError: if a rate is out of the range that the pruner was trained for.
         """
         if not self.network.rate_input:
             return {}
@@ -192,7 +192,7 @@ class SAGPruner(Planner):
             rate: prune rates f32 [B, 1], if they are an input.
 
         Raises:
-            ValueError: if the observations do not have the shape that the pruner was trained on.
+            InputError: if the observations do not have the shape that the pruner was trained on.
         """
         if cond.shape[1:] != self.network.cond_shape:
             raise InputError(
@@ -230,7 +230,7 @@ class SAGPruner(Planner):
 
         Raises:
             FileNotFoundError: if a file is not there.
-            ValueError: naming the file, what was expected in it and what came.
+            InputError: naming the file, what was expected in it and what came.
         """
         path = Path(path)
         config = read_json(path / "config.json", _Config)

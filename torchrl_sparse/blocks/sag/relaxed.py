@@ -88,7 +88,7 @@ def denoise_relaxed(
         detached: keep outputs for reuse without their gradient, see the module.
 
     Raises:
-        ValueError: as ``denoise`` does.
+        InputError: as ``denoise`` does.
     """
     options = _Options(reuse, explore, checkpointed, detached)
     *_, (*_, actions) = _chain(network, sampler, noise, cond, gate, options)

@@ -65,7 +65,7 @@ class RobosuiteDemonstrator:
         quality: see `torchrl_sparse.envs.experts.operators`.
 
     Raises:
-        ValueError: if the task has no expert or the quality is unknown.
+        InputError: if the task has no expert or the quality is unknown.
     """
 
     qualities = tuple(OPERATORS)
@@ -143,7 +143,7 @@ class StateDemonstrator:
         quality: "proficient"; these experts have no other.
 
     Raises:
-        ValueError: if the task has no expert, or not of that quality.
+        InputError: if the task has no expert, or not of that quality.
     """
 
     instruction, model_file = None, ""

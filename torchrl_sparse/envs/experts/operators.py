@@ -113,7 +113,7 @@ def draw_operator(quality: str, rng: np.random.Generator) -> Operator:
     """Draw one of the operators of a quality.
 
     Raises:
-        ValueError: if there is no such quality; the message lists those there are.
+        InputError: if there is no such quality; the message lists those there are.
     """
     if quality not in OPERATORS:
         raise InputError(f"quality: expected one of {', '.join(OPERATORS)}, got {quality!r}")

@@ -48,7 +48,7 @@ class Grid:
         strides: of the search, see `search_timesteps`.
 
     Raises:
-        ValueError: naming the field, for a name that is no sampler or has no steps.
+        InputError: naming the field, for a name that is no sampler or has no steps.
     """
 
     samplers: tuple[str, ...] = (
@@ -96,7 +96,7 @@ def calibrate_candidates(
         n_action_steps: actions executed of a chunk.
 
     Raises:
-        ValueError: naming the file, if one in the folder was made for something else; or the grid's field, if a chain in
+        InputError: naming the file, if one in the folder was made for something else; or the grid's field, if a chain in
             it has more steps than the policy was trained with.
     """
     _check_fits(policy, grid)

@@ -21,7 +21,7 @@ def within_budget(candidates: Mapping[str, Candidate], budget_ms: float | None) 
             median is below dense's.
 
     Raises:
-        ValueError: if there is none.
+        InputError: if there is none.
     """
     others = {name: candidate for name, candidate in candidates.items() if name != DENSE}
     if budget_ms is None:

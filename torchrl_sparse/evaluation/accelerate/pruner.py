@@ -50,7 +50,7 @@ def train_candidate(
 
     Raises:
         RunFailed: if a signal stopped it; called again it goes on.
-        ValueError: if the folder holds another training.
+        InputError: if the folder holds another training.
     """
     path, made_for = folder / "targets.safetensors", {**made_for, "share": share}
     if not path.exists():

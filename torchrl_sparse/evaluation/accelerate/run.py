@@ -82,7 +82,7 @@ def accelerate(
         What was found, and the policy under every method.
 
     Raises:
-        ValueError: naming the option or the file, if the policy has a planner, nothing keeps the budget, or ``out``
+        InputError: naming the option or the file, if the policy has a planner, nothing keeps the budget, or ``out``
             holds something else.
 
     Examples:

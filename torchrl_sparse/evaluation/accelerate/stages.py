@@ -67,7 +67,7 @@ def read_or_make(
         remake: whether to make again, instead of refusing, what was made for something else.
 
     Raises:
-        ValueError: naming the file, if it is malformed, or was made for something else.
+        InputError: naming the file, if it is malformed, or was made for something else.
 
     Examples:
         >>> import tempfile

@@ -63,7 +63,7 @@ class DiffusionBenchmark(Benchmark):
         calibration: of the dense policy, whose similarities `draw` shows; called once, at the end. None where it draws nothing.
 
     Raises:
-        ValueError: see `make_executor`.
+        InputError: see `make_executor`.
     """
 
     def __init__(

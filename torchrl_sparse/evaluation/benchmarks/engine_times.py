@@ -52,7 +52,7 @@ def measure_engines(
         instruction_sets: also time the native engine on each instruction set that this CPU has.
 
     Raises:
-        ValueError: if ``bac`` was made for another policy, or an engine answers otherwise than the reference.
+        InputError: if ``bac`` was made for another policy, or an engine answers otherwise than the reference.
     """
     dense = policy.sampler.variant()
     mask = None if bac is None else policy.with_plan(bac, dense).plan.schedule.mask()

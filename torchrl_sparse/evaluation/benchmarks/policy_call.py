@@ -53,7 +53,7 @@ def measure_call(
         library: ``libtsp.so``, to ask the exported policy in C too.
 
     Raises:
-        ValueError: if the native engine cannot run the policy here, or ``library`` not the exported policy.
+        InputError: if the native engine cannot run the policy here, or ``library`` not the exported policy.
     """
     samplers = {"dense": policy.sampler.variant()}
     if policy.sampler.config != samplers["dense"].config:

@@ -30,7 +30,7 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
         max_episodes: cap of the others; part of the design, and so not to be raised once episodes were seen.
 
     Raises:
-        ValueError: for another ``until``, or a number below 1.
+        InputError: for another ``until``, or a number below 1.
 
     >>> make_design("episodes", 400, 1300).ends, make_design("conclusive", 400, 1300).ends[:2]
     ((400,), (43, 86))

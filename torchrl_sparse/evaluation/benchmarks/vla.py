@@ -118,7 +118,7 @@ def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) ->
         settings: see `make_pruner`.
 
     Raises:
-        ValueError: naming the method.
+        InputError: naming the method.
     """
     for text in texts:
         if parse_token_method(text).like is None and (pruner := make_pruner(text, settings=settings)):
@@ -132,7 +132,7 @@ def filmed_methods(videos: Iterable[str], methods: Sequence[str]) -> dict[str, s
     """Return what to film: video -> method. A video is named as its method, or only as what is before the @.
 
     Raises:
-        ValueError: if none or several of the methods are meant.
+        InputError: if none or several of the methods are meant.
 
     >>> filmed_methods(["dense", "specprune"], ["dense", "specprune@0.17", "fastv@specprune@0.17"])
     {'dense': 'dense', 'specprune': 'specprune@0.17'}

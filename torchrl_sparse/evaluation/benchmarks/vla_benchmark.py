@@ -58,7 +58,7 @@ class VLABenchmark(Benchmark):
         skipped: decoder layers that ``efficientvla_layers`` leaves out.
 
     Raises:
-        ValueError: see `check_budgets` and `filmed_methods`.
+        InputError: see `check_budgets` and `filmed_methods`.
     """
 
     def __init__(

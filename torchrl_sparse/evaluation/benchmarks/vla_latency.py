@@ -41,7 +41,7 @@ def token_pruners(
         equal_to: name of one of them, whose mean of tokens in a layer FastV, frame difference and random keep too.
 
     Raises:
-        ValueError: if ``equal_to`` is none of them, or keeps fewer tokens than the layers before FastV's do.
+        InputError: if ``equal_to`` is none of them, or keeps fewer tokens than the layers before FastV's do.
     """
     pruners: dict[str, TokenPruner | None] = {DENSE: None}
     pruners |= {f"specprune, alpha {alpha:g}": SpecPrune(alpha=alpha) for alpha in alphas}

@@ -26,7 +26,7 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
         steps_per_query: environment steps from one call to the next.
 
     Raises:
-        ValueError: if ``masks`` is not such an array.
+        InputError: if ``masks`` is not such an array.
     """
     masks = _check_masks(masks)
     shown = np.unique(np.linspace(0, len(masks) - 1, _PANELS).round().astype(int))
@@ -60,7 +60,7 @@ def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: st
         name: of the method, for the title.
 
     Raises:
-        ValueError: if ``masks`` is not such an array.
+        InputError: if ``masks`` is not such an array.
     """
     masks = _check_masks(masks)
     num_blocks = masks.shape[2]

@@ -49,7 +49,7 @@ def plot_schedule(
         flops_ratio: FLOPs of a policy call over those of the dense policy, for the title.
 
     Raises:
-        ValueError: if ``mask`` is not a bool matrix with a multiple of three columns.
+        InputError: if ``mask`` is not a bool matrix with a multiple of three columns.
     """
     from matplotlib.colors import ListedColormap
 
@@ -101,7 +101,7 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
         path: of the PNG.
 
     Raises:
-        ValueError: if the shape is another or a value is not finite.
+        InputError: if the shape is another or a value is not finite.
     """
     similarity = np.asarray(similarity, dtype=np.float64)
     if similarity.ndim != 3 or similarity.shape[0] % _TYPES or similarity.shape[1] != similarity.shape[2]:
@@ -141,7 +141,7 @@ def plot_error_surge(
         path: of the PNG.
 
     Raises:
-        ValueError: if names or shapes differ.
+        InputError: if names or shapes differ.
     """
     if list(errors) != list(masks) or not errors:
         raise InputError(

@@ -37,7 +37,7 @@ def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: i
         u8 [h * scale, V * w * scale, 3].
 
     Raises:
-        ValueError: if the tokens of a camera form no square grid that divides the image.
+        InputError: if the tokens of a camera form no square grid that divides the image.
 
     Examples:
         >>> images = np.full((2, 3, 4, 4), 200, np.uint8)
@@ -70,7 +70,7 @@ def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path
         path: of the PNG.
 
     Raises:
-        ValueError: if there is nothing to show, or labels do not match.
+        InputError: if there is nothing to show, or labels do not match.
     """
     if not len(pictures) or len(pictures) != len(labels):
         raise InputError(
@@ -105,7 +105,7 @@ def plot_control(
         kept: [T] visual tokens of the latest call, drawn below.
 
     Raises:
-        ValueError: if lengths differ.
+        InputError: if lengths differ.
     """
     series = {"fine": fine, "queried": queried, **({} if kept is None else {"kept": kept})}
     for name, values in series.items():
@@ -142,7 +142,7 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
         path: of the PNG.
 
     Raises:
-        ValueError: if there is no method, or one without calls.
+        InputError: if there is no method, or one without calls.
     """
     if not depth or any(np.ndim(values) != 2 or not np.size(values) for values in depth.values()):
         shapes = {name: list(np.shape(values)) for name, values in depth.items()}
@@ -171,7 +171,7 @@ def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) 
         path: of the PNG.
 
     Raises:
-        ValueError: if there is none, or they were calibrated by different measures.
+        InputError: if there is none, or they were calibrated by different measures.
     """
     measures = sorted({budget.measure for budget in budgets})
     if len(measures) != 1:

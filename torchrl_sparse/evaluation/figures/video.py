@@ -57,7 +57,7 @@ def write_video(
         hold: seconds for which the last frame stays.
 
     Raises:
-        ValueError: if there is no frame, a frame has another shape or type, or captions do not match.
+        InputError: if there is no frame, a frame has another shape or type, or captions do not match.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "rollout.mp4"

@@ -48,7 +48,7 @@ def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
     """Make an untrained network of a published shape, but for ``sizes``, arguments of `TransformerForDiffusion`.
 
     Raises:
-        ValueError: on an unknown shape.
+        InputError: on an unknown shape.
     """
     if shape not in SHAPES:
         raise InputError(f"shape: expected one of {list(SHAPES)}, got {shape!r}")

@@ -46,7 +46,7 @@ def first_calls(
         on_call: called as ``on_call(done, total)`` after each.
 
     Raises:
-        ValueError: naming the variant whose actions are not those of the reference.
+        InputError: naming the variant whose actions are not those of the reference.
     """
     first, reference = {}, cache(case.reference)
     for done, (name, variant) in enumerate(variants.items(), 1):

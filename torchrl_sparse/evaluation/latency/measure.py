@@ -63,7 +63,7 @@ def summarize_latency(samples: Sequence[float]) -> Latency:
     """Summarise latencies, in seconds, by percentiles (linear interpolation).
 
     Raises:
-        ValueError: if there are none, or one is negative or not finite.
+        InputError: if there are none, or one is negative or not finite.
 
     >>> latency = summarize_latency([0.1, 0.2, 0.3])
     >>> latency.p50, latency.n
@@ -109,7 +109,7 @@ def measure_latency(
         name -> :class:`Latency`, in the order of ``callables``.
 
     Raises:
-        ValueError: if there is nothing to time or a count is out of range.
+        InputError: if there is nothing to time or a count is out of range.
 
     >>> result = measure_latency({"fast": lambda: None, "slow": lambda: sum(range(20000))}, repeats=5)
     >>> result["fast"].p50 < result["slow"].p50, result["slow"].n

@@ -51,7 +51,7 @@ def call_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[s
     """Measure a policy call and its parts: `query_parts` where it runs as two native calls, else `stage_seconds`.
 
     Raises:
-        ValueError: if its engine cannot run here, or a policy of states under a static plan runs in another than native.
+        InputError: if its engine cannot run here, or a policy of states under a static plan runs in another than native.
     """
     if policy.vision is None and policy.plan.is_static and not policy.start.name:
         return query_parts(policy, repeats, warmup)
@@ -73,7 +73,7 @@ def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[
         sampler; ``"tensors"``: keys of the TensorDict, Python, and the clock.
 
     Raises:
-        ValueError: if another engine runs the policy, or the planner looks at the observation.
+        InputError: if another engine runs the policy, or the planner looks at the observation.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift", engine="native")
@@ -227,7 +227,7 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
         library: the shared library that CMake makes, ``libtsp.so``.
 
     Raises:
-        ValueError: if the library cannot be loaded or the policy not exported.
+        InputError: if the library cannot be loaded or the policy not exported.
     """
     state = example_query(policy)["history", "state"].contiguous()
     chunk = torch.empty(policy.horizon - policy.n_obs_steps + 1, policy.network.output_dim)

@@ -29,7 +29,7 @@ def untrained_policy(shape: str, *, engine: EngineName = "auto") -> DiffusionPol
     """Make an untrained policy of a published shape, see `make_network`; of the shape ``"image"`` with two cameras.
 
     Raises:
-        ValueError: on an unknown shape.
+        InputError: on an unknown shape.
     """
     network = make_network(shape)
     if shape == "image":
@@ -53,7 +53,7 @@ def image_policy(
         engine: that runs the denoiser.
 
     Raises:
-        ValueError: if the condition has no room for the features.
+        InputError: if the condition has no room for the features.
     """
     vision = VisionEncoder(_CAMERAS, image_size=(_IMAGE, _IMAGE), width=width)
     state = network.cond_dim - vision.feature_dim

@@ -68,7 +68,7 @@ def make_policy(
         dtype, device: of the network's weights.
 
     Raises:
-        ValueError: on an unknown shape.
+        InputError: on an unknown shape.
     """
     if shape not in SHAPES:
         raise InputError(f"shape: expected one of {', '.join(SHAPES)}, got {shape!r}")

@@ -142,7 +142,7 @@ def load_acceleration(path: str | os.PathLike) -> Acceleration:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind or does not agree with itself.
+        InputError: naming file and key, if it is of another kind or does not agree with itself.
     """
     return read_json(path, Acceleration)
 

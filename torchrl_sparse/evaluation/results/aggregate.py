@@ -61,7 +61,7 @@ def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
 
     Raises:
         FileNotFoundError: if a file or a log is not there.
-        ValueError: naming the file, if one is of a task that is graded, dense solved nothing in it, or
+        InputError: naming the file, if one is of a task that is graded, dense solved nothing in it, or
             its log lacks episodes; if a task is there twice, splits or margins differ, or no method is in all of them.
     """
     found = {Path(path): load_results(path) for path in paths}
@@ -153,6 +153,6 @@ def load_aggregate(path: str | os.PathLike) -> AggregateResults:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another kind.
+        InputError: naming file and key, if it is of another kind.
     """
     return read_json(path, AggregateResults)

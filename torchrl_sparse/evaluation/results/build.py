@@ -120,7 +120,7 @@ def build_results(
         settings: what else the methods depend on, as JSON values.
 
     Raises:
-        ValueError: if dense is missing, a pair is not two of the methods, methods ran on different seeds, or a value is out of
+        InputError: if dense is missing, a pair is not two of the methods, methods ran on different seeds, or a value is out of
             range.
     """
     if DENSE not in runs:
@@ -214,7 +214,7 @@ def compare_pair(
         terms: of the comparison.
 
     Raises:
-        ValueError: if the seeds differ.
+        InputError: if the seeds differ.
     """
     pairs, horizon = pair_episodes(method, episodes, against, others), terms.episode_horizon
     solved, times = pairs.success_difference(terms.margin), pairs.time_ratio(horizon, terms.time_margin)
@@ -241,7 +241,7 @@ def compare_episodes(
         terms: of the comparison.
 
     Raises:
-        ValueError: if the seeds do not fit.
+        InputError: if the seeds do not fit.
     """
     pairs = pair_by_design(name, episodes, DENSE, dense, terms.design)
     ours, theirs = pairs.times(terms.episode_horizon)

@@ -179,7 +179,7 @@ def load_engine_results(path: str | os.PathLike) -> EngineResults:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is not of this schema.
+        InputError: naming file and key, if it is not of this schema.
     """
     return read_json(path, EngineResults)
 

@@ -92,7 +92,7 @@ def load_query_profile(path: str | Path) -> QueryProfile:
 
     Raises:
         FileNotFoundError: if it is not there.
-        ValueError: if it is of another version or not as `QueryProfile` says.
+        InputError: if it is of another version or not as `QueryProfile` says.
     """
     return read_json(path, QueryProfile)
 

@@ -125,7 +125,7 @@ def build_realtime(
     """Make the content of ``realtime.json``.
 
     Raises:
-        ValueError: if the dense policy is missing, methods differ in their delays (their own apart), or seeds differ.
+        InputError: if the dense policy is missing, methods differ in their delays (their own apart), or seeds differ.
     """
     if DENSE not in runs:
         raise InputError(f"runs: expected the method {DENSE!r} among them, got {sorted(runs)}")
@@ -168,7 +168,7 @@ def load_realtime(path: str | os.PathLike) -> Realtime:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is not of this schema.
+        InputError: naming file and key, if it is not of this schema.
     """
     return read_json(path, Realtime)
 

@@ -189,7 +189,7 @@ def load_results(path: str | os.PathLike) -> Results:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is of another version or does not agree with itself.
+        InputError: naming file and key, if it is of another version or does not agree with itself.
     """
     found = read_json(path, dict[str, Any]).get("schema")
     if type(found) is not int or found != SCHEMA:  # true is 1

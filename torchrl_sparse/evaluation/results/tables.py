@@ -41,7 +41,7 @@ def select_columns(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) ->
     """Return the rows with these columns alone, in this order.
 
     Raises:
-        ValueError: if a row lacks one of them.
+        InputError: if a row lacks one of them.
 
     >>> select_columns([{"method": "dense", "p50": "128"}], ["p50"])
     [{'p50': '128'}]

@@ -115,7 +115,7 @@ def load_vla_results(path: str | os.PathLike) -> VLALatency:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: naming file and key, if it is not of this schema.
+        InputError: naming file and key, if it is not of this schema.
     """
     return read_json(path, VLALatency)
 

@@ -96,7 +96,7 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
     """Average episodes, every policy call counting the same.
 
     Raises:
-        ValueError: if there are no episodes or no call.
+        InputError: if there are no episodes or no call.
 
     >>> totals([EpisodeResult(0, True, 8, 1, 10.0, 0.5), EpisodeResult(1, True, 24, 3, 90.0, 0.9)])
     Totals(flops_per_query=25.0, prune_rate=0.8, episode_length=16.0, queries=4)
@@ -155,7 +155,7 @@ class EpisodeLog:
             episode, as after a run that failed at once.
 
     Raises:
-        ValueError: if the file is not such a log, has a damaged line before its last, or has another
+        InputError: if the file is not such a log, has a damaged line before its last, or has another
             identity.
 
     >>> import tempfile
@@ -200,7 +200,7 @@ class EpisodeLog:
         """Write one episode through to the disk.
 
         Raises:
-            ValueError: if its seed is already in the log.
+            InputError: if its seed is already in the log.
         """
         if episode.seed in self.episodes:
             raise InputError(f"{self.path}: seed {episode.seed} is already in the log")
@@ -240,7 +240,7 @@ def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
 
     Raises:
         FileNotFoundError: if there is neither.
-        ValueError: naming file and line, if one is damaged.
+        InputError: naming file and line, if one is damaged.
     """
     path = _log_path(path)
     lines = _lines(path)

@@ -95,7 +95,7 @@ def rollout_episodes(
         The episodes in the order of ``seeds``.
 
     Raises:
-        ValueError: if seeds repeat or are no whole numbers, an option is out of range or the file belongs to something else.
+        InputError: if seeds repeat or are no whole numbers, an option is out of range or the file belongs to something else.
         ImportError: if Ray is asked for and not installed.
         KeyError: if the actor or the environment leaves out a key that is needed.
         RunFailed: if workers keep dying without finishing an episode.

@@ -80,7 +80,7 @@ def pair_episodes(
         others: of the second, on the same seeds.
 
     Raises:
-        ValueError: if they ran on different seeds, or a seed ran twice.
+        InputError: if they ran on different seeds, or a seed ran twice.
     """
     ours, theirs = _by_seed(episodes), _by_seed(others)
     if ours.keys() != theirs.keys():
@@ -105,7 +105,7 @@ def pair_by_design(
         design: of the benchmark.
 
     Raises:
-        ValueError: if the seeds do not fit.
+        InputError: if the seeds do not fit.
     """
     if design.analyses > 1:
         seeds = {episode.seed for episode in episodes}

@@ -68,7 +68,7 @@ def matching_share(
         most: the largest share that is tried.
 
     Raises:
-        ValueError: if even the smallest share keeps more.
+        InputError: if even the smallest share keeps more.
     """
     episodes = list(episodes)
 

@@ -103,7 +103,7 @@ def aggregate_tasks(
         time_margin: of times, a share of dense's.
 
     Raises:
-        ValueError: if there are fewer than two tasks, or a task has fewer than two pairs.
+        InputError: if there are fewer than two tasks, or a task has fewer than two pairs.
 
     >>> agreeing = TaskPairs(([True] * 5, [True] * 5), ([30] * 5, [30] * 5), 400)
     >>> result = aggregate_tasks({"a": agreeing, "b": agreeing})

@@ -22,7 +22,7 @@ def median_ratio_interval(numerator: ArrayLike, denominator: ArrayLike) -> tuple
         numerator, denominator: seconds of each round, [rounds], in the order of the rounds.
 
     Raises:
-        ValueError: if they are not as many, or none.
+        InputError: if they are not as many, or none.
 
     >>> median_ratio_interval([2.0, 2.0, 2.0], [1.0, 1.0, 1.0])
     (2.0, 2.0)

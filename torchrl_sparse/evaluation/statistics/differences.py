@@ -70,6 +70,6 @@ def check_interval(interval: Interval) -> None:
 
 
 def require(condition: bool, key: str, expected: str, got: Any) -> None:
-    """Raise ValueError naming the key unless the condition holds."""
+    """Raise InputError naming the key unless the condition holds."""
     if not condition:
         raise InputError(f"{key}: expected {expected}, got {got!r}")

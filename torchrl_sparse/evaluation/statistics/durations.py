@@ -51,7 +51,7 @@ def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: in
         horizon: steps until truncation.
 
     Raises:
-        ValueError: if an episode is longer than the horizon, or ended before it unsolved.
+        InputError: if an episode is longer than the horizon, or ended before it unsolved.
 
     >>> restricted_times([True, False], [31, 400], 400).tolist()
     [31.0, 400.0]
@@ -81,7 +81,7 @@ def time_ratio(
         confidence: two-sided level, strictly between 0 and 1.
 
     Raises:
-        ValueError: if the lengths differ or are zero, or a number is out of range.
+        InputError: if the lengths differ or are zero, or a number is out of range.
 
     >>> result = time_ratio([30.0] * 500, [30.0] * 500, 400)
     >>> result.ratio, result.verdict, [round(limit, 2) for limit in result.ci95]
@@ -123,7 +123,7 @@ def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> f
         ratio: the hypothesis, 1 + margin for non-inferiority.
 
     Raises:
-        ValueError: as `time_ratio`.
+        InputError: as `time_ratio`.
 
     >>> round(time_z([30.0] * 500, [30.0] * 500, 400, 1.1), 2)
     2.01

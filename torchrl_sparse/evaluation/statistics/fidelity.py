@@ -25,7 +25,7 @@ def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
         dense_chunks: of the dense policy on the same observations and noise, same shape.
 
     Raises:
-        ValueError: if the shapes differ.
+        InputError: if the shapes differ.
 
     >>> mean, largest = action_error(torch.tensor([[[0.0, 0.5]]]), torch.tensor([[[0.0, 0.0]]]))
     >>> mean, largest
@@ -48,7 +48,7 @@ def relative_error(features: Tensor, dense_features: Tensor) -> Tensor:
         f64 [K, 3L].
 
     Raises:
-        ValueError: if the shapes differ.
+        InputError: if the shapes differ.
 
     >>> relative_error(torch.full((3, 2, 1, 4), 1.5), torch.ones(3, 2, 1, 4)).shape
     torch.Size([2, 3])
@@ -83,7 +83,7 @@ def block_errors(
         name -> f64 [K, 3L], see :func:`relative_error`.
 
     Raises:
-        ValueError: if shapes do not fit or a mask prunes its first row.
+        InputError: if shapes do not fit or a mask prunes its first row.
     """
     errors = {name: torch.zeros(mask.shape, dtype=torch.float64) for name, mask in masks.items()}
     for part_noise, part_cond in zip(noise.split(_AT_ONCE), cond.split(_AT_ONCE), strict=True):

@@ -46,7 +46,7 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
         confidence: two-sided level, strictly between 0 and 1.
 
     Raises:
-        ValueError: if the counts or the level are out of range.
+        InputError: if the counts or the level are out of range.
 
     >>> [round(limit, 4) for limit in wilson_interval(81, 263)]
     [0.2553, 0.3662]
@@ -70,7 +70,7 @@ def tango_interval(won: int, lost: int, n: int, confidence: float = 0.95) -> tup
         confidence: two-sided level, strictly between 0 and 1.
 
     Raises:
-        ValueError: if the counts or the level are out of range.
+        InputError: if the counts or the level are out of range.
 
     >>> [round(limit, 3) for limit in tango_interval(1, 7, 21)]
     [-0.517, -0.026]
@@ -170,7 +170,7 @@ def paired_difference(
         confidence: two-sided level, strictly between 0 and 1.
 
     Raises:
-        ValueError: if the lengths differ or are zero.
+        InputError: if the lengths differ or are zero.
 
     >>> result = paired_difference([True, True, False, True], [True, True, True, True])
     >>> result.diff, result.mcnemar_p, result.verdict
@@ -185,7 +185,7 @@ def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int
     """Return the pairs that only the method solved, that only the other solved, and all.
 
     Raises:
-        ValueError: if the lengths differ or are zero.
+        InputError: if the lengths differ or are zero.
 
     >>> discordant_pairs([True, False, True], [True, True, False])
     (1, 1, 3)
@@ -195,7 +195,7 @@ def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int
 
 
 def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Return both as f64 [n], or raise ValueError if they are no pairs."""
+    """Return both as f64 [n], or raise InputError if they are no pairs."""
     method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
     if method.shape != other.shape or method.ndim != 1 or not len(method):
         raise InputError(
@@ -218,6 +218,6 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
 
 
 def check_level(confidence: float) -> None:
-    """Raise ValueError unless a level lies strictly between 0 and 1."""
+    """Raise InputError unless a level lies strictly between 0 and 1."""
     if not 0 < confidence < 1:
         raise InputError(f"confidence: expected a number strictly between 0 and 1, got {confidence}")

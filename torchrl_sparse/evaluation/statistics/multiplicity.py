@@ -25,7 +25,7 @@ def holm(
         error: of the whole family.
 
     Raises:
-        ValueError: if there are fewer comparisons than p-values, or a p-value is none.
+        InputError: if there are fewer comparisons than p-values, or a p-value is none.
 
     >>> sorted(holm({"a": 0.001, "b": 0.012, "c": 0.02}))
     ['a', 'b', 'c']

@@ -22,7 +22,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
     """Return the mean of ``values``, at least two, and Student's interval of it.
 
     Raises:
-        ValueError: if there are fewer than two values, or they are no list of numbers.
+        InputError: if there are fewer than two values, or they are no list of numbers.
 
     >>> mean, (low, high) = mean_interval([0.5, 0.7, 0.9])
     >>> round(mean, 3), round(low, 3), round(high, 3)
@@ -47,7 +47,7 @@ def difference_interval(
         confidence: two-sided level.
 
     Raises:
-        ValueError: if they are no pairs, or there are fewer than two.
+        InputError: if they are no pairs, or there are fewer than two.
 
     >>> difference, (low, high) = difference_interval([0.5, 0.7, 0.9], [0.0, 0.0, 0.0])
     >>> round(difference, 3), round(low, 3), round(high, 3)

@@ -43,7 +43,7 @@ class Design:
         analyses: at most so many, the last at the cap. One analysis is the ordinary fixed number of episodes.
 
     Raises:
-        ValueError: if a number is below 1 or there are more analyses than episodes.
+        InputError: if a number is below 1 or there are more analyses than episodes.
 
     >>> design = Design(1300, analyses=30)
     >>> design.ends[:3], design.ends[-1]
@@ -72,7 +72,7 @@ class Design:
         """Return the standard errors beyond which an analysis decides.
 
         Raises:
-            ValueError: if there is no analysis after so many episodes.
+            InputError: if there is no analysis after so many episodes.
         """
         if episodes not in self.ends:
             raise InputError(f"episodes: expected an analysis of the design ({self.ends}), got {episodes}")

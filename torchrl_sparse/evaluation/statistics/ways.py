@@ -21,7 +21,7 @@ def way_entropy(ways: Iterable[int]) -> float:
         ways: one number an episode. Negative ones, which showed no way or went between them, count as no episode.
 
     Raises:
-        ValueError: if no episode showed a way.
+        InputError: if no episode showed a way.
 
     >>> way_entropy([0, 3, 0, 3, -1])
     1.0

@@ -59,7 +59,7 @@ class SamplerName:
 
     @classmethod
     def parse(cls, text: str) -> SamplerName:
-        """Raise ValueError unless ``text`` is written as the module says."""
+        """Raise InputError unless ``text`` is written as the module says."""
         match = _NAME.fullmatch(text) if isinstance(text, str) else None
         if match is None:
             raise InputError(

@@ -61,7 +61,7 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
         chunk_shape: (H, A).
 
     Raises:
-        ValueError: if seeds are no whole numbers.
+        InputError: if seeds are no whole numbers.
     """
     check_whole("seed", seed)
     noise, generator = torch.empty(len(seed), num_steps, *chunk_shape), _OWN.generator
@@ -73,7 +73,7 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
 
 
 def check_whole(name: Any, tensor: Tensor) -> None:
-    """Raise ValueError unless ``tensor`` holds whole numbers: of a fraction, a generator would take another seed."""
+    """Raise InputError unless ``tensor`` holds whole numbers: of a fraction, a generator would take another seed."""
     if tensor.dtype not in _WHOLE:
         raise InputError(f"{name}: expected whole numbers, got {tensor.dtype}")
 

@@ -76,7 +76,7 @@ class Sampler:
 
     Raises:
         AttributeError: if an attribute is assigned.
-        ValueError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
+        InputError: naming the argument: an unknown ``kind`` or ``spacing``, a number of steps out of range,
             ``timesteps`` that do not fall, an ``eta`` out of [0, 1] or of another kind than DDIM, a
             ``clip_sample_range`` that is not positive.
 
@@ -171,7 +171,7 @@ class Sampler:
             num_train_timesteps: diffusion steps that the network was trained with.
 
         Raises:
-            ValueError: if no sampler is called that, or not with so many steps.
+            InputError: if no sampler is called that, or not with so many steps.
         """
         parts = SamplerName.parse(name)
         written, asked = parts.num_inference_steps, num_inference_steps
@@ -260,7 +260,7 @@ class Sampler:
 
         Raises:
             IndexError: if ``k`` is not in 0..K-1.
-            ValueError: if the step needs ``noise_k`` or ``cleans`` and they are missing.
+            InputError: if the step needs ``noise_k`` or ``cleans`` and they are missing.
         """
         if not 0 <= k < self.num_inference_steps:
             raise IndexError(f"k must be in 0..{self.num_inference_steps - 1}, got {k}")

@@ -52,7 +52,7 @@ def spaced_timesteps(
         without_last: leave out the last timestep of ``"leading"`` and ``"linspace"``, as diffusers' solvers do.
 
     Raises:
-        ValueError: on an unknown spacing, or where K is so large that they would repeat or leave 0 .. T-1.
+        InputError: on an unknown spacing, or where K is so large that they would repeat or leave 0 .. T-1.
 
     Warns:
         UserWarning: where they begin far from pure noise. ``"leading"`` does, in diffusers too, with few steps and with most

@@ -81,7 +81,7 @@ class TransformerForDiffusion(nn.Module):
         made_shapes: of its weights by name, as it was made with them.
 
     Raises:
-        ValueError: if a size is no positive number or far too large, or ``n_emb`` is not a multiple of ``n_head``.
+        InputError: if a size is no positive number or far too large, or ``n_emb`` is not a multiple of ``n_head``.
 
     Examples:
         >>> network = TransformerForDiffusion(

@@ -120,7 +120,7 @@ class VisionEncoder(nn.Module):
         feature_dim: size of the features, 64 for each camera.
 
     Raises:
-        ValueError: if a size is out of range, or a camera is named twice.
+        InputError: if a size is out of range, or a camera is named twice.
 
     Examples:
         >>> vision = VisionEncoder(["image"], width=16).eval()
@@ -154,7 +154,7 @@ class VisionEncoder(nn.Module):
         """Return the features [*B, feature_dim] of images u8 [*B, 3, h, w] by camera.
 
         Raises:
-            ValueError: if images have another type or size.
+            InputError: if images have another type or size.
         """
         return torch.cat([self._encode(name, images[name]) for name in self.cameras], dim=-1)
 

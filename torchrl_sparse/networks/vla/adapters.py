@@ -58,7 +58,7 @@ def add_adapters(network: VLANetwork, rank: int) -> VLANetwork:
     """Adapt the linear layers of all decoder layers, in place, and freeze the rest of the decoder.
 
     Raises:
-        ValueError: if ``rank`` is no positive number, or far too large.
+        InputError: if ``rank`` is no positive number, or far too large.
     """
     check_size("rank", rank, _MAX_RANK)
     network.decoder.llama.requires_grad_(False)

@@ -41,7 +41,7 @@ class TransformerSize:
         mlp: width of the feed-forward network.
 
     Raises:
-        ValueError: if a size is no positive number or far too large, or the width is no multiple of the heads with an even
+        InputError: if a size is no positive number or far too large, or the width is no multiple of the heads with an even
             quotient.
     """
 
@@ -83,7 +83,7 @@ class VLAConfig:
         norm_eps: of the decoder's norms.
 
     Raises:
-        ValueError: if sizes do not fit together.
+        InputError: if sizes do not fit together.
 
     Examples:
         >>> VLAConfig().num_visual, VLAConfig().num_slots, VLAConfig.tiny().num_visual
@@ -195,7 +195,7 @@ class VLAConfig:
         """Return the sizes whose `to_dict` gave ``fields``.
 
         Raises:
-            ValueError: if a field is missing, unknown or wrong.
+            InputError: if a field is missing, unknown or wrong.
         """
         names = {field.name for field in dataclasses.fields(cls)}
         if not isinstance(fields, Mapping) or not names - _ADDED.keys() <= set(fields) <= names:

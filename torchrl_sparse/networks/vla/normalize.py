@@ -31,7 +31,7 @@ class QuantileNormalizer(nn.Module):
         gripper: bool [A], which actions are grippers.
 
     Raises:
-        ValueError: if shapes differ, a number is not finite, or a high quantile is below a low one.
+        InputError: if shapes differ, a number is not finite, or a high quantile is below a low one.
 
     Examples:
         >>> low, high = torch.zeros(2), torch.tensor([4.0, 1.0])

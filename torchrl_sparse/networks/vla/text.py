@@ -99,7 +99,7 @@ class LlamaTokenizer:
         closing: id of the token that ends every prompt; None for none.
 
     Raises:
-        ValueError: if the text is no tokenizer.
+        InputError: if the text is no tokenizer.
     """
 
     def __init__(self, definition: str, closing: int | None = _EMPTY_WORD_ID):
@@ -125,7 +125,7 @@ class LlamaTokenizer:
         """Load the tokenizer in the file ``path``.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file.
+            FileNotFoundError, InputError: naming the file.
         """
         path = Path(path)
         if not path.is_file():
@@ -160,7 +160,7 @@ def tokenizer_from_config(config: Any) -> InstructionTokenizer:
     """Make the tokenizer whose ``to_config`` gave ``config``.
 
     Raises:
-        ValueError: if it is none.
+        InputError: if it is none.
     """
     match config:
         case {"kind": "words", "words": list(words), **rest} if not rest and _are_words(words):

@@ -29,7 +29,7 @@ NOISES = {"torch": sample_noise, "philox": philox_noise}
 
 
 def check_noise(name: str) -> str:
-    """Return ``name``, or raise ValueError unless it is in :data:`NOISES`."""
+    """Return ``name``, or raise InputError unless it is in :data:`NOISES`."""
     if name not in NOISES:
         raise InputError(f"noise: expected one of {list(NOISES)}, got {name!r}")
     return name

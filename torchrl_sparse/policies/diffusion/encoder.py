@@ -59,7 +59,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
 
         Raises:
             KeyError: if an observation is missing.
-            ValueError: if images do not fit the encoder.
+            InputError: if images do not fit the encoder.
         """
         state = self.normalizer.normalize_state(keys.read(tensordict, self.state_key))
         if self.vision is None:
@@ -98,7 +98,7 @@ class ObservationEncoder(TensorDictModuleBase):
         noise_stream: which of the noises that an episode could have had; 0 unless another is assigned.
 
     Raises:
-        ValueError: if features and state together are not what the network expects.
+        InputError: if features and state together are not what the network expects.
     """
 
     def __init__(

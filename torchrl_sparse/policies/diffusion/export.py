@@ -47,7 +47,7 @@ def export_policy(
         facts: about the policy, for the file's description.
 
     Raises:
-        ValueError: naming what cannot be exported: cameras, a warm start, a network that the native engine does not run, or a
+        InputError: naming what cannot be exported: cameras, a warm start, a network that the native engine does not run, or a
             observation-conditioned planner of one's own.
 
     Examples:

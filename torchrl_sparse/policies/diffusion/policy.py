@@ -153,7 +153,7 @@ class DiffusionPolicy(FreezablePolicy):
         It is frozen if this one is.
 
         Raises:
-            ValueError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
+            InputError: if the planner was made for another policy or sampler, the start cannot serve it, or the sampler counts
                 other training steps.
         """
         same: dict[str, Any] = {"vision": self.vision, "sampler": self.sampler, "engine": self.engine}
@@ -242,7 +242,7 @@ class DiffusionPolicy(FreezablePolicy):
         An engine that rounds is kept, any other is the reader's choice.
 
         Raises:
-            ValueError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
+            InputError: if the planner cannot be saved, see `torchrl_sparse.blocks.saved.save_beside`, or the start is neither
                 None nor a `WarmStart`; nothing is written.
         """
         parts = self.network, self.normalizer, self.sampler, self.vision, self.source
@@ -264,7 +264,7 @@ class DiffusionPolicy(FreezablePolicy):
         A policy that was saved with rounded weights rounds them again under ``engine="auto"``; ``"native"`` does not.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
         """
         stored = read_diffusion_policy(path) if Path(path).suffix == ".ckpt" else read_pretrained(Path(path))
         policy = cls._assemble(stored, engine)

@@ -68,7 +68,7 @@ class QueryStart(TensorDictModuleBase):
         """Prepare to serve a policy of these parts; it calls this when it is given the start or another sampler.
 
         Raises:
-            ValueError: if the start cannot serve them; it then stays as it was.
+            InputError: if the start cannot serve them; it then stays as it was.
         """
 
     @property
@@ -140,7 +140,7 @@ def stored_start(start: QueryStart) -> int | None:
     """Return what a policy's file says of its start: the steps of a warm policy call, None where all begin from noise.
 
     Raises:
-        ValueError: for a start of another class.
+        InputError: for a start of another class.
 
     >>> stored_start(WarmStart(2)), stored_start(QueryStart())
     (2, None)

@@ -20,7 +20,7 @@ def read_images(td: TensorDictBase, cameras: Sequence[NestedKey], size: int) -> 
 
     Raises:
         KeyError: if a camera is missing.
-        ValueError: if an image has another type or size.
+        InputError: if an image has another type or size.
     """
     images = [keys.read(td, camera) for camera in cameras]
     for camera, image in zip(cameras, images, strict=True):
@@ -33,7 +33,7 @@ def read_state(td: TensorDictBase, key: NestedKey, size: int) -> Tensor:
 
     Raises:
         KeyError: if it is missing.
-        ValueError: if it has another type or size, or is not finite.
+        InputError: if it has another type or size, or is not finite.
     """
     state = keys.read(td, key)
     _check(key, state, torch.float32, (size,))
@@ -47,7 +47,7 @@ def read_keep_mask(td: TensorDictBase, num_visual: int) -> Tensor | None:
     """Return the visual tokens to keep, bool [B, num_visual], or None if nobody has written a mask.
 
     Raises:
-        ValueError: if it has another type or size.
+        InputError: if it has another type or size.
     """
     mask = td.get(keys.KEEP_MASK, None)
     if mask is not None:

@@ -55,7 +55,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
         TypeError: if an instruction is not text.
-        ValueError: if the batch is empty, an image, the state or a mask has a wrong shape or type, or the tokenizer has more
+        InputError: if the batch is empty, an image, the state or a mask has a wrong shape or type, or the tokenizer has more
             ids than the network.
 
     Examples:
@@ -115,7 +115,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         """Return a policy of the same network under another pruner.
 
         Raises:
-            ValueError: if the pruner does not fit the network.
+            InputError: if the pruner does not fit the network.
         """
         policy = VLAPolicy(self.network, self.normalizer, self.tokenizer)
         policy.pruner, policy.source, policy.base = pruner, self.source, self.base
@@ -239,7 +239,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             published: arguments of `from_openvla_oft`, which only such a folder takes.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
         """
         ours = {name: given for name, given in (("base", base), ("config", config)) if given is not None}
         if unread := ours if (released := is_openvla_oft(path)) else published:
@@ -285,7 +285,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             dtype: of the network; by default that of the embeddings in the shards, bf16 where they are as published.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
 
         Examples:
             >>> policy = VLAPolicy.from_openvla_oft("checkpoint", unnorm_key="libero_spatial")  # doctest: +SKIP

@@ -46,7 +46,7 @@ class PublishedConfig:
         tree: what `read_pickle` found: records of OmegaConf objects, or plain containers.
 
     Raises:
-        ValueError: if it is no configuration.
+        InputError: if it is no configuration.
 
     Examples:
         >>> config = PublishedConfig({"n_obs_steps": 2, "policy": {"steps": "${n_obs_steps}"}})
@@ -69,7 +69,7 @@ class PublishedConfig:
             default: what to return if there is none, or None is there; required without.
 
         Raises:
-            ValueError: if the entry is missing, of another type, or an expression.
+            InputError: if the entry is missing, of another type, or an expression.
         """
         value = self._find(path, _MAX_DEPTH)
         if value is None:
@@ -91,7 +91,7 @@ class PublishedConfig:
         """Return the names in the list at ``path``, or of the entries of the dict there; None if there is neither.
 
         Raises:
-            ValueError: if there are too many, or it holds anything but names.
+            InputError: if there are too many, or it holds anything but names.
         """
         found = self._find(path, _MAX_DEPTH)
         if found is None:

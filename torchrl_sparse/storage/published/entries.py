@@ -38,7 +38,7 @@ class Section:
     nullable: frozenset[str] = frozenset()
 
     def check(self, config: PublishedConfig, path: str, ignore: Collection[str] = ()) -> None:
-        """Raise ValueError for an entry of the section at ``path`` that is not supported, or unknown and not in ``ignore``."""
+        """Raise InputError for an entry of the section at ``path`` that is not supported, or unknown and not in ``ignore``."""
         read = self.fixed.keys() | self.read
         for name in config.names(path) or ():
             place = f"{path}.{name}"
@@ -54,7 +54,7 @@ class Section:
 
 
 def check_value(config: PublishedConfig, path: str, default: Any, supported: Any) -> None:
-    """Raise ValueError unless the entry at ``path``, or the ``default`` where there is none, is ``supported``."""
+    """Raise InputError unless the entry at ``path``, or the ``default`` where there is none, is ``supported``."""
     found = config.value(path) if supported is None else config.get(path, type(supported), default)
     if found != supported:
         raise InputError(f"cfg: {path}: expected {_written(supported)}, got {_written(found)}")
@@ -161,7 +161,7 @@ _SIZES = {
 
 
 def check_policy_entries(config: PublishedConfig, *, cameras: bool, ignore: Collection[str]) -> None:
-    """Raise ValueError for an entry of ``policy`` that is not known or not supported.
+    """Raise InputError for an entry of ``policy`` that is not known or not supported.
 
     Args:
         config: the configuration.
@@ -183,7 +183,7 @@ def check_task_entries(
     """Check the entries of ``task``; return the names of the observations and whether actions are absolute, None where unsaid.
 
     Raises:
-        ValueError: for an entry that is not known or not supported, or two that contradict each other.
+        InputError: for an entry that is not known or not supported, or two that contradict each other.
     """
     for path, section in (("task", _TASK), ("task.env_runner", _RUNNER), ("task.dataset", _DATASET)):
         section.check(config, path, ignore)
@@ -218,7 +218,7 @@ def check_sizes(config: PublishedConfig, section: str, sizes: Any, *, cameras: b
         cameras: whether the condition is more than the state that ``task`` describes.
 
     Raises:
-        ValueError: naming the entry that says otherwise.
+        InputError: naming the entry that says otherwise.
     """
     for place in dict.fromkeys(("", "policy.", f"{section}.", "task.", "task.env_runner.")):
         for name, attribute in _SIZES.items():

@@ -65,7 +65,7 @@ def read_pickle(
         persistent: makes an object of a persistent id; without it there may be none.
 
     Raises:
-        ValueError: if the pickle is damaged, mentions another name, needs any other operation or more than a million, or
+        InputError: if the pickle is damaged, mentions another name, needs any other operation or more than a million, or
             makes whole numbers of more than 64 bits or more bytes than it has itself.
 
     Examples:

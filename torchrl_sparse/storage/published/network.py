@@ -30,7 +30,7 @@ def read_network(
         stored: its tensors by name, without ``model.``.
 
     Raises:
-        ValueError: if tensors are missing, do not fit together or contradict the configuration.
+        InputError: if tensors are missing, do not fit together or contradict the configuration.
     """
     cameras = section == "policy"
     # What the published image policy takes where nothing is said, and what the denoiser alone does.
@@ -96,7 +96,7 @@ def read_affine(
     """Scale and offset, f32 [size], of one entry of the normaliser; takes it out of ``stored``.
 
     Raises:
-        ValueError: if the entry is missing or of another size.
+        InputError: if the entry is missing or of another size.
     """
     entry = {k: v for k, v in take(stored, f"{name}.").items() if not k.startswith("input_stats.")}
     single = "scale" in entry and entry["scale"].shape == (1,)  # one number for all dimensions

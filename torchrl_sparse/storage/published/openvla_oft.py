@@ -91,7 +91,7 @@ class Unsaid:
     """What a folder does not say; see `VLAPolicy.from_openvla_oft`.
 
     Raises:
-        ValueError: if there are not one or two cameras, or no three numbers of heads.
+        InputError: if there are not one or two cameras, or no three numbers of heads.
     """
 
     cameras: int
@@ -195,7 +195,7 @@ def _read_part(path: Path, prefix: str) -> dict[str, Tensor]:
 
 
 def _config(path: Path, tensors: dict[str, Tensor], image_size: int, unsaid: Unsaid) -> VLAConfig:
-    """Infer the sizes from the shapes of the weights; ValueError if they are not those of LIBERO's arm."""
+    """Infer the sizes from the shapes of the weights; InputError if they are not those of LIBERO's arm."""
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in tensors:

@@ -32,7 +32,7 @@ def read_normalizer(
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming the file, if it has no such data set or no such statistics, or they are not of LIBERO's arm.
+        InputError: naming the file, if it has no such data set or no such statistics, or they are not of LIBERO's arm.
     """
     if normalization not in _BOUNDS:
         raise InputError(f"normalization: expected one of {get_args(Normalization)}, got {normalization!r}")

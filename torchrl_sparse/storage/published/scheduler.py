@@ -46,7 +46,7 @@ def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampl
         ignore: paths of entries that are passed over where they are not known.
 
     Raises:
-        ValueError: naming the entry, if it is not known or `Sampler` does not have what it asks for.
+        InputError: naming the entry, if it is not known or `Sampler` does not have what it asks for.
     """
     target = config.get(f"{_PLACE}._target_", str)
     package, _, name = target.rpartition(".")

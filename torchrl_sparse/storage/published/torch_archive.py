@@ -71,7 +71,7 @@ class TorchArchive:
         path: the file.
 
     Raises:
-        ValueError: if it is no such file, or is truncated.
+        InputError: if it is no such file, or is truncated.
 
     Examples:
         >>> import tempfile
@@ -112,7 +112,7 @@ class TorchArchive:
             known: names that the pickle may mention besides those of tensors, see `read_pickle`.
 
         Raises:
-            ValueError: if the pickle is damaged or asks for anything else, or a tensor's record has another length.
+            InputError: if the pickle is damaged or asks for anything else, or a tensor's record has another length.
         """
         if f"{self._folder}byteorder" in self._zip.namelist():
             order = self._read("byteorder")
@@ -125,7 +125,7 @@ class TorchArchive:
         """Read one tensor.
 
         Raises:
-            ValueError: if its bytes are missing or damaged.
+            InputError: if its bytes are missing or damaged.
         """
         storage = stored.storage
         data = self._read(f"data/{storage.record}")

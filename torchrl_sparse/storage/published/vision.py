@@ -46,7 +46,7 @@ class ImageLayout:
         """Parse the layout that ``policy.shape_meta`` describes.
 
         Raises:
-            ValueError: if there is no camera or no state, or images of several sizes.
+            InputError: if there is no camera or no state, or images of several sizes.
         """
         order: dict[str, int] = {}
         cameras: dict[str, str] = {}
@@ -97,7 +97,7 @@ def read_vision(
         stored: tensors by name, without ``obs_encoder.obs_nets.``.
 
     Raises:
-        ValueError: if tensors are missing, do not fit together or describe another encoder.
+        InputError: if tensors are missing, do not fit together or describe another encoder.
     """
     said = "crop_shape" in (
         config.names("policy") or ()

@@ -18,7 +18,7 @@ def without_wrappers(where: str, tensors: Mapping[str, T]) -> dict[str, T]:
     """Return ``tensors`` under the names that they have without wrappers, at any depth.
 
     Raises:
-        ValueError: if two would have one name.
+        InputError: if two would have one name.
 
     >>> without_wrappers("model", {"module.head.weight": 1, "encoder._orig_mod.bias": 2})
     {'head.weight': 1, 'encoder.bias': 2}

@@ -34,7 +34,7 @@ def begun_policy(
         state_mode, crop, width: as of `untrained_policy`; None for the policy's own.
 
     Raises:
-        FileNotFoundError, ValueError: as `DiffusionPolicy.from_pretrained`; and naming what is asked for that it has not.
+        FileNotFoundError, InputError: as `DiffusionPolicy.from_pretrained`; and naming what is asked for that it has not.
     """
     policy = DiffusionPolicy.from_pretrained(path, engine="reference")
     network = policy.network
@@ -66,7 +66,7 @@ def continued_policy(
         cameras: image -> camera of the demonstrations; they have to be the policy's.
 
     Raises:
-        FileNotFoundError, ValueError: as `begun_policy` and `continued_source`; and naming a camera that is not the policy's.
+        FileNotFoundError, InputError: as `begun_policy` and `continued_source`; and naming a camera that is not the policy's.
     """
     policy = begun_policy(path, sizes, **asked)
     if policy.vision is not None:

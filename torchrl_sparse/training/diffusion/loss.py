@@ -83,7 +83,7 @@ class DiffusionLoss(LossModule):
         """Return ``{"loss": scalar}`` of a batch.
 
         Raises:
-            ValueError: if the chunk does not have the network's horizon and action size.
+            InputError: if the chunk does not have the network's horizon and action size.
         """
         action = tensordict.get(keys.ACTION)
         chunk = (self.network.horizon, self.network.input_dim)

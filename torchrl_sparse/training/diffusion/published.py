@@ -44,7 +44,7 @@ def published_shape(task: str) -> PublishedShape:
     """Return the shape for a task; the robosuite tasks share one, which those without a published policy get too.
 
     Raises:
-        ValueError: if there is no such task.
+        InputError: if there is no such task.
 
     >>> published_shape("kitchen").n_emb, published_shape("lift").n_emb
     (768, 256)
@@ -61,7 +61,7 @@ def executed_steps(task: str, source: Mapping[str, Any], chosen: int | None = No
         chosen: by the user.
 
     Raises:
-        ValueError: if there is no such task.
+        InputError: if there is no such task.
 
     >>> executed_steps("block_push", {}), executed_steps("lift", {"n_action_steps": 4})
     (1, 4)
@@ -73,7 +73,7 @@ def with_published(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``options`` with the published choice for the task where they are None and `PublishedShape` has one.
 
     Raises:
-        ValueError: if there is no such task.
+        InputError: if there is no such task.
 
     >>> with_published("kitchen", {"n_emb": None, "horizon": 8, "seed": None})
     {'n_emb': 768, 'horizon': 8, 'seed': None}
@@ -90,7 +90,7 @@ def published_network(task: str, **changes: Any) -> TransformerForDiffusion:
         changes: arguments of `TransformerForDiffusion` that shall differ.
 
     Raises:
-        ValueError: if there is no such task.
+        InputError: if there is no such task.
 
     >>> network = published_network("pusht")
     >>> network.horizon, network.cond_dim, sum(p.numel() for p in network.parameters())

@@ -65,7 +65,7 @@ def make_targets(
         f32 [N, H, A], normalised.
 
     Raises:
-        ValueError: if the share leaves no window, or the demonstrations mean something else than what the policy observes.
+        InputError: if the share leaves no window, or the demonstrations mean something else than what the policy observes.
     """
     network, normalizer = policy.network, policy.normalizer
     check_contract(policy, demos.contract)
@@ -166,7 +166,7 @@ def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: naming the file, if it is damaged or was made for something else.
+        InputError: naming the file, if it is damaged or was made for something else.
     """
     try:
         with safe_open(path, "pt") as file:

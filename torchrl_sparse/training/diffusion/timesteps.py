@@ -48,7 +48,7 @@ def search_timesteps(
         The timesteps of least error and the error of all that were tried.
 
     Raises:
-        ValueError: if ``start`` does not fall, or not from below ``num_train_timesteps`` to at least 0.
+        InputError: if ``start`` does not fall, or not from below ``num_train_timesteps`` to at least 0.
 
     Examples:
         >>> best, tried = search_timesteps(lambda steps: abs(steps[0] - 88) + abs(steps[1] - 12), [50, 0])
@@ -139,7 +139,7 @@ def find_timesteps(
         on_chain: called before each chain that is tried.
 
     Raises:
-        ValueError: if there is no such sampler.
+        InputError: if there is no such sampler.
     """
     train_steps = policy.sampler.num_train_timesteps
 

@@ -32,7 +32,7 @@ class PolicyTrainer(DemonstrationTrainer):
         config: how to train.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on, or the demonstrations mean something else than what the
+        InputError: if ``val_ratio`` leaves no episode to train on, or the demonstrations mean something else than what the
             policy observes.
     """
 

@@ -57,7 +57,7 @@ class PrunerConfig:
         seed: fixes everything random.
 
     Raises:
-        ValueError: if a value is out of its range.
+        InputError: if a value is out of its range.
     """
 
     objective: Literal["actions", "noise"] = "actions"

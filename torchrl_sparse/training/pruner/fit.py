@@ -50,7 +50,7 @@ def fit_to_masks(
         on_progress: called with (steps taken, all).
 
     Raises:
-        ValueError: if there is no mask, one is not of the gates' shape, or gates that do not read the rate get several.
+        InputError: if there is no mask, one is not of the gates' shape, or gates that do not read the rate get several.
     """
     if not masks or (len(masks) > 1 and not gates.rate_input):
         expected = "at least one" if gates.rate_input else "one for gates that do not read the rate"

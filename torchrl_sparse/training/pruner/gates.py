@@ -70,7 +70,7 @@ def make_gates(
             nothing of the cameras.
 
     Raises:
-        ValueError: for another method, something else to read, or sizes of L2C's gates, which have none.
+        InputError: for another method, something else to read, or sizes of L2C's gates, which have none.
 
     Examples:
         >>> policy = DiffusionPolicy.from_pretrained("assets/lift")

@@ -55,7 +55,7 @@ class PrunerTrainer(Trainer):
         weight: cost of each block, f32 [3L], as ``config.cost`` counts it.
 
     Raises:
-        ValueError: if calibration set, configuration and gates do not fit each other.
+        InputError: if calibration set, configuration and gates do not fit each other.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ class GroundingConfig:
         refer_steps: steps after those, in which the whole network locates the object that the instruction refers to.
 
     Raises:
-        ValueError: if one is negative.
+        InputError: if one is negative.
     """
 
     locate_steps: int = 0
@@ -58,7 +58,7 @@ class ObjectPositions:
         instructions: n of them.
 
     Raises:
-        ValueError: if there are not as many instructions as objects.
+        InputError: if there are not as many instructions as objects.
 
     Examples:
         >>> things = ObjectPositions(torch.rand(50, 2, 3), ["lift the red cube", "lift the green cube"])
@@ -80,7 +80,7 @@ class ObjectPositions:
         """Return positions about zero, and of unit size along the axis on which they vary most.
 
         Raises:
-            ValueError: if they vary on none, as one object's that nothing moves: there is nothing to locate.
+            InputError: if they vary on none, as one object's that nothing moves: there is nothing to locate.
         """
         positions = self.positions.double()  # or the last bit would depend on the number of threads
         centred = positions - positions.mean((0, 1))

@@ -57,7 +57,7 @@ class VLALoss(LossModule):
         """Return ``{"loss": scalar}`` of a batch [B].
 
         Raises:
-            ValueError: if the chunk does not have the policy's length and action size.
+            InputError: if the chunk does not have the policy's length and action size.
         """
         chunk = keys.read(tensordict, keys.CHUNK)
         expected = (self.policy.chunk_size, self.policy.action_dim)

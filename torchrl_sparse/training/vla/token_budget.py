@@ -133,7 +133,7 @@ def measure_errors(
         on_episode: called after each episode.
 
     Raises:
-        ValueError: if no episode has a second call.
+        InputError: if no episode has a second call.
     """
     if not any(len(queries) > 1 for queries in episodes):
         raise InputError(

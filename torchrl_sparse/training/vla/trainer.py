@@ -44,7 +44,7 @@ class InstructedDemonstrations:
         objects: where things are in each step, for `Grounding`; None if that is not known.
 
     Raises:
-        ValueError: if there are not as many instructions as episodes.
+        InputError: if there are not as many instructions as episodes.
     """
 
     episodes: Demonstrations
@@ -88,7 +88,7 @@ class VLATrainer(DemonstrationTrainer):
         grounding: stages that come before the actions; none by default.
 
     Raises:
-        ValueError: if ``val_ratio`` leaves no episode to train on, or there are stages but no ``demos.objects``.
+        InputError: if ``val_ratio`` leaves no episode to train on, or there are stages but no ``demos.objects``.
     """
 
     def __init__(

@@ -51,7 +51,7 @@ def untrained_policy(
         rank: of the adapters.
 
     Raises:
-        ValueError: for another size, or a file that is no language model.
+        InputError: for another size, or a file that is no language model.
     """
     data = demos.episodes.data
     action = data[keys.ACTION]
@@ -73,7 +73,7 @@ def check_sizes(
     rank: int | None,
     changes: Mapping[str, Any],
 ) -> None:
-    """Raise ValueError for sizes that are asked for and that a policy to train on has not.
+    """Raise InputError for sizes that are asked for and that a policy to train on has not.
 
     Args:
         policy: that is trained on.

@@ -37,7 +37,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         is no column.
 
     Raises:
-        ValueError: if a weight is too large for ``dtype``.
+        InputError: if a weight is too large for ``dtype``.
 
     Examples:
         >>> pack_panels(torch.ones(40, 7)).view(2, 7, 32)[1, 0].sum()

@@ -65,7 +65,7 @@ class NativeEngine:
         detail: instruction set, weight type and the threads of a single call.
 
     Raises:
-        ValueError: if the engine cannot run the network or the instruction set, with the reason.
+        InputError: if the engine cannot run the network or the instruction set, with the reason.
 
     Examples:
         >>> from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -132,7 +132,7 @@ class NativeEngine:
         """Return normalised actions f32 [B, H, A], see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
         Raises:
-            ValueError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
+            InputError: also if the mask is not on the CPU, or if the network is in training mode or was converted or moved.
         """
         check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
         self._check(mask)
@@ -173,7 +173,7 @@ class NativeEngine:
         """Return what :meth:`answer` reads of the network, as its weights are now.
 
         Raises:
-            ValueError: if a policy call does not fit them, or naming a weight that cannot be packed.
+            InputError: if a policy call does not fit them, or naming a weight that cannot be packed.
         """
         packed = self._current()
         packed.check(noise=noise, cond=cond)

@@ -100,7 +100,7 @@ def instruction_level(instruction_set: str | None = None) -> int:
     """Return the number by which the library knows an instruction set; by default the widest that this CPU has.
 
     Raises:
-        ValueError: if this CPU does not have it.
+        InputError: if this CPU does not have it.
     """
     available = INSTRUCTION_SETS[: loaded().sparse_levels()]
     if instruction_set is None:

@@ -58,7 +58,7 @@ class PackedWeights:
         members: of the structure `Model`.
 
     Raises:
-        ValueError: naming a weight that has another shape than the network was made with.
+        InputError: naming a weight that has another shape than the network was made with.
     """
 
     def __init__(self, network: TransformerForDiffusion, dtype: torch.dtype, *, narrow: bool = True) -> None:
@@ -169,7 +169,7 @@ class PackedNetwork:
             )
 
     def check(self, **query: Tensor) -> None:
-        """Raise ValueError unless ``noise``, ``cond`` and ``mask`` of a policy call have the sizes that were packed."""
+        """Raise InputError unless ``noise``, ``cond`` and ``mask`` of a policy call have the sizes that were packed."""
         for name, tensor in query.items():
             if tuple(tensor.shape[1:]) != self._sizes[name]:
                 raise InputError(
@@ -189,7 +189,7 @@ class PackedNetwork:
 
 
 def weight_type(name: str) -> torch.dtype:
-    """Return the type of weights of that name, or raise ValueError if there is none."""
+    """Return the type of weights of that name, or raise InputError if there is none."""
     if name not in _WEIGHTS:
         raise InputError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
     return getattr(torch, name)

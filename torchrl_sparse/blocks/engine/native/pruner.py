@@ -59,7 +59,7 @@ class NativePruner:
         hidden: activations of its hidden layers.
 
     Raises:
-        ValueError: if this CPU does not have the instruction set.
+        InputError: if this CPU does not have the instruction set.
 
     Examples:
         >>> from torchrl_sparse.blocks.engine import native_available
@@ -102,7 +102,7 @@ class NativePruner:
             features: flat observations, and rates if they are an input, f32 [B, F] on the CPU.
 
         Raises:
-            ValueError: if there is another number of features than F.
+            InputError: if there is another number of features than F.
         """
         logits = torch.empty(len(features), *self._shape, dtype=torch.float32, device="cpu")
         self._run(features, logits.data_ptr(), None)

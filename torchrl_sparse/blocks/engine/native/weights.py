@@ -60,7 +60,7 @@ class SharedWeights:
         """Return the packed weights, packed again if the network has changed.
 
         Raises:
-            ValueError: naming a weight that cannot be packed.
+            InputError: naming a weight that cannot be packed.
         """
         version = self._watch.state()
         known, packed = self._packed  # read and replaced in one go: other threads may do the same
