@@ -159,6 +159,8 @@ def test_the_same_names_are_told_apart_and_the_same_file_is_not(tmp_path):
     assert [m.name for m in read_methods(files)] == ["first/Lift epoch 20", "second/Lift epoch 20"]
     with refused("files"):
         read_methods([files[0], files[0]])
+    with refused("files"):
+        read_methods([])
     with refused("none.csv", FileNotFoundError):
         read_methods([tmp_path / "none.csv"])
 

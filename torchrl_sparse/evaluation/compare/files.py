@@ -41,6 +41,8 @@ def read_methods(paths: Sequence[str | os.PathLike], errors: Errors = "refuse") 
         FileNotFoundError: if there is no such file.
         ValueError: naming file and entry, if one is of no kind that is known, or damaged.
     """
+    if not paths:
+        raise InputError(f"files: expected {_KNOWN}, got none")
     found = [method for path in paths for method in _read(_chosen(Path(path)))]
     twice = Counter(method.name for method in found)
     named = [
