@@ -43,7 +43,7 @@ def write_episodes(methods: Sequence[MethodOutcomes], path: str | os.PathLike) -
         path: of the file, whose suffix says which.
 
     Raises:
-        ValueError: for another suffix.
+        InputError: for another suffix.
         ImportError: of Parquet without pyarrow.
     """
     path, rows = Path(path), episode_rows(methods)
@@ -133,7 +133,7 @@ def write_lerobot(methods: Sequence[MethodOutcomes], folder: str | os.PathLike) 
     """Write ``METHOD/eval_info.json`` of every method into a new folder, whole or not at all; return the folder.
 
     Raises:
-        ValueError: if the folder is there already, or a name is no name of a folder.
+        InputError: if the folder is there already, or a name is no name of a folder.
     """
     folder = Path(folder)
     if folder.exists():

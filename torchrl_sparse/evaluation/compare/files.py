@@ -39,7 +39,7 @@ def read_methods(paths: Sequence[str | os.PathLike], errors: Errors = "refuse") 
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming file and entry, if one is of no kind that is known, or damaged.
+        InputError: naming file and entry, if one is of no kind that is known, or damaged.
     """
     if not paths:
         raise InputError(f"files: expected {_KNOWN}, got none")

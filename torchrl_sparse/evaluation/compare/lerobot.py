@@ -22,7 +22,7 @@ def read_lerobot(path: str, data: Mapping[str, Any]) -> list[Outcome]:
     Current files have ``per_task`` alone, without seeds: a place is a start only as far as runs had the same ``seed``.
 
     Raises:
-        ValueError: naming file and entry.
+        InputError: naming file and entry.
     """
     if "per_episode" in data:
         return [_episode(path, index, entry) for index, entry in enumerate(_list(data, "per_episode", path))]

@@ -67,7 +67,7 @@ class MethodOutcomes:
         stopped: whether their number followed from the verdict, as of a benchmark with ``until=conclusive``.
 
     Raises:
-        ValueError: naming the file, if there is no episode, or two began at the same.
+        InputError: naming the file, if there is no episode, or two began at the same.
     """
 
     name: str
@@ -108,7 +108,7 @@ def settle_errors(method: MethodOutcomes, errors: Errors) -> MethodOutcomes:
     """Count episodes that ended in an error as the user chooses.
 
     Raises:
-        ValueError: if there is one and they are to be refused, or no other episode is left.
+        InputError: if there is one and they are to be refused, or no other episode is left.
     """
     failed = [outcome for outcome in method.outcomes if outcome.error]
     if not failed or errors == "failure":

@@ -71,7 +71,7 @@ def pilot_truths(methods: Sequence[MethodOutcomes]) -> list[tuple[str, Truth]]:
     come. The correlation is that of successes on seeds that both ran, and 0 where there are none or it cannot be told.
 
     Raises:
-        ValueError: if there are fewer than two methods.
+        InputError: if there are fewer than two methods.
     """
     if len(methods) < 2:
         raise InputError(

@@ -25,7 +25,7 @@ def read_robomimic_log(path: str, text: str) -> dict[str, list[Outcome]]:
     """Return the episodes of every evaluation in a log: its name, ``ENV epoch N``, or empty of ``run_trained_agent``.
 
     Raises:
-        ValueError: naming file and line, if there is none, or counts do not agree.
+        InputError: naming file and line, if there is none, or counts do not agree.
     """
     found: dict[str, list[Outcome]] = {}
     lines = text.splitlines()

@@ -21,7 +21,7 @@ def read_table(path: Path) -> dict[str, list[Outcome]]:
     there. Others are left alone.
 
     Raises:
-        ValueError: naming file, line and column.
+        InputError: naming file, line and column.
     """
     if path.stat().st_size > _MOST_BYTES:
         raise InputError(f"{path}: expected at most {_MOST_BYTES} bytes of CSV, got {path.stat().st_size}")

@@ -101,7 +101,7 @@ def compare_methods(
         horizon: steps after which an episode is truncated; None is what the files tell.
 
     Raises:
-        ValueError: if there are fewer than two methods, none of that name, or methods of different tasks.
+        InputError: if there are fewer than two methods, none of that name, or methods of different tasks.
     """
     if len(methods) < 2:
         raise InputError(

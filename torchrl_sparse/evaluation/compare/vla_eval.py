@@ -22,7 +22,7 @@ def read_vla_eval(path: str, data: Mapping[str, Any]) -> list[Outcome]:
     vla-eval counts an episode with a ``failure_reason`` as a failure; here it is one that ended in an error.
 
     Raises:
-        ValueError: naming file and entry.
+        InputError: naming file and entry.
     """
     run = "" if data.get("seed") is None else str(data["seed"])
     if not isinstance(data["tasks"], list):

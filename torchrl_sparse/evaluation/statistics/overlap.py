@@ -43,7 +43,7 @@ class OverlapCounts:
         theirs: the same of the second.
 
     Raises:
-        ValueError: if a count is negative, or a method has no episode.
+        InputError: if a count is negative, or a method has no episode.
 
     >>> counts = OverlapCounts(0, 0, 0, 0, ours=(56, 70), theirs=(48, 80))
     >>> round(counts.difference, 3), [round(limit, 3) for limit in counts.interval()]

@@ -21,7 +21,15 @@ from torchrl_sparse.evaluation.statistics.intervals import DEFAULT_MARGIN, tango
 from torchrl_sparse.evaluation.statistics.overlap import miettinen_nurminen_z
 from torchrl_sparse.evaluation.statistics.sequential import Design
 
-__all__ = ["DEFAULT_ANALYSES", "DEFAULT_POWER", "Plan", "Truth", "fixed_plan", "fixed_power", "sequential_plan"]
+__all__ = [
+    "DEFAULT_ANALYSES",
+    "DEFAULT_POWER",
+    "Plan",
+    "Truth",
+    "fixed_plan",
+    "fixed_power",
+    "sequential_plan",
+]
 
 DEFAULT_POWER = 0.9
 DEFAULT_ANALYSES = 30
@@ -42,7 +50,7 @@ class Truth:
         difference: rate of the method minus that rate.
 
     Raises:
-        ValueError: if no two methods are so.
+        InputError: if no two methods are so.
 
     >>> [round(share, 3) for share in Truth(0.8, 0.5).cells]
     [0.72, 0.08, 0.08, 0.12]
@@ -107,7 +115,7 @@ def fixed_plan(
         paired: whether both methods run the same seeds.
 
     Raises:
-        ValueError: if a number is out of range, or the difference lies so near the margin that none suffice.
+        InputError: if a number is out of range, or the difference lies so near the margin that none suffice.
 
     >>> fixed_plan(Truth(0.9, 0.5), margin=0.1).episodes
     118
@@ -161,7 +169,7 @@ def sequential_plan(
         analyses: of the design; the cap is a multiple of them.
 
     Raises:
-        ValueError: as `fixed_plan`.
+        InputError: as `fixed_plan`.
     """
     fixed = fixed_plan(truth, margin, power, paired=paired).episodes
 
