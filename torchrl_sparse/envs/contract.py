@@ -153,7 +153,7 @@ def provenance(contract: Contract | None) -> dict[str, str]:
 
 
 def continued_source(task: str, policy: DiffusionPolicy) -> dict[str, Any]:
-    """Return the ``source`` of a fine-tuned policy: its original one, updated to the task it was last trained on.
+    """Return the ``source`` of a policy after further training: its own, naming the task it was last trained on.
 
     Args:
         task: that it is trained on now, a name or alias.

@@ -127,7 +127,7 @@ def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -
 
 
 def continued_vla_source(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -> VLASource:
-    """Return the ``source`` of a fine-tuned policy: its original one, updated to the task it was last trained on.
+    """Return the ``source`` of a policy after further training: its own, naming the task it was last trained on.
 
     Args:
         task: that it is trained on now, see `find_instructed_task`.

@@ -137,7 +137,7 @@ class RobosuiteTask(_Named):
         return _load(f"{_ENVS}.robosuite:RobosuiteEnv")(self.name, **kwargs)
 
     def register(self) -> None:
-        """Register the task with robosuite unless robosuite defines it."""
+        """Register the task with robosuite, unless it is one of robosuite's own."""
         if self.module is not None:
             import_module(self.module)
 
