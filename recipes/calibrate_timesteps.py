@@ -55,7 +55,7 @@ def main(config: DictConfig) -> None:
 
 
 def report(policy: DiffusionPolicy, found: FoundTimesteps, config: DictConfig) -> dict:
-    """Return everything that was tried, best first, what the spacings took, and what it was tried with."""
+    """Return all timesteps tried, best first, with the errors of the standard spacings and the search settings."""
     ordered = sorted(found.tried.items(), key=lambda entry: entry[1])
     return {
         "policy": policy.fingerprint,

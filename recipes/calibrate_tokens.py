@@ -70,7 +70,7 @@ def main(config: DictConfig) -> None:
 
 
 def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
-    """Measure the action error at each number, on the same recorded policy calls."""
+    """Measure the action error of each token budget on the same recorded policy calls."""
     if config.demos is not None:
         task = find_robosuite_task(config.task)
         poses = task.pose_slices(task.proprioception_keys)
@@ -86,7 +86,7 @@ def errors(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[Budget
 
 
 def lost_episodes(policy: VLAPolicy, tried: Pruners, config: DictConfig) -> list[BudgetPoint]:
-    """Measure the success that each number loses to the dense policy, on the same initial states."""
+    """Measure the success rate that each token budget loses to the dense policy on the same initial states."""
     make_actor, make = partial(executor, config=config), environment(policy, config)
     with tqdm(total=(1 + len(tried)) * config.episodes, unit="episode") as bar:
         return measure_success(policy, make_actor, make, seeds(config), tried, bar.update)

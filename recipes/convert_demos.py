@@ -45,18 +45,18 @@ def main(config: DictConfig) -> None:
 
 
 def find_format(demos: Path) -> str:
-    """Tell Push-T's npz from robomimic's HDF5; whatever else it is, the reader says what is wrong with it."""
+    """Tell Push-T's npz from robomimic's HDF5 by the file type; the reader of either refuses other content."""
     return "pusht" if demos.is_file() and is_zipfile(demos) else "robomimic"
 
 
 def is_ours(demos: Path) -> bool:
-    """Tell whether a file was collected or converted by this library, so that nothing is to be converted."""
+    """Tell whether this library collected or converted the file, so that no conversion is needed."""
     with open_demos(demos) as file:
         return bool({"collection", "source_bytes"} & {*demo_group(file).attribute_names()})
 
 
 def check_read(config: DictConfig, kind: str) -> None:
-    """Refuse options that nothing would read, before anything is written."""
+    """Refuse options that this conversion does not use, before anything is written."""
     if kind == "pusht" and config.cameras:
         raise InputError(f"cameras: expected [] of Push-T, which is not rendered, got {list(config.cameras)}")
     if kind == "pusht" and config.poses:
@@ -64,7 +64,7 @@ def check_read(config: DictConfig, kind: str) -> None:
 
 
 def convert(kind: str, demos: Path, out: Path, poses: bool) -> str:
-    """Convert a published file, and tell what is in the new one."""
+    """Convert a published file and return a summary of the new one."""
     if kind == "pusht":
         return f"{convert_pusht(demos, out)} demonstrations"
     return f"{convert_demos(demos, out, poses=poses)} demonstrations with absolute actions"

@@ -47,7 +47,7 @@ def main(config: DictConfig) -> None:
 
 
 def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
-    """Play one episode per seed, read from the log as far as they are there."""
+    """Play one episode per seed; episodes that are in the log already are read from it."""
     task = find_task(config.task)
     n_action_steps = executed_steps(task.name, policy.source, config.n_action_steps)
     played = {"task": task.name, "n_action_steps": n_action_steps, "horizon": config.horizon}
@@ -65,7 +65,7 @@ def play(policy: DiffusionPolicy, config: DictConfig) -> list[EpisodeResult]:
 
 
 def summarize(episodes: list[EpisodeResult]) -> str:
-    """Sum episodes up in a line."""
+    """Summarize episodes in one line."""
     n, k = len(episodes), sum(episode.success for episode in episodes)
     low, high = wilson_interval(k, n)
     scores = torch.tensor([episode.score for episode in episodes])
@@ -89,7 +89,7 @@ def describe_ways(ways: list[int]) -> str:
 
 
 def demonstrated_ways(config: DictConfig) -> list[int]:
-    """Return the ways of demonstrations, to compare with the policy's."""
+    """Return which mode each demonstration takes, to compare with the policy's modes."""
     if config.demos is None:
         return []
     task = find_task(config.task)

@@ -57,7 +57,7 @@ def main(config: DictConfig) -> None:
 
 
 def state_model(config: DictConfig, task: RobosuiteTask, policy: DiffusionPolicy) -> StateModel | None:
-    """Fit what methods named ``_ahead`` roll the policy's state forward with; None if there are none."""
+    """Fit the state model that methods named ``_ahead`` roll the state forward with; None if there are none."""
     if not any(MethodSpec.parse(name).ahead for name in config.methods):
         return None
     if config.demos is None:

@@ -59,7 +59,7 @@ def main(config: DictConfig) -> None:
 
 
 def find_sweep(name: str) -> Path:
-    """Return the path of a sweep: one of ours by its name, or any by its path."""
+    """Return the path of a sweep file, given the name of one of the library's sweeps or any path."""
     known = {path.stem: path for path in sorted((RECIPES / "sweeps").glob("*.yaml"))}
     path = Path(name) if name.endswith(".yaml") else known.get(name)
     if path is None or not path.is_file():
@@ -68,7 +68,7 @@ def find_sweep(name: str) -> Path:
 
 
 def run_online(sweep: dict, out: Path, config: DictConfig) -> None:
-    """Create the sweep, unless an earlier call did, and run its trials here."""
+    """Create the sweep unless an earlier call did, and run its trials here."""
     import wandb
 
     path, made_for = out / "sweep.json", {"project": config.project, "sweep": sweep}

@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_trainer(config: DictConfig) -> PolicyTrainer:
-    """Read the demonstrations and build what is trained on them; ``config`` then holds what it had left open."""
+    """Read the demonstrations and build a trainer; options that ``config`` left open are filled in."""
     task, cameras = find_task(config.task), chosen_cameras(config.cameras)
     begun = None
     if config.init is not None:

@@ -56,7 +56,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_trainer(config: DictConfig) -> PrunerTrainer:
-    """Read the policy and make what its gates are trained on, unless an earlier run did."""
+    """Read the policy and build a trainer for its gates."""
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.sampler is not None:
         policy.sampler = policy.sampler.variant(**config.sampler)
@@ -71,7 +71,7 @@ def initial_schedules(config: DictConfig) -> list[str]:
 
 
 def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
-    """Return observations and targets, read where an earlier run made them.
+    """Return calibration observations and target actions, from an earlier run's file if there is one.
 
     Those of other settings are made again, or refused once something was trained on them.
     """
@@ -101,7 +101,7 @@ def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
 
 
 def begin(trainer: PrunerTrainer, masks: list[Tensor], config: DictConfig) -> None:
-    """Fit the gates to the masks of ``init``, or spread their logits; else leave them as they are."""
+    """Fit the gates to the masks of ``init``, or spread their logits; otherwise leave them as they are."""
     queries = trainer.train_set
     if config.spread:
         spread_logits(trainer.gates, queries, config.spread)

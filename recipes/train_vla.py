@@ -53,7 +53,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_trainer(config: DictConfig) -> VLATrainer:
-    """Read the demonstrations and build what is trained on them."""
+    """Read the demonstrations and build a trainer."""
     cameras, policy, changes = chosen_cameras(config.cameras), None, given(config.network)
     if config.init is not None:
         policy = VLAPolicy.from_pretrained(config.init, base=config.base, fold=False)
@@ -79,7 +79,7 @@ def make_trainer(config: DictConfig) -> VLATrainer:
 
 
 def read_objects(config: DictConfig) -> ObjectPositions:
-    """Return where the objects are that the task's instructions name, in the order of these."""
+    """Return the positions of the objects that the task's instructions name, in the order of the instructions."""
     task = find_robosuite_task(config.task)
     positions = read_demos(config.demos, ["object_positions"], task=task.name).data[keys.STATE]
     return ObjectPositions(positions.unflatten(1, (-1, 3)), task.instructions).standardised()

@@ -1,4 +1,4 @@
-"""The sheet that every figure is drawn on: one style, no pyplot, saved atomically."""
+"""Common style of all figures, without pyplot, and atomic saving."""
 
 import os
 from pathlib import Path
@@ -32,7 +32,7 @@ def make_figure(
     heights: tuple[float, ...] | None = None,
     sharex: bool = False,
 ) -> tuple["Figure", Any]:
-    """Make a styled figure of ``width * 100`` pixels and its axes: one, or an array [rows, columns]."""
+    """Make a styled figure ``width * 100`` pixels wide and its axes: one, or an array [rows, columns]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ def make_figure(
 
 
 def save_figure(figure: "Figure", path: str | os.PathLike) -> Path:
-    """Write the figure as a PNG; return the path."""
+    """Write the figure as a PNG and return the path."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, facecolor="white")
     return Path(path)

@@ -1,4 +1,4 @@
-"""State that a module leaves in the TensorDict for its own next call, and its place in an environment's spec.
+"""State that a module carries in the TensorDict from one call to the next, and its entries in an environment's spec.
 
 A key is *carried* if it is in a module's ``in_keys`` and in its ``out_keys``. An environment need not hand back what it does
 not know: TorchRL's `ParallelEnv` hands back the keys of its spec alone. So a module says what one environment's entries are::
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Entry(NamedTuple):
-    """What one environment has under a key, and what where an episode begins."""
+    """Spec of a carried key for one environment, and its value at the start of an episode."""
 
     shape: tuple[int, ...]
     dtype: torch.dtype = torch.float32
@@ -52,13 +52,13 @@ COUNT, FLAG = Entry((1,), torch.int64), Entry((1,), torch.bool)
 
 
 def carried_keys(module: TensorDictModuleBase) -> list[NestedKey]:
-    """Return the keys that ``module`` leaves to itself."""
+    """Return the keys that ``module`` carries from call to call."""
     written = {unravel_key(key) for key in module.out_keys}
     return [key for key in map(unravel_key, module.in_keys) if key in written]
 
 
 def carried_entries(module: nn.Module, chunk: Entry | None) -> dict[NestedKey, Entry]:
-    """Return what ``module`` and its parts say of the keys that they leave to themselves."""
+    """Return the specs of all keys that ``module`` and its submodules carry."""
     found: dict[NestedKey, Entry] = {}
     for part in module.modules():
         if callable(tell := getattr(part, "carried", None)):
@@ -67,7 +67,7 @@ def carried_entries(module: nn.Module, chunk: Entry | None) -> dict[NestedKey, E
 
 
 def make_primer(entries: Mapping[NestedKey, Entry]) -> TensorDictPrimer:
-    """Return the transform that gives keys their place in a spec, of environments of any batch size."""
+    """Return a transform that adds the keys to the spec of an environment of any batch size."""
     from torchrl.data import Categorical, Composite, Unbounded  # which a robot's loop does without
     from torchrl.envs import TensorDictPrimer
 
@@ -80,7 +80,7 @@ def make_primer(entries: Mapping[NestedKey, Entry]) -> TensorDictPrimer:
 
 
 def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going_on: Tensor) -> None:
-    """Raise InputError if a row in mid-episode lacks what the step before left.
+    """Raise InputError if a row in mid-episode lacks an entry carried from the previous step.
 
     Args:
         tensordict: [*B].
@@ -93,7 +93,7 @@ def check_carried(tensordict: TensorDictBase, wanted: Iterable[NestedKey], going
 
 
 def dense(tensordict: TensorDictBase, module: TensorDictModuleBase) -> TensorDictBase:
-    """Return ``tensordict``, or if it is a lazy stack a TensorDict with the same entries, of one tensor each.
+    """Return ``tensordict``, or for a lazy stack a TensorDict with the same entries, each one tensor.
 
     An asynchronous collector stacks rows lazily where their keys differ. What a lazy stack hands out is a copy, so that writing
     into it is lost, and its repeated rows are one and the same. Rows without a key that ``module`` carries, at their first
@@ -117,7 +117,7 @@ def dense(tensordict: TensorDictBase, module: TensorDictModuleBase) -> TensorDic
 
 
 def refuse(key: NestedKey, lost: Tensor) -> None:
-    """Raise InputError if the rows ``lost``, bool [*B, 1], are any: the environment dropped ``key``."""
+    """Raise InputError if any of the rows ``lost``, bool [*B, 1], is True: the environment dropped ``key``."""
     if lost.any():
         raise InputError(
             f"{key}: expected what the step before left, since 'is_init' is False, got none in {int(lost.sum())} of "
@@ -135,7 +135,7 @@ def _lacks(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 class TensorKeys:
-    """Has a module read or write keys of other names, as a loss of TorchRL does.
+    """Mixin that renames the keys that a module reads or writes, as a TorchRL loss does.
 
     Attributes:
         tensor_keys: what may be renamed, and the key that each has.
@@ -144,7 +144,7 @@ class TensorKeys:
     tensor_keys: ClassVar[Mapping[str, NestedKey]]
 
     def set_keys(self, **names: NestedKey | None) -> None:
-        """Give keys other names; None is the default's.
+        """Rename keys; None restores the default.
 
         Raises:
             InputError: for what has no key here; nothing is changed.

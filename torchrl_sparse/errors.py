@@ -1,4 +1,4 @@
-"""The error of every input that is refused: an option, a file, a tensor or a policy. It imports nothing."""
+"""The error of every refused input: an option, a file, a tensor or a policy. Imports nothing."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ __all__ = ["InputError"]
 
 
 class InputError(ValueError):
-    """Refuse an input in one line, ``ENTRY: expected what would do, got what came``.
+    """Error for a refused input, in one line: ``ENTRY: expected what would do, got what came``.
 
     Attributes:
         entry: key, option, argument or file to be changed, with the entry of a file behind it: ``config.json: sampler``.

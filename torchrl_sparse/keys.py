@@ -1,4 +1,4 @@
-"""Every TensorDict key that the library reads or writes: one constant each, one meaning each.
+"""Every TensorDict key that the library reads or writes: one constant and one meaning each.
 
 Names that TorchRL's own vision-language-action schema (`torchrl.data.vla`) already has are used as they are. ``*B`` is the
 batch of environments (it may be empty), K the denoising steps, L the layers, A the action dimension, To the observation steps,
@@ -129,7 +129,7 @@ LATENCY = ("cost", "latency")
 
 
 def history(name: str) -> tuple[str, str]:
-    """Return the key of the last entries of ``("observation", name)``.
+    """Return the key of the history of ``("observation", name)``.
 
     >>> history("image")
     ('history', 'image')
@@ -138,7 +138,7 @@ def history(name: str) -> tuple[str, str]:
 
 
 def history_of(key: NestedKey) -> tuple[str, str]:
-    """Return the key of the last entries of an environment's observation, which has that observation's last name.
+    """Return the key of an environment observation's history, which has the observation's last name.
 
     >>> history_of(("robot", "proprio")), history_of("proprio")
     (('history', 'proprio'), ('history', 'proprio'))
@@ -147,7 +147,7 @@ def history_of(key: NestedKey) -> tuple[str, str]:
 
 
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return the entry under ``key``.
+    """Return the entry under ``key``; InputError if there is none.
 
     Raises:
         KeyError: if there is none; the message names the key and those that are there.
@@ -166,7 +166,7 @@ def recall(
     fill: float,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """Return the entry of an earlier call under ``key``, [*B, *shape]; ``fill`` for samples without one.
+    """Return the entry carried under ``key`` from an earlier call, [*B, *shape]; ``fill`` for samples without one.
 
     An asynchronous collector stacks samples at their first step with samples in mid-episode; the stack then lacks the key
     although some of its rows have it. The others get rows of the same shape.

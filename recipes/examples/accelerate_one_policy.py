@@ -1,4 +1,4 @@
-"""One policy, dense and under a training-free schedule: the same episode, and the share of the FLOPs that is left.
+"""Play the same episode with one policy, dense and under a training-free cache schedule, and print the share of FLOPs left.
 
 python recipes/examples/accelerate_one_policy.py
 """

@@ -1,4 +1,4 @@
-"""Experience of an accelerated policy from TorchRL's own collector, in two processes, which make their environments.
+"""Collect data with an accelerated policy in two processes, using TorchRL's own collector.
 
 python recipes/examples/collect.py
 """

@@ -1,4 +1,4 @@
-"""A policy in a plain loop that holds a rate and reports missed deadlines; your robot goes in `observe` and `command`.
+"""Run a policy in a plain fixed-rate loop that reports missed deadlines; your robot goes in `observe` and `command`.
 
 python recipes/examples/robot_loop.py
 """
@@ -19,7 +19,7 @@ def observe() -> dict[str, np.ndarray]:
 
 
 def command(action: np.ndarray) -> None:
-    """Hand the pose to your robot."""
+    """Send the target pose to your robot."""
 
 
 period, steps, missed = 1 / 20, 20, 0

@@ -1,4 +1,4 @@
-"""A method of your own in one class: what to skip, checked, counted and run by the same engine.
+"""Write your own method in one class that decides what to skip; the library's engine checks, counts and runs it.
 
 python recipes/examples/your_planner.py
 """
@@ -9,7 +9,7 @@ from torchrl_sparse import ChunkExecutor, DiffusionPolicy, StaticPlanner, make_e
 
 
 class SkipOddSteps(StaticPlanner):
-    """Skips every block at the odd denoising steps."""
+    """Planner that skips every block at the odd denoising steps."""
 
     def mask(self, spec):
         step = torch.arange(spec.num_inference_steps)

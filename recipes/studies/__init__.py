@@ -1,1 +1,1 @@
-"""Studies: what answered one question once. Each is a program, `python -m recipes.studies.NAME`, on top of the library."""
+"""Studies, each of which answered one question: programs, ``python -m recipes.studies.NAME``, that use the library."""

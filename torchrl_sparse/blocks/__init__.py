@@ -1,4 +1,4 @@
-"""Sparsity over (denoising step × block): what to skip (planners) and how it is skipped (engines)."""
+"""Sparsity over (denoising step × block): planners decide what to skip, engines skip it."""
 
 import lazy_loader as lazy
 

@@ -46,7 +46,7 @@ _FFN = BLOCK_TYPES.index("FFN")
 
 
 def acs(similarity: Tensor, num_updates: int, objective: Objective = "anchor") -> tuple[int, ...]:
-    """Choose the best ``num_updates`` denoising steps to compute one block at; step 0 is always one of them.
+    """Choose the best ``num_updates`` denoising steps at which to compute one block; step 0 is always included.
 
     * ``"anchor"``: maximise ``Σ_m Σ_{t=c_m}^{c_{m+1}-1} S[c_m, t]``, the similarity of every step to the
       update that it reuses. Dynamic programme over the end of the m-th interval, ``D[m][i] = max_{j<i}
@@ -103,7 +103,7 @@ def _anchored(similarity: Tensor, num_updates: int) -> tuple[int, ...]:
 
 
 def upstream_blocks(errors: Tensor | Sequence[float], top_k: int) -> tuple[int, ...]:
-    """Return the set U of BUA: columns of the ``top_k`` highest error scores, ascending; of equals the shallower.
+    """Return the set U of BUA: columns of the ``top_k`` highest error scores, ascending; ties go to the shallower block.
 
     >>> upstream_blocks([0.1, 0.3, 0.2], top_k=2)
     (1, 2)
@@ -121,7 +121,7 @@ def bubbling_union(
     errors: Tensor | Sequence[float],
     top_k: int = 5,
 ) -> tuple[tuple[int, ...], ...]:
-    """Let the blocks of highest error compute whenever a downstream FFN does (BUA).
+    """Compute the blocks of highest error whenever a downstream FFN is computed (BUA).
 
     ``C(u) ← C(u) ∪ ⋃_{v∈D(u)} C(v)`` for every u in U, the ``top_k`` blocks of highest error (FFNs included);
     D(u) are the FFNs of u's own layer and deeper. Afterwards C(u) ⊇ C(v) for every v in D(u). The order does not
@@ -232,7 +232,7 @@ SCHEDULES = {
 
 
 class BAC(SchedulePlanner):
-    """Writes a BAC schedule, or that of one of its ablations, for every observation.
+    """Planner that writes a BAC schedule, or one of its ablations', for every observation.
 
     Args:
         schedule: what a function of :data:`SCHEDULES` made.

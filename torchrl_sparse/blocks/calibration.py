@@ -1,4 +1,4 @@
-"""Calibration: statistics of each block over dense policy calls, from which BAC decides.
+"""Calibration: per-block statistics of dense policy calls, from which BAC derives its schedules.
 
 They tell how alike a block's outputs are between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much they
 vary in all. Few calls suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
@@ -53,7 +53,7 @@ def block_error(features: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Similarities and errors of a policy's blocks.
+    """Feature similarities and error scores of a policy's blocks.
 
     Attributes:
         similarity: f64 [3L, K, K], see :func:`feature_similarity`.
@@ -70,7 +70,7 @@ class Calibration:
 
 @torch.no_grad()
 def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Calibration:
-    """Record the block outputs of dense policy calls; the paper uses a single one, several average its noise out.
+    """Record the block outputs of dense policy calls. The paper uses a single call; several average out its noise.
 
     Args:
         network: the denoiser, in eval mode.

@@ -27,7 +27,7 @@ __all__ = ["StaticGates", "noise_errors"]
 
 
 class StaticGates(nn.Module):
-    """A logit for each block of each denoising step, positive where it is better pruned; all zero at first.
+    """One logit for each block of each denoising step, positive where it should be pruned; initially all zero.
 
     Args:
         num_steps: denoising steps K.
@@ -60,7 +60,7 @@ def noise_errors(
     gate: Tensor,
     step: int,
 ) -> Tensor:
-    """Return what caching changes in the noise predicted at one step, L2C's objective before it is squared.
+    """Return how caching changes the predicted noise at one step: L2C's objective before squaring.
 
     A gate M mixes ``(1 - M) fresh + M cached``, cached being the block's output in the dense step before.
 

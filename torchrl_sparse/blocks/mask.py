@@ -1,4 +1,4 @@
-"""Prune masks over (denoising step × block): what they mean, how they are checked, and what they cost.
+"""Prune masks over (denoising step × block): their meaning, checks, and costs.
 
 A mask is bool [*B, K, 3L] with **True = pruned** (the symbol M of SAG, arXiv:2601.12894). Axis K counts the
 calls of the network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456,
@@ -73,7 +73,7 @@ def block_name(column: int) -> str:
 
 
 class MaskError(InputError):
-    """A tensor that is no prune mask: its message names what was expected and what came."""
+    """Error for a tensor that is not a prune mask; the message says what was expected and what came."""
 
 
 def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
@@ -103,7 +103,7 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
 
 
 def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
-    """Refuse what does not have the type and shape of a prune mask, without reading it; see :func:`validate_mask`.
+    """Check type and shape of a prune mask, without reading its values; see :func:`validate_mask`.
 
     Raises:
         MaskError: if ``mask`` is no bool tensor [*batch, K, 3L].
@@ -130,7 +130,7 @@ def check_reuse(reuse: str) -> None:
 
 
 def num_buffers(reuse: Reuse, num_blocks: int) -> int:
-    """Return the number of outputs that a reuse rule keeps; block ``b`` writes and reads number ``b % num_buffers``.
+    """Return the number of block outputs that a reuse rule keeps; block ``b`` uses buffer ``b % num_buffers``.
 
     >>> num_buffers("type", num_blocks=24)
     3
@@ -167,7 +167,7 @@ def steps_from_mask(mask: Tensor) -> tuple[tuple[int, ...], ...]:
 
 @dataclass(frozen=True)
 class NetworkSizes:
-    """The sizes of a denoiser that decide its cost.
+    """Sizes of a denoiser that determine its cost.
 
     Attributes:
         num_layers: decoder layers L.
@@ -219,7 +219,7 @@ def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
 
 
 def fixed_macs(sizes: NetworkSizes) -> int:
-    """Count the multiply-accumulates of one call outside the blocks: stems, condition encoder, head; never pruned."""
+    """Count the multiply-accumulates of one call outside the blocks, which are never pruned: stems, condition encoder, head."""
     d, memory = sizes.width, 1 + sizes.n_obs_steps
     encoder = 8 * d * d * memory
     if sizes.num_cond_layers:
@@ -254,7 +254,7 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
 
 
 def mask_flops(sizes: NetworkSizes, mask: Tensor) -> Tensor:
-    """Return :func:`query_flops` of a mask that was validated before."""
+    """Return :func:`query_flops` of a mask that has already been validated."""
     num_steps = mask.shape[-2]
     # Summed as whole numbers: a policy call exceeds what float32 counts exactly.
     skipped = (mask.sum(dim=-2) * _block_flops(sizes).to(mask.device)).sum(dim=-1)

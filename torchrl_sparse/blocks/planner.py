@@ -1,4 +1,4 @@
-"""Planners: TensorDict modules that write the prune mask of a policy call and nothing else, and have one reuse rule.
+"""Planners: TensorDict modules that write the prune mask of a policy call, each with one reuse rule.
 
 A planner of one's own subclasses :class:`Planner` (the mask depends on the observation) or :class:`StaticPlanner` (it
 does not) and writes one method; ``policy.plan = Mine()`` is all that using it takes. One that is kept in a file gets a
@@ -47,7 +47,7 @@ class PlanSpec:
         return len(BLOCK_TYPES) * self.num_layers
 
     def check_is(self, asked: PlanSpec, who: str) -> None:
-        """Raise InputError, in the name of ``who`` was made for this, unless ``asked`` is the same.
+        """Raise InputError, naming ``who``, unless ``asked`` is the policy and sampler it was built for.
 
         Where another sampler is asked for, the message says in which order plan and sampler are assigned.
 
@@ -68,7 +68,7 @@ class PlanSpec:
 
 
 class Planner(TensorDictModuleBase):
-    """Base of everything that decides which blocks a policy call skips.
+    """Base of all modules that decide which blocks a policy call skips.
 
     Reads ``("diffusion", "cond")`` f32 [*B, To, D], writes ``("diffusion", "prune_mask")`` bool [*B, K, 3L].
     A subclass writes :meth:`masks`; one that reads more keys also overrides :meth:`options`, and one that was made for
@@ -123,7 +123,7 @@ class Planner(TensorDictModuleBase):
         return self._spec
 
     def bind(self, spec: PlanSpec) -> None:
-        """Prepare to serve ``spec``; a policy calls it when it is given the planner or another sampler.
+        """Prepare the planner for ``spec``; a policy calls it on assignment of the planner or of another sampler.
 
         Raises:
             InputError: if the planner was made for another, or its ``reuse`` is no rule; it then stays as it was.
@@ -139,7 +139,7 @@ class Planner(TensorDictModuleBase):
 
     @property
     def fingerprint(self) -> str:
-        """A name of what decides the masks: two planners of one class and one fingerprint decide alike."""
+        """A hash of what determines the masks: planners of one class with one fingerprint write equal masks."""
         return tensors_fingerprint(self.state_dict())
 
     def masks(self, cond: Tensor) -> Tensor:
@@ -147,11 +147,11 @@ class Planner(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must define masks(cond)")
 
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
-        """Return further arguments of :meth:`masks`, each with the batch dimensions flattened into ``rows``."""
+        """Return further arguments of :meth:`masks`, each with the batch dimensions flattened to ``rows``."""
         return {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the mask of every observation; the engine validates what it says.
+        """Write the mask of every observation; the engine validates it.
 
         Raises:
             RuntimeError: if the planner is not bound.
@@ -173,7 +173,7 @@ class Planner(TensorDictModuleBase):
 
 
 def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
-    """Return sixteen hexadecimal digits that name the values of named tensors."""
+    """Return sixteen hexadecimal digits that identify the values of named tensors."""
     digest = hashlib.sha256()
     for name, value in sorted(tensors.items()):
         digest.update(name.encode())
@@ -182,7 +182,7 @@ def tensors_fingerprint(tensors: Mapping[str, Tensor]) -> str:
 
 
 class StaticPlanner(Planner):
-    """Base of the planners whose mask does not depend on the observation; a subclass writes :meth:`mask`."""
+    """Base of planners whose mask does not depend on the observation; subclasses define :meth:`mask`."""
 
     is_static = True
 
@@ -192,7 +192,7 @@ class StaticPlanner(Planner):
         self.register_buffer("_mask", None, persistent=False)
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """Return the mask bool [K, 3L] of every policy call for ``spec``, row 0 all False.
+        """Return the mask bool [K, 3L] of all policy calls for ``spec``, row 0 all False.
 
         Raises:
             InputError: if the planner cannot serve ``spec``.
@@ -214,17 +214,17 @@ class StaticPlanner(Planner):
 
     @property
     def fingerprint(self) -> str:
-        """A name of the bound mask."""
+        """A hash of the bound mask."""
         return tensors_fingerprint({"mask": self.mask(self.spec)})
 
     def masks(self, cond: Tensor) -> Tensor:
-        """Return the mask, once per row of ``cond``."""
+        """Return the mask, repeated for each row of ``cond``."""
         # A copy per row: an expanded view in the TensorDict would break whoever writes to one row in place.
         return self._mask.to(cond.device).repeat(len(cond), 1, 1)
 
 
 class Dense(StaticPlanner):
-    """Prunes nothing: the unmodified policy, through the same code path as every method.
+    """Planner that prunes nothing: the unmodified policy, through the same code path as every method.
 
     Examples:
         >>> Dense().mask(PlanSpec(num_inference_steps=100, num_layers=8, policy="any")).any().item()
@@ -232,5 +232,5 @@ class Dense(StaticPlanner):
     """
 
     def mask(self, spec: PlanSpec) -> Tensor:
-        """Return a mask that is all False, [K, 3L]."""
+        """Return an all-False mask, [K, 3L]."""
         return torch.zeros(spec.num_inference_steps, spec.num_blocks, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Planners from files: each file says in its ``format`` what it holds, and one table says which class reads that.
+"""Planners from files: each file's ``format`` names its content, and one table maps formats to classes.
 
 A planner of one's own that is kept in a file writes JSON with a ``format`` of its own and adds a line::
 
@@ -64,7 +64,7 @@ def load_planner(path: str | os.PathLike, spec: PlanSpec | None = None) -> Plann
 
 
 def saved_planners(folder: str | os.PathLike) -> list[str]:
-    """Return the names of the planners in a folder, sorted: ``NAME.json`` or ``NAME/`` of a format in :data:`PLANNERS`.
+    """Return the names of the planners in a folder, sorted: ``NAME.json`` or ``NAME/`` with a format in :data:`PLANNERS`.
 
     >>> saved_planners("assets/lift")[4:]
     ['bac_unified', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched']
@@ -84,7 +84,7 @@ def _format(file: Path) -> str | None:
 
 
 def save_beside(planner: Planner, folder: Path) -> Literal["plan.json", "plan"] | None:
-    """Write a bound planner into its policy's folder and return its name there, which `load_planner` reads; None for dense.
+    """Write a bound planner into its policy's folder and return its name there, for `load_planner`; None for dense.
 
     A learned planner is the folder ``plan``. One that prunes the same blocks always is ``plan.json``: a cache schedule,
     unless its class is in :data:`PLANNERS`.

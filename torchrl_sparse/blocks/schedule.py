@@ -1,5 +1,4 @@
-"""Cache schedules: a mask that does not depend on the observation, kept as a small JSON file that people can
-read.
+"""Cache schedules: masks that do not depend on the observation, stored as small human-readable JSON files.
 
 ::
 
@@ -90,7 +89,7 @@ class _ScheduleFile:
 
 @dataclass(frozen=True)
 class CacheSchedule:
-    """Blocks that are computed at each denoising step, and the policy for which that was decided.
+    """Blocks to compute at each denoising step, and the policy for which they were chosen.
 
     Attributes:
         method: name of the method that made it, e.g. ``"bac"``.
@@ -149,7 +148,7 @@ class CacheSchedule:
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
     ) -> CacheSchedule:
-        """Make the schedule of a mask bool [K, 3L].
+        """Build the schedule of a mask bool [K, 3L].
 
         Raises:
             InputError: if ``mask`` is no prune mask.
@@ -163,7 +162,7 @@ class CacheSchedule:
 
     @property
     def spec(self) -> PlanSpec:
-        """The policy and the sampler that it was made for."""
+        """The policy and the sampler that the schedule was made for."""
         return PlanSpec(self.num_inference_steps, self.num_layers, self.policy, self.sampler)
 
     def mask(self) -> Tensor:
@@ -171,7 +170,7 @@ class CacheSchedule:
         return mask_from_steps(self.computed_steps, self.num_inference_steps)
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
-        """Write the file under a temporary name and move it into place: no reader ever sees half of it.
+        """Write the file atomically: no reader ever sees half of it.
 
         Raises:
             TypeError: if ``settings`` holds something that JSON cannot.
@@ -182,7 +181,7 @@ class CacheSchedule:
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> CacheSchedule:
-        """Read and check a file; nothing in it is executed.
+        """Read and check a schedule file; nothing in it is executed.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -215,7 +214,7 @@ class CacheSchedule:
 
 
 class SchedulePlanner(StaticPlanner):
-    """Writes the mask of a schedule for every observation; serves only the policy that it was made for.
+    """Planner that writes the mask of a schedule for every observation; serves only the policy that it was made for.
 
     Args:
         schedule: the schedule.
@@ -234,11 +233,11 @@ class SchedulePlanner(StaticPlanner):
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> SchedulePlanner:
-        """Read a schedule's file; errors are those of :meth:`CacheSchedule.from_pretrained`."""
+        """Read a schedule file; errors are those of :meth:`CacheSchedule.from_pretrained`."""
         return cls(CacheSchedule.from_pretrained(path))
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
-        """Write the schedule's file, see :meth:`CacheSchedule.save_pretrained`."""
+        """Write the schedule file, see :meth:`CacheSchedule.save_pretrained`."""
         self.schedule.save_pretrained(path)
 
     def mask(self, spec: PlanSpec) -> Tensor:

@@ -33,7 +33,7 @@ def uniform_mask(num_steps: int, num_blocks: int, interval: int, *, last: bool =
 
 
 class Uniform(StaticPlanner):
-    """Writes the same uniform mask for every observation.
+    """Planner that writes the same uniform mask for every observation.
 
     Args:
         interval: denoising steps from one update to the next, >= 1 (1 is dense).

@@ -1,4 +1,4 @@
-"""The beginning of every recipe: its options checked, its output its own, its errors one line."""
+"""Common start-up of every recipe: checked options, a locked output folder, and one-line errors."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""The command ``torchrl-sparse``: every recipe from any folder, and what a report of a fault should tell of an installation.
+"""The command ``torchrl-sparse``: runs every recipe from any folder, and describes the installation for bug reports.
 
 ::
 
@@ -51,7 +51,7 @@ _REPORTED = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0, or 2 for a name that is no recipe.
+    """Run the command and return its exit status: 0, or 2 for an unknown recipe.
 
     >>> main(["nope"])
     2

@@ -1,4 +1,4 @@
-"""The values that the options of all recipes may have. A word has one meaning in all of them, so this is one table.
+"""The table of values that recipe options accept; an option name means the same in every recipe.
 
 A recipe's yaml has the defaults and says what each option does. Whether there is a task of a name is checked where it is used.
 """
@@ -233,7 +233,7 @@ OmegaConf.register_new_resolver(
 
 
 def check_options(recipe: str, options: Mapping[str, Any], table: Mapping[str, Any] = OPTIONS) -> None:
-    """Raise InputError, ``key: expected …, got …``, for the first option that is not as `OPTIONS` says.
+    """Raise InputError, ``key: expected …, got …``, for the first option that violates `OPTIONS`.
 
     Args:
         recipe: name of the recipe.
@@ -266,7 +266,7 @@ def _lookup(recipe: str, key: str, table: Mapping[str, Any]) -> Any:
 
 
 def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> None:
-    """Raise InputError if a benchmark's ``methods`` or ``videos`` name what is none, or its ``pairs`` what it does not measure.
+    """Raise InputError for unknown names in a benchmark's ``methods`` or ``videos``, or unmeasured ones in its ``pairs``.
 
     Args:
         options: of the benchmark.
@@ -292,7 +292,7 @@ def check_names(options: Mapping[str, Any], check: Callable[[str], None]) -> Non
 
 
 def given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that are not left open.
+    """Return the options that are set, that is, not None.
 
     >>> given({"size": None, "rank": 16})
     {'rank': 16}

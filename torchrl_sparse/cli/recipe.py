@@ -1,4 +1,4 @@
-"""The entry of every recipe: Hydra reads its options, which are checked; its output is locked; its errors are one line."""
+"""Decorator of every recipe: Hydra reads the options, which are checked; the output is locked; errors take one line."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def recipe(
     options: Mapping[str, Any] | None = None,
     positional: str | None = None,
 ) -> Callable:
-    """Make a function of its options a recipe: a program whose options are those in ``name.yaml`` beside its file.
+    """Turn a function of options into a program whose options are listed in ``name.yaml`` beside its file.
 
     A mistake (`ValueError`, `OSError`, `ImportError`, or one that Hydra finds) or `RunFailed` ends it with exit code 2 and one
     line on stderr; the environment variable ``HYDRA_FULL_ERROR=1`` shows the whole traceback instead. All options are checked
@@ -75,7 +75,7 @@ def recipe(
 
 
 def benchmark_command(task: str, policy: str, planners: str | Path, methods: Sequence[str]) -> str:
-    """Return the command that compares what was just made with dense.
+    """Return the command that compares the new policy or planner with dense.
 
     >>> benchmark_command("lift", "runs/lift/policy", "runs/sag", ["pruner"])
     'next: torchrl-sparse benchmark task=lift policy=runs/lift/policy planners=runs/sag methods=[dense,pruner]'
@@ -85,7 +85,7 @@ def benchmark_command(task: str, policy: str, planners: str | Path, methods: Seq
 
 
 def check_command(program: Path, words: Sequence[str]) -> None:
-    """Read and check the options of another recipe's command line as that recipe would, without running it.
+    """Read and check another recipe's command line as that recipe would, without running it.
 
     Args:
         program: path of the recipe; a program without a yaml of options beside it is none, and nothing is checked.
@@ -106,7 +106,7 @@ def check_command(program: Path, words: Sequence[str]) -> None:
 
 
 def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: str) -> None:
-    """Raise InputError for the first of the options ``names`` that is given though nothing would read it.
+    """Raise InputError for the first of the options ``names`` that is set although nothing would read it.
 
     Args:
         config: of a recipe.

@@ -1,4 +1,4 @@
-"""An ordinary wandb sweep file: what of it is honoured, and the command line that a trial's parameters make."""
+"""Wandb sweep files: the supported subset, and the command line of each trial."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DEFAULT_COMMAND = (
 
 
 def read_sweep(path: str | os.PathLike) -> dict[str, Any]:
-    """Read an ordinary sweep yaml and check it against wandb's own schema.
+    """Read a wandb sweep YAML and check it against wandb's own schema.
 
     A file without ``command`` gets `DEFAULT_COMMAND`.
 
@@ -95,7 +95,7 @@ def _check_parameters(path: str | os.PathLike, parameters: Mapping[str, Any]) ->
 
 
 def parameter_values(name: str, entry: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the options that a parameter sets, with each value that the file names; a distribution names none.
+    """Yield the options that a parameter sets, with each value listed in the file; a distribution lists none.
 
     >>> list(parameter_values("sampler", {"parameters": {"kind": {"values": ["ddim", "ddpm"]}}}))
     [('sampler.kind', 'ddim'), ('sampler.kind', 'ddpm')]
@@ -141,7 +141,7 @@ def _check_command(path: str | os.PathLike, config: dict[str, Any]) -> None:
 
 
 def parameter_sets(config: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the parameters that trials may have: all of a grid; else each value, or end of a range, beside others' first.
+    """Yield parameters of possible trials: the full grid, or each value or range end with the others at their first.
 
     Args:
         config: a sweep, see `read_sweep`.
@@ -197,7 +197,7 @@ def trial_command(config: Mapping[str, Any], parameters: Mapping[str, Any]) -> l
 
 
 def hydra_word(value: Any) -> str:
-    """Write a parameter as Hydra reads it on a command line.
+    """Format a parameter as a Hydra command-line word.
 
     A text is read as the text that it is, but for one that is a list or a mapping in brackets, as W&B's users write these.
 
@@ -239,7 +239,7 @@ def _quoted(text: str) -> str:
 
 
 def find_program(name: str) -> Path:
-    """Return the path of a sweep's program: from here or, for ours, where the recipes lie, so that any folder will do.
+    """Return the path of a sweep's program, looked up in the current folder, the package, and the folder beside it.
 
     >>> find_program("recipes/benchmark.py").name
     'benchmark.py'
@@ -251,7 +251,7 @@ def find_program(name: str) -> Path:
 
 
 def sweep_engine() -> Any:
-    """Return wandb's own engine, the package ``sweeps``."""
+    """Return wandb's own sweep engine, the package ``sweeps``."""
     try:
         import sweeps
         import sweeps.config.cfg

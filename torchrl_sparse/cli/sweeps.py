@@ -1,4 +1,4 @@
-"""A wandb sweep without a server: wandb's own engine chooses, this keeps what it chose and what came of it."""
+"""Wandb sweeps without a server: wandb's own engine chooses trials, and this module stores trials and results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial: the id of its wandb run, which also names its folder, its parameters, and whether it is through."""
+    """One trial: the id of its wandb run, which also names its folder; its parameters; and whether it has finished."""
 
     id: str
     parameters: dict[str, Any]
@@ -41,7 +41,7 @@ class Trial:
 
     @property
     def label(self) -> str:
-        """Its parameters in words."""
+        """The trial's parameters as text."""
         return " ".join(f"{name}={value}" for name, value in self.parameters.items())
 
 
@@ -55,14 +55,14 @@ class SavedSweep:
 
 @dataclass(frozen=True)
 class ServedSweep:
-    """The content of a ``sweep.json`` of a sweep on W&B's server: the id that it has there, and what it was made for."""
+    """The content of the ``sweep.json`` of a sweep on W&B's server: its id there, and the settings that it was made for."""
 
     sweep_id: str
     made_for: dict[str, Any]
 
 
 class LocalSweep:
-    """The trials of a sweep in a folder. Chosen parameters are on disk before their trial begins, so a kill loses none.
+    """The trials of a sweep in a folder. Parameters are on disk before their trial begins, so a kill loses none.
 
     Args:
         config: the sweep.
@@ -94,11 +94,11 @@ class LocalSweep:
         return self.out / "sweep.json"
 
     def results_file(self, trial: Trial) -> Path:
-        """Return the path at which a trial's results are once it is finished."""
+        """Return the path of a trial's results, which exists once the trial has finished."""
         return self.out / trial.id / "results.json"
 
     def next_trial(self) -> Trial | None:
-        """Return the trial to run now: one that was killed, or a new one that the engine chooses; None at the end."""
+        """Return the next trial: an interrupted one, or a new one from the engine; None at the end."""
         for trial in self.trials:
             if not trial.finished:
                 return trial
@@ -113,7 +113,7 @@ class LocalSweep:
         return self.trials[-1]
 
     def finish(self, trial: Trial) -> None:
-        """Note that a trial is through.
+        """Mark a trial as finished.
 
         Raises:
             FileNotFoundError: if it left no results.
@@ -124,7 +124,7 @@ class LocalSweep:
         self._save()
 
     def results(self) -> list[tuple[Trial, Results]]:
-        """Return the finished trials and what they found, in the order in which they were chosen."""
+        """Return the finished trials and their results, in the order in which they were chosen."""
         return [(trial, load_results(self.results_file(trial))) for trial in self.trials if trial.finished]
 
     def _save(self) -> None:
@@ -145,7 +145,7 @@ class LocalSweep:
 
 
 def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
-    """Run a trial to its end, as one offline run of wandb.
+    """Run a trial to its end as one offline wandb run.
 
     Raises:
         RunFailed: if its command fails.
@@ -164,7 +164,7 @@ def run_trial(sweep: LocalSweep, trial: Trial, lock: int) -> None:
 
 
 def write_trials(trials: Sequence[tuple[Trial, Results]], path: str | os.PathLike) -> None:
-    """Write one line of CSV per trial: its parameters, the numbers of what it tested, and the id of its run."""
+    """Write a CSV file with one line per trial: parameters, results of the tested method, and run id."""
     rows = [{**trial.parameters, **_tested(results), "run": trial.id} for trial, results in trials]
     with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -179,7 +179,7 @@ def _tested(results: Results) -> dict[str, float]:
 
 
 def merge_trials(trials: Sequence[tuple[Trial, Results]]) -> Results:
-    """Merge a sweep: dense, and what each trial tested, by its name or, where trials share that, by label.
+    """Merge a sweep's results: dense, and each trial's tested method under its name, or its label if names repeat.
 
     Latencies come from the trials' own processes, each with its own dense for ``speedup_vs_dense``; the dense entry
     is the first trial's.

@@ -1,4 +1,4 @@
-"""A sweep's trials as their recipes will read them, before the first one runs."""
+"""Checks of a sweep's trials by their recipes' own rules, before the first one runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["check_served", "check_trials"]
 
 
 def check_trials(file: Path, settings: Mapping[str, Any]) -> None:
-    """Read every trial's command line as its recipe will, before the first one runs.
+    """Check every trial's command line as its recipe will, before the first one runs.
 
     Raises:
         InputError: naming file, trial and option.
@@ -43,7 +43,7 @@ def _check_trials(file: Path, settings: Mapping[str, Any], program: Path) -> Non
 
 
 def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
-    """Refuse what W&B's own agent hands to a trial in words that Hydra does not read, or to another project."""
+    """Refuse parameters that W&B's own agent would pass in a form that Hydra cannot read, or to another project."""
     for name, entry in settings["parameters"].items():
         for option, value in parameter_values(name, entry):
             if option != name or _agent_changes(value):

@@ -1,4 +1,4 @@
-"""The options with which recipes load a vision-language-action policy."""
+"""Options with which recipes load a vision-language-action policy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ _UNSAID = ("cameras", "heads", "chunk_size", "normalization", "center_crop")
 
 
 def is_vla(path: str | Path) -> bool:
-    """Tell a vision-language-action policy, ours or a published one, by its ``config.json``; not whether it is complete.
+    """Tell whether a folder's ``config.json`` is of a vision-language-action policy, ours or published; other files are not
+    checked.
 
     >>> is_vla("assets/vla"), is_vla("assets/lift")
     (True, False)
@@ -30,7 +31,7 @@ def is_vla(path: str | Path) -> bool:
 
 
 def load_vla(config: DictConfig, data_set: str | None) -> VLAPolicy:
-    """Load the folder ``config.policy``, with those options that the files of a published one do not say.
+    """Load the folder ``config.policy``, taking from the options what a published checkpoint's files leave open.
 
     Args:
         config: of a recipe. ``published`` holds arguments of `VLAPolicy.from_openvla_oft`; null ones are the published values.

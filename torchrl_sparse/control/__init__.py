@@ -1,4 +1,4 @@
-"""Between a policy and an environment: when to call it, and which action of a chunk to play."""
+"""Controllers between policy and environment: when to call the policy, and which action of a chunk to execute."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Fine or coarse: how much a motion needs to see, read off the hand's speed.
+"""Action-aware control: fine or coarse mode, chosen from the hand's speed.
 
 The action-aware controller of SpecPrune-VLA (arXiv:2509.05614, Eqs. 11 and 12): while the hand moves slowly and not upwards, as
 when it closes in on an object, the policy keeps more; in between it is pruned harder. The printed rule switches at a
@@ -28,7 +28,7 @@ _DELTA_DIM = 7  # three of translation, three of rotation, the gripper
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds at which fine mode is entered and left, in m/s and rad/s for measured velocity, in action units for commands.
+    """Thresholds for entering and leaving fine mode: m/s and rad/s for measured velocity, action units for commands.
 
     Attributes:
         translation, rotation: a hand slower than both, and not rising, enters fine mode.
@@ -60,7 +60,7 @@ class Thresholds:
         return slow & (twist[..., 2] <= 0)
 
     def leaves(self, twist: Tensor, used_up: Tensor) -> Tensor:
-        """Tell, bool [...], whether a motion [..., 6] leaves it; here it is no matter whether the chunk is used up."""
+        """Tell, bool [...], whether a motion [..., 6] leaves fine mode; ``used_up`` is ignored."""
         fast = (translation_speed(twist) > self.leave_translation) | (
             rotation_speed(twist) > self.leave_rotation
         )
@@ -69,7 +69,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class ReleaseThresholds:
-    """The rule of the authors' release, for normalised delta actions, of which the last one served is read.
+    """Rule of the authors' release for normalised delta actions; it reads the last executed action.
 
     Entering takes a slow translation, whatever the rotation and the rise, *or* a motion that is slow in the plane, does not
     rise fast and turns slowly. A rise leaves, and so does a fast rotation in the last action of a chunk. So a motion may enter
@@ -96,7 +96,9 @@ class ReleaseThresholds:
         return (translation_speed(twist) < self.speed) | calm
 
     def leaves(self, twist: Tensor, used_up: Tensor) -> Tensor:
-        """Tell, bool [..., arms], whether a motion [..., arms, 6] leaves it; ``used_up``, bool [..., 1]: a chunk is."""
+        """Tell, bool [..., arms], whether a motion [..., arms, 6] leaves fine mode; ``used_up``, bool [..., 1]: at a chunk's
+        end.
+        """
         turning = rotation_speed(twist) > self.leave_rotation
         return (twist[..., 2] > self.leave_rise) | (turning & used_up)
 
@@ -109,12 +111,12 @@ COMMANDED = ReleaseThresholds()
 
 
 def translation_speed(twist: Tensor) -> Tensor:
-    """Return Eq. 11: the norm [...] of the first three numbers of ``twist`` [..., 6]."""
+    """Return the norm [...] of the first three numbers of ``twist`` [..., 6] (Eq. 11)."""
     return torch.linalg.vector_norm(twist[..., :3], dim=-1)
 
 
 def rotation_speed(twist: Tensor) -> Tensor:
-    """Return Eq. 12: the norm [...] of the last three numbers of ``twist`` [..., 6]."""
+    """Return the norm [...] of the last three numbers of ``twist`` [..., 6] (Eq. 12)."""
     return torch.linalg.vector_norm(twist[..., 3:], dim=-1)
 
 
@@ -124,7 +126,7 @@ def fine_mode(
     thresholds: Thresholds | ReleaseThresholds,
     used_up: Tensor | None = None,
 ) -> Tensor:
-    """Decide whether the next action is a fine one, bool [*B, 1].
+    """Decide whether the next action is in fine mode, bool [*B, 1].
 
     Args:
         twist: [*B, arms, 6] translation and rotation of each arm. One slow arm enters; it takes all of them to leave.
@@ -145,8 +147,8 @@ def fine_mode(
 
 @dataclass(frozen=True)
 class ControllerOptions:
-    """What of a controller a recipe's options set: see `ActionAwareController`, whose ``on`` is ``motion`` here, as YAML takes
-    that word for a truth value.
+    """Recipe options of an `ActionAwareController`; its ``on`` is named ``motion``, since YAML reads ``on`` as a
+    truth value.
     """
 
     motion: Literal["measured", "commanded"] = "measured"
@@ -158,7 +160,7 @@ class ControllerOptions:
 
 
 class ActionAwareController(TensorDictModuleBase):
-    """Switches each sample between coarse and fine, grants the budget of that mode, and re-plans on entering fine.
+    """Controller that switches each sample between coarse and fine, sets that mode's budget, and replans on entering fine.
 
     The controller of a `ChunkExecutor`: it runs at every step and writes ``("control", "fine")``, the budget, and
     ``("control", "replan")``, which is True where fine mode begins, so that what is left of a chunk that was planned coarsely
@@ -218,7 +220,7 @@ class ActionAwareController(TensorDictModuleBase):
         self._budget_key = budget_key
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        """Return the spec of the keys carried for one environment, see :mod:`torchrl_sparse.carried`."""
         return {keys.FINE: FLAG, keys.CONTROL_STEP: COUNT}
 
     @torch.no_grad()
@@ -247,7 +249,7 @@ class ActionAwareController(TensorDictModuleBase):
 
     @classmethod
     def from_options(cls, **options: Any) -> ActionAwareController:
-        """Make a controller from plain values, as a recipe's section ``controller`` has them; see `ControllerOptions`.
+        """Build a controller from plain values, as in a recipe's section ``controller``; see `ControllerOptions`.
 
         Raises:
             InputError: ``controller: key: expected …, got …``.

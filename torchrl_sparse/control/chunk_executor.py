@@ -1,4 +1,4 @@
-"""Receding-horizon execution: ask the policy for a chunk, serve its actions one by one, ask again."""
+"""Receding-horizon execution: call the policy for a chunk, execute its actions one by one, call again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _HANDED_OVER = (keys.LAST_CHUNK, keys.ELAPSED, keys.DELAY)
 
 
 class ChunkExecutor(TensorKeys, TensorDictModuleBase):
-    """Serves the actions of a policy's chunks, one environment step after the other, for each sample of a batch on its own.
+    """Actor that executes a policy's chunks one action per environment step, independently for each sample of a batch.
 
     A sample asks the policy when its episode begins (``"is_init"``), when ``n_action_steps`` of its chunk are used up, or
     when the controller asks (``("control", "replan")``, see `ActionAwareController`). Only samples that are due are handed to
@@ -126,7 +126,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         return tensordict.set(self.tensor_keys["action"], self._serve(tensordict, age))
 
     def make_tensordict_primer(self, chunk_shape: tuple[int, int] | None = None) -> TensorDictPrimer:
-        """Return the transform that gives all that this actor carries from step to step its place in an environment's spec.
+        """Return the transform that adds all keys carried by this actor to an environment's spec.
 
         Collectors find and append it by themselves with ``auto_register_policy_transforms=True``.
 
@@ -145,7 +145,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         return make_primer(carried_entries(self, None if shape is None else Entry(tuple(shape))))
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what the executor itself carries, see :mod:`torchrl_sparse.carried`."""
+        """Return the spec of the executor's own carried keys, see :mod:`torchrl_sparse.carried`."""
         age = COUNT._replace(begin=-1)
         return {keys.AGE: age, keys.QUERIED: FLAG, **({} if chunk is None else {keys.CHUNK: chunk})}
 
@@ -166,7 +166,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         refuse(keys.AGE, going_on & ~asked & (age == 0))
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin an episode of `act`: the next observation is its first.
+        """Start a new episode of `act`: the next observation is its first.
 
         Args:
             seed: of the noise, the same as in an environment's episode of this seed; None for torch's global generator.
@@ -177,7 +177,7 @@ class ChunkExecutor(TensorKeys, TensorDictModuleBase):
         self._plain = PlainLoop(self, seed)
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the action f32 [A] of this step of a plain loop, for one robot.
+        """Return the action f32 [A] of the current step of a plain loop, for one robot.
 
         Args:
             observation: ``"state"``, numbers [Ds] of any real dtype, laid out and in the version of robosuite that

@@ -1,4 +1,4 @@
-"""What a plain robot loop hands to an executor, and gets back: numpy arrays, checked by name, without TorchRL around them."""
+"""Adapter from a plain robot loop to an executor: numpy arrays in and out, checked by name, without TorchRL around them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["PlainLoop"]
 
 
 class PlainLoop:
-    """One robot's episode under an executor: keeps its history and what a call left, as an environment and a collector would.
+    """Episode of one robot under an executor; keeps history and carried keys, as an environment and a collector would.
 
     Args:
         executor: a `ChunkExecutor`, whose policy has ``n_obs_steps`` and a ``normalizer``, as a `DiffusionPolicy` has.
@@ -41,7 +41,7 @@ class PlainLoop:
         self._carried: TensorDictBase = TensorDict()
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the action of this step; see `ChunkExecutor.act`."""
+        """Return the action of the current step; see `ChunkExecutor.act`."""
         if observation.keys() != self._past.keys() | self._now:
             expected, got = sorted(self._past.keys() | self._now), sorted(observation)
             raise InputError(

@@ -1,4 +1,4 @@
-"""The policy calls of episodes: recorded once, so that any policy can be asked the same."""
+"""Recorded policy calls of episodes, to compare policies on the same inputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["answer", "in_turn", "record_queries"]
 def record_queries(
     actor: ChunkExecutor, make_env: Callable[..., EnvBase], seeds: Sequence[int]
 ) -> TensorDictBase:
-    """Record every policy call of one episode per seed: [number of calls], with what the policy read and what it answered.
+    """Record the inputs and outputs of every policy call in one episode per seed: [number of calls].
 
     The calls are where the policy is; the environment is where it is made.
 
@@ -50,7 +50,7 @@ def _queries(steps: TensorDictBase) -> TensorDictBase:
 
 @torch.no_grad()
 def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictBase:
-    """Ask ``policy`` recorded queries: the same observations and noise, whatever was answered; ``queries`` stay as they are.
+    """Run ``policy`` on recorded policy calls, with the same observations and noise; ``queries`` is not modified.
 
     All [N] at once, or in turn if it has to remember what it was asked before, see `in_turn`; a single one [] as the first.
     """
@@ -60,7 +60,7 @@ def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictB
 
 
 def in_turn(policy: TensorDictModuleBase, queries: Iterable[TensorDictBase]) -> Iterator[TensorDictBase]:
-    """Yield what ``policy`` reads of one recorded policy call after the other, in TensorDicts of their own.
+    """Yield the inputs of ``policy`` for one recorded policy call after another, each in a TensorDict of its own.
 
     What it leaves to its own next call, such as scores of visual tokens, was not recorded of another policy. It is taken
     from the TensorDict that was yielded before, which the policy has to have answered in place by then.

@@ -1,4 +1,4 @@
-"""Execution in a world that does not wait: while the policy computes, the old chunk plays on.
+"""Execution under inference delay: while the policy computes, the old chunk is executed further.
 
 A policy call takes ``latency`` seconds, in which the environment makes ``ceil(latency * control_freq)`` steps. The answer is
 for the step at which it was asked for; once it is there, its actions for the steps that are past are skipped. Others call this
@@ -26,7 +26,7 @@ from torchrl_sparse.rotations import quaternion_to_rot6d
 
 
 class RealtimeExecutor(ChunkExecutor):
-    """A `ChunkExecutor` whose answers come as late as the policy is slow.
+    """`ChunkExecutor` whose new chunks arrive with the policy's inference delay.
 
     A sample asks the policy every ``n_action_steps`` steps, or as soon as the last answer has come if that takes longer.
     Until the new answer is there the old chunk plays on, and where a chunk has come to its end its last action is held, which
@@ -138,7 +138,7 @@ class RealtimeExecutor(ChunkExecutor):
 
 
 class HoldPose(TensorDictModuleBase):
-    """Writes the absolute action, [*B, 10 * arms], that keeps the hands where they are, fingers opened.
+    """Module that writes the absolute action, [*B, 10 * arms], that holds the hands in place with open fingers.
 
     Args:
         pose_slices: where position and quaternion (xyzw) of each arm lie in ``("observation", "state")``; of a robosuite task,
@@ -171,7 +171,7 @@ class HoldPose(TensorDictModuleBase):
 
 
 def delay_steps(latency: Tensor, control_freq: float = 20.0) -> Tensor:
-    """Return the steps, i64, that the environment makes in ``latency`` seconds; an answer that misses one waits for the next.
+    """Return the inference delay in environment steps, i64: ``latency`` seconds, rounded up to whole steps.
 
     >>> delay_steps(torch.tensor([0.0, 0.001, 0.05, 0.051])).tolist()
     [0, 1, 1, 2]

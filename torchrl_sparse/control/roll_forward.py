@@ -1,4 +1,4 @@
-"""A policy that is shown the state in which its answer will begin.
+"""Delay compensation: a policy that observes a prediction of the state in which its chunk will start.
 
 In a world that does not wait, an answer begins d steps after it was asked for, and what is played until then is known: the rest
 of the old chunk. VLASH (arXiv:2512.01031) therefore shows the policy its robot's state rolled forward through those actions, so
@@ -33,7 +33,7 @@ _SMALLEST_DEVIATION = 1e-6  # a number that does not vary predicts nothing
 
 
 class StateModel(nn.Module):
-    """A linear model of one environment step, fitted by ridge regression.
+    """Linear model of one environment step, fitted by ridge regression.
 
     Args:
         weight: f64 [2 Ds + A + 1, Ds]: what the state, its last change, the action and 1 add to the state.
@@ -72,11 +72,11 @@ class StateModel(nn.Module):
         return cls(torch.linalg.solve(inputs.T @ inputs + ridge, inputs.T @ change) / scale[:, None])
 
     def forward(self, before: Tensor, now: Tensor, action: Tensor) -> Tensor:
-        """Return the next state [*B, Ds] of states ``before`` and ``now`` [*B, Ds] and the action [*B, A] taken now."""
+        """Return the next state [*B, Ds], from states ``before`` and ``now`` [*B, Ds] and the action [*B, A] taken now."""
         return now + (_inputs(before, now, action) @ self.weight).to(now)
 
     def errors(self, episodes: Iterable[tuple[Tensor, Tensor]], steps: int) -> tuple[Tensor, Tensor]:
-        """Return how far off the model is ``steps`` ahead, and how far the state that is not rolled, f32 [Ds] each.
+        """Return the errors ``steps`` ahead of the model's prediction and of the unpredicted state, f32 [Ds] each.
 
         Args:
             episodes: as of `fit`, others than those.
@@ -106,7 +106,7 @@ class StateModel(nn.Module):
 
 
 class RollForward(TensorDictModuleBase):
-    """A policy whose chunks begin when its answer does, see the module.
+    """Policy whose chunk starts where the inference delay ends; see the module.
 
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands
     to a policy that asks for them, and rolls ``("history", "state")`` forward through what plays until the answer is there.
@@ -142,7 +142,7 @@ class RollForward(TensorDictModuleBase):
 
     @property
     def chunk_shape(self) -> tuple[int, int] | None:
-        """(n, A) of a chunk, None if the policy does not say."""
+        """(n, A) of a chunk, None if the policy does not define it."""
         return getattr(self.policy, "chunk_shape", None)
 
     @torch.no_grad()

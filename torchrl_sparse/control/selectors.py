@@ -1,4 +1,4 @@
-"""Which of several chunks to play, when a policy call is asked more than once.
+"""Selection of one chunk among several samples of a policy call.
 
 Bidirectional Decoding (arXiv:2408.17355) samples several chunks and keeps one that agrees with the decision before. Its
 backward coherence is the distance to what the last chunk still has for the same steps, later ones counting less::
@@ -23,7 +23,7 @@ __all__ = ["CoherentChunk", "backward_coherence", "disagreement"]
 
 
 def backward_coherence(candidates: Tensor, last: Tensor, elapsed: Tensor, decay: float) -> Tensor:
-    """Return L_B of every candidate, f32 [B, S]; 0 where there is no last chunk or nothing of it is left.
+    """Return L_B of every candidate, f32 [B, S]; 0 if there is no previous chunk or none of it is left.
 
     Args:
         candidates: chunks f32 [B, S, n, A].
@@ -44,7 +44,7 @@ def backward_coherence(candidates: Tensor, last: Tensor, elapsed: Tensor, decay:
 
 
 def disagreement(candidates: Tensor) -> Tensor:
-    """Return the mean distance of every candidate to the others, f32 [B, S], of chunks f32 [B, S, n, A].
+    """Return the mean distance of every candidate to the others, f32 [B, S], for chunks f32 [B, S, n, A].
 
     >>> disagreement(torch.tensor([[[[0.0]], [[1.0]], [[5.0]]]])).tolist()
     [[3.0, 2.5, 4.5]]
@@ -55,7 +55,7 @@ def disagreement(candidates: Tensor) -> Tensor:
 
 
 class CoherentChunk(TensorDictModuleBase):
-    """Chooses the candidate of the smallest ``backward * L_B + agreement * disagreement``; the first of equal ones.
+    """Selector of the candidate with the smallest ``backward * L_B + agreement * disagreement``; ties go to the first.
 
     Reads ``("control", "candidates")`` f32 [B, S, n, A] and what `ChunkExecutor` hands over of the last chunk; writes
     ``("control", "chosen")`` i64 [B, 1]. Distances are in environment units.

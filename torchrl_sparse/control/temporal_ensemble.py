@@ -1,4 +1,4 @@
-"""A policy whose chunks are averaged with what earlier policy calls predicted for the same steps.
+"""Temporal ensembling: a policy whose chunks are averaged with earlier predictions for the same steps.
 
 ACT (arXiv:2304.13705, temporal ensembling) asks at every step and plays the weighted mean of all predictions for it, the oldest
 with index 0 and the largest weight::
@@ -32,7 +32,7 @@ __all__ = ["TemporalEnsemble"]
 
 
 class TemporalEnsemble(TensorDictModuleBase):
-    """Averages the chunks of a policy over its policy calls, see the module.
+    """Policy whose chunks are averaged over its policy calls; see the module.
 
     Reads ``("control", "last_chunk")`` and ``("control", "elapsed")``, which `ChunkExecutor` hands over, and
     ``("control", "ensembled")``, which it wrote at the call before: the predictions in each action of that chunk. An episode's
@@ -67,11 +67,11 @@ class TemporalEnsemble(TensorDictModuleBase):
 
     @property
     def chunk_shape(self) -> tuple[int, int] | None:
-        """(n, A) of a chunk, None if the policy does not say."""
+        """(n, A) of a chunk, None if the policy does not define it."""
         return getattr(self.policy, "chunk_shape", None)
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        """Return the spec of the keys carried for one environment, see :mod:`torchrl_sparse.carried`."""
         return {} if chunk is None else {keys.ENSEMBLED: Entry(chunk.shape[:1], torch.int64)}
 
     @torch.no_grad()

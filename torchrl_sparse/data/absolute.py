@@ -1,4 +1,4 @@
-"""Published demonstrations as this library's policies need them: absolute actions and present-day observations.
+"""Conversion of published demonstrations to absolute actions and current observations, as this library's policies need them.
 
 Published files of robomimic (arXiv:2108.03298) record normalised deltas. As Diffusion Policy (arXiv:2303.04137) does it, each
 becomes the pose that robosuite's OSC controller makes its goal when the recorded simulator state is set and the recorded
@@ -53,7 +53,7 @@ __all__ = ["AbsoluteActions", "convert_demos"]
 
 
 def convert_demos(path: str | Path, out: str | Path, *, poses: bool = False) -> int:
-    """Copy a robomimic file with absolute actions and with the observations that policies of the task read.
+    """Copy a robomimic file with absolute actions and the observations that policies of the task read.
 
     Images, simulator states, rewards, attributes and filter keys are copied; one demonstration at a time is in memory. A
     killed conversion goes on where it stopped, from ``<out>.parts``; ``out`` appears when it is complete. Calling again
@@ -105,7 +105,7 @@ def convert_demos(path: str | Path, out: str | Path, *, poses: bool = False) -> 
 
 
 class AbsoluteActions:
-    """Turns recorded states and actions into absolute actions and observations, by robosuite itself.
+    """Converter of recorded states and actions to absolute actions and observations, using robosuite itself.
 
     Args:
         control: how the actions were meant.

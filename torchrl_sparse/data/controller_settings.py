@@ -1,4 +1,4 @@
-"""What a demonstration file may say about the robot and controller that recorded it, entry by entry.
+"""Checks of a demonstration file's robot and controller settings, entry by entry.
 
 An entry is honoured, or it has a value under which steps and actions mean what they mean in this library's environments, or it
 cannot change that meaning. Any other is refused by its name. Entries are those of robosuite 1.2 to 1.5, in the form in
@@ -93,7 +93,7 @@ _BODY_PARTS: dict[str, Choice] = dict.fromkeys(
 
 
 def check_entries(where: str, entries: Any, known: Mapping[str, Choice]) -> None:
-    """Raise InputError, beginning with ``where``, for an entry that is not known or has another value than those known.
+    """Raise InputError, starting with ``where``, for an unknown entry or an unsupported value.
 
     >>> check_entries("env_kwargs", {"control_freq": 10}, {"control_freq": (20,)})
     Traceback (most recent call last):
@@ -115,7 +115,7 @@ def check_entries(where: str, entries: Any, known: Mapping[str, Choice]) -> None
 
 
 def check_env_kwargs(where: str, env_kwargs: Any) -> None:
-    """Raise InputError for an entry under which actions or steps mean something else than in this library."""
+    """Raise InputError for an entry that would give actions or steps another meaning than in this library."""
     check_entries(where, env_kwargs, _ENV_KWARGS)
     for name in ("robots", "controller_configs"):
         if name not in env_kwargs:
@@ -123,7 +123,7 @@ def check_env_kwargs(where: str, env_kwargs: Any) -> None:
 
 
 def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
-    """Return the settings of each arm's controller in the terms of robosuite 1.5.
+    """Return the settings of each arm's controller in robosuite 1.5 terms.
 
     Args:
         where: of ``configs``, for messages.
@@ -151,7 +151,7 @@ def arm_settings(where: str, configs: Any, *, is_old: bool) -> dict[str, Any]:
 
 
 def six_numbers(where: str, value: Any) -> tuple[float, ...]:
-    """Return six numbers of a list of them or of one for all."""
+    """Return six numbers, from a list of six or from one number for all."""
     values = value if isinstance(value, list) else [value] * 6
     is_number = all(isinstance(each, (int, float)) and not isinstance(each, bool) for each in values)
     if len(values) != 6 or not is_number or not all(map(math.isfinite, values)):

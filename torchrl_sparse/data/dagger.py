@@ -1,4 +1,4 @@
-"""DAgger for policies that act in chunks: the policy drives, the expert takes over from where that led and finishes.
+"""DAgger for chunked policies: the policy drives, then the expert takes over from the reached state and finishes.
 
 DAgger (arXiv:1011.0686) visits states under the mixture ``beta * expert + (1 - beta) * policy``, drawn at every step, asks the
 expert for one action in each of them, and trains on all. A policy that acts in chunks needs more than that: its target in a
@@ -43,7 +43,7 @@ _TAKE_OVER_STREAM = 2
 
 @dataclass(frozen=True)
 class Driving:
-    """Who drives before the expert does, and for how long.
+    """Settings of the policy that drives before the expert, and for how long.
 
     Attributes:
         policy: folder of a `DiffusionPolicy` that observes states of the task, in whatever convention.
@@ -69,7 +69,7 @@ class Driving:
             raise InputError(f"mixing: expected a probability, got {self.mixing}")
 
     def draw_steps(self, seed: int, longest: int) -> int:
-        """Draw how many steps the policy drives in the episode of a seed, ``longest`` at most.
+        """Draw the number of steps, at most ``longest``, that the policy drives in the episode of a seed.
 
         >>> driving = Driving("assets/lift", "", mixing=0.5)
         >>> [driving.draw_steps(seed, 100) for seed in range(4)]
@@ -82,7 +82,7 @@ class Driving:
 
 
 class Driver:
-    """Drives the first steps of an episode.
+    """Policy that drives the first steps of an episode.
 
     Args:
         driving: decides how many.
@@ -102,7 +102,7 @@ class Driver:
         self._env: Any = None
 
     def begin(self, seed: int, env: Any) -> int:
-        """Begin the episode of a seed; return how many of its steps the policy drives, half of the environment's at most."""
+        """Begin the episode of a seed and return how many steps the policy drives, at most half of the environment's."""
         self._actor.reset(seed)
         self._env = env
         return self._driving.draw_steps(seed, env.horizon // 2)
@@ -118,7 +118,7 @@ class Driver:
 
 @cache
 def load_driver(task: str, driving: Driving) -> Driver:
-    """Load the policy that drives, once in a process.
+    """Load the driving policy, once per process.
 
     Raises:
         FileNotFoundError, InputError: if it cannot be read, is of other weights than ``driving`` says or of another task,

@@ -1,4 +1,4 @@
-"""Demonstrations made by several workers, handed on in the order of their seeds.
+"""Parallel demonstration workers whose results are returned in the order of the seeds.
 
 An expert reads the simulator and not the TensorDict, so these are plain processes, or plain Ray tasks, rather than a TorchRL
 collector.
@@ -30,7 +30,7 @@ _FAILURES = 3
 def in_order(
     task: Callable[[int], object], first: int, workers: int, *, backend: str = "process"
 ) -> Generator[int, None, None]:
-    """Call ``task(first)``, ``task(first + 1)``, ... in workers and yield each number once it is done, in order.
+    """Call ``task(first)``, ``task(first + 1)``, ... in workers and yield each number, in order, once it is done.
 
     A worker that dies, be it while it starts, is reported as a warning; what it and the others had under way is done again.
 

@@ -1,4 +1,4 @@
-"""One scripted demonstration, acted out in an environment and recorded; a policy may drive its first steps."""
+"""Recording of one scripted demonstration in an environment; a policy may drive its first steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OBSERVED = "obs/"
 def demonstrate(
     task: Task, env: EnvBase, seed: int, quality: str = "proficient", driver: Driver | None = None
 ) -> Episode:
-    """Act out one scripted episode, to success or to the environment's horizon.
+    """Play one scripted episode until success or the environment's horizon, and record it.
 
     Args:
         task: what is demonstrated.

@@ -1,4 +1,4 @@
-"""Collecting scripted demonstrations: run experts, keep what succeeded, survive being killed.
+"""Collection of scripted demonstrations: run experts, keep the successes, survive being killed.
 
 The demonstrations are scripted, never human. Episode ``i`` is fixed by ``seed + i`` alone, so a file can be
 made again, and continued after a kill, to the same bytes on the same machine. A policy may drive first, see
@@ -113,7 +113,7 @@ def collect(
     backend: str = "process",
     on_episode: Callable[[Summary], None] | None = None,
 ) -> Summary:
-    """Collect demonstrations into ``path``, resuming where a killed run stopped.
+    """Collect demonstrations into ``path``, resuming an interrupted run.
 
     Every finished episode is first committed to ``<path>.parts``; the file itself appears, complete, at the
     end. Calling again after that only reports or, for more episodes, goes on from those of the file.
@@ -197,7 +197,7 @@ def _worker_env(task: str) -> EnvBase:
 
 
 def read_initial_state(path: str | Path, index: int) -> InitialState:
-    """Read the start of one demonstration: ``env.reset(initial_state=...)`` begins there again.
+    """Read the initial state of one demonstration, for ``env.reset(initial_state=...)``.
 
     Its seed is -1 where the file names none, as those of people do not.
 

@@ -1,4 +1,4 @@
-"""Demonstrations as a policy observes them: every training and calibration on demonstrations reads them here.
+"""Demonstrations read as a given policy observes them, for every training and calibration.
 
 What a policy observes is its contract (`torchrl_sparse.envs.contract`): names and order of the state, the version of robosuite
 whose meaning it has, and the cameras. What a file recorded in another way is translated, or refused. A vision-language-action
@@ -24,7 +24,7 @@ __all__ = ["contract_demos", "instructed_demos", "policy_demos"]
 def policy_demos(
     paths: str | Path | Sequence[str | Path], task: str, policy: DiffusionPolicy, **options: Any
 ) -> Demonstrations:
-    """Read a task's demonstrations with the state and the cameras that ``policy`` was trained on.
+    """Read a task's demonstrations with the state and cameras that ``policy`` was trained on.
 
     Args:
         paths: of an HDF5 file or of several, see `read_demos`.
@@ -47,7 +47,7 @@ def policy_demos(
 def contract_demos(
     paths: str | Path | Sequence[str | Path], contract: Contract, **options: Any
 ) -> Demonstrations:
-    """Read demonstrations under a contract, such as that of a policy that is yet to be trained.
+    """Read demonstrations under an observation contract, such as that of a policy yet to be trained.
 
     Args:
         paths: see `read_demos`.

@@ -1,4 +1,4 @@
-"""Bound what a demonstration file may ask for: what it holds itself, and little if it is small.
+"""Memory limits for reading demonstration files, derived from the size of the file.
 
 HDF5 keeps nothing of a part that was never written, compresses others a thousandfold, follows links into other files and
 repeats a text as often as it is mentioned: a file of a few kilobytes can describe more than any memory holds.
@@ -28,7 +28,7 @@ _HARMLESS = {h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 
 
 class Room:
-    """Counts what is read of a file, and refuses what would be too much.
+    """Budget of bytes that may be read from a file; refuses whatever exceeds it.
 
     Args:
         size: of the file, bytes.
@@ -49,7 +49,7 @@ class Room:
         self._left = small if self._is_small else _UNFOLDED * size
 
     def enter(self, array: Node, itemsize: int = 8) -> Layout:
-        """Count an array, of whose numbers each will take ``itemsize`` bytes, and return how it is kept.
+        """Charge an array at ``itemsize`` bytes per number to the budget and return its storage layout.
 
         Raises:
             InputError: if there is no room for it, or it is not kept as numbers in the file itself.
@@ -71,7 +71,7 @@ class Room:
 
 
 def most_demos(size: int) -> int:
-    """Return how many demonstrations a file of ``size`` bytes can hold; a few more for files that are all but empty."""
+    """Return how many demonstrations a file of ``size`` bytes can hold; a few more for files that are almost empty."""
     return 64 + size // _DEMO
 
 

@@ -1,4 +1,4 @@
-"""Making an HDF5 file: whole or not at all, and with one error when the disk is full."""
+"""Writing of HDF5 files: completely or not at all, with one error when the disk is full."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["new_hdf5"]
 
 @contextmanager
 def new_hdf5(path: str | os.PathLike) -> Iterator[h5py.File]:
-    """Lend an empty HDF5 file that becomes ``path`` when the block ends well, see `atomic_path`.
+    """Lend an empty HDF5 file that becomes ``path`` if the block succeeds, see `atomic_path`.
 
     Raises:
         OSError: if the disk is full, naming the file and its volume.

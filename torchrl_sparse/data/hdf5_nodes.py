@@ -23,7 +23,7 @@ DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError,
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Turn what h5py raises on damaged files into a ValueError of one line that begins with ``where``."""
+    """Turn the errors that h5py raises on damaged files into a one-line ValueError that starts with ``where``."""
     try:
         yield
     except DAMAGE as error:
@@ -32,7 +32,7 @@ def naming(where: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Layout:
-    """How an array is kept.
+    """Storage layout of an array.
 
     Attributes:
         shape: None of one that has no value.
@@ -69,20 +69,20 @@ class Node:
 
     @property
     def is_group(self) -> bool:
-        """True of a group, also of the whole file; else it is an array."""
+        """True for a group or the whole file, False for an array."""
         return isinstance(self._item, h5py.Group)
 
     @property
     def is_array(self) -> bool:
-        """True of an array."""
+        """True for an array."""
         return isinstance(self._item, h5py.Dataset)
 
     def at(self, where: str) -> Node:
-        """Return the same entry, called ``where`` in errors."""
+        """Return the same entry, named ``where`` in errors."""
         return Node(where, self._item)
 
     def file_size(self) -> int:
-        """Return the size of its file, bytes."""
+        """Return the size of the entry's file, bytes."""
         with naming(self.where):
             return self._item.file.id.get_filesize()
 
@@ -116,13 +116,13 @@ class Node:
         return Node(where, item)
 
     def array_names(self) -> list[str]:
-        """Return the names of all arrays in a group and in its groups, sorted."""
+        """Return the names of all arrays in a group and its subgroups, sorted."""
         names: list[str] = []
         self.visit(lambda name, node: names.append(name) if node.is_array else None)
         return sorted(names)
 
     def visit(self, see: Callable[[str, Node], Any]) -> None:
-        """Show all entries of a group and of its groups; an error of ``see`` is passed on."""
+        """Call ``see`` on all entries of a group and its subgroups; its errors are passed on."""
         with naming(self.where):
             found: list[tuple[str, Any]] = []
             self._item.visititems(lambda name, item: found.append((name, item)))
@@ -143,19 +143,19 @@ class Node:
         return found
 
     def copy(self, target: h5py.Group, path: str) -> None:
-        """Copy the entry at ``path``, if there is one, into a group of a file in the making, by the last of its names."""
+        """Copy the entry at ``path``, if it exists, into a group of a new file, under its last name."""
         if (found := self.find(path)) is not None:
             found.copy_to(target, path.rpartition("/")[2])
 
     def copy_to(self, target: h5py.Group, name: str) -> None:
-        """Copy this entry, and all in it, into a group of a file in the making."""
+        """Copy this entry and its content into a group of a new file."""
         with naming(self.where):
             target.file.copy(self._item, target, name=name)
 
     # -- attributes ----------------------------------------------------------------------------------------------------
 
     def count(self, name: str, default: int | None = None) -> int:
-        """Return the attribute ``name``, a whole number.
+        """Return the integer attribute ``name``.
 
         Raises:
             InputError: if it is anything else, or missing without a default.
@@ -174,7 +174,7 @@ class Node:
         return int(self._value(name))
 
     def text(self, name: str) -> str | None:
-        """Return the attribute ``name``, a text; None if there is none.
+        """Return the text attribute ``name``; None if there is none.
 
         Raises:
             InputError: if it is anything else.
@@ -189,7 +189,7 @@ class Node:
         return text.decode(errors="replace") if isinstance(text, (bytes, np.bytes_)) else str(text)
 
     def flag(self, name: str) -> bool:
-        """Return the attribute ``name``, true or false.
+        """Return the boolean attribute ``name``.
 
         Raises:
             InputError: if it is missing or anything else.
@@ -211,7 +211,7 @@ class Node:
         return {name: self._value(name) for name in self.attribute_names()}
 
     def copy_attributes(self, target: h5py.Group) -> None:
-        """Copy all attributes to a group of a file in the making."""
+        """Copy all attributes to a group of a new file."""
         for name, value in self.told().items():
             target.attrs[name] = value
 
@@ -230,7 +230,7 @@ class Node:
     # -- arrays --------------------------------------------------------------------------------------------------------
 
     def layout(self) -> Layout:
-        """Return how an array is kept."""
+        """Return the storage layout of an array."""
         with naming(self.where):
             item = self._item
             is_text = h5py.check_string_dtype(item.dtype) is not None
@@ -239,29 +239,29 @@ class Node:
             )
 
     def read(self, rows: Any = (), dtype: type | None = None) -> np.ndarray:
-        """Return ``rows`` of an array, all of it by default; `torchrl_sparse.data.hdf5_bounds.Room` says whether it may be."""
+        """Return ``rows`` of an array, by default all; `torchrl_sparse.data.hdf5_bounds.Room` limits the size."""
         with naming(self.where):
             return np.asarray(self._item[rows], dtype=dtype)
 
     def read_through(self) -> None:
-        """Read an array a chunk at a time and keep nothing, to learn whether it is whole."""
+        """Read an array chunk by chunk without keeping it, to check that it is intact."""
         with naming(self.where):
             for part in self._item.iter_chunks() if self._item.chunks else [()]:
                 self._item[part]
 
     def read_text(self, row: int) -> str:
-        """Return one of an array of texts."""
+        """Return one element of an array of texts."""
         with naming(self.where):
             return self._item.asstr()[row]
 
     def filters(self) -> list[int]:
-        """Return the numbers of an array's filters, such as compressions."""
+        """Return the ids of an array's filters, such as compressions."""
         with naming(self.where):
             settings = self._item.id.get_create_plist()
             return [settings.get_filter(index)[0] for index in range(settings.get_nfilters())]
 
     def chunks_above(self, size: int) -> list[tuple[int, ...]]:
-        """Return where the chunks begin that take more than ``size`` bytes of the file."""
+        """Return the offsets of the chunks that take more than ``size`` bytes of the file."""
         large: list[tuple[int, ...]] = []
         with naming(self.where):
             self._item.id.chunk_iter(
@@ -270,6 +270,6 @@ class Node:
         return large
 
     def stored_chunk(self, offset: tuple[int, ...]) -> bytes:
-        """Return a chunk as it is kept."""
+        """Return a chunk as stored, filters not undone."""
         with naming(self.where):
             return self._item.id.read_direct_chunk(offset)[1]

@@ -1,4 +1,4 @@
-"""Opening demonstration files in robomimic's HDF5 layout: names, filter keys, arrays, and errors that say where."""
+"""Reader of demonstration files in robomimic's HDF5 layout: names, filter keys, arrays, and errors that say where."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NAME = re.compile(r"demo_[0-9]{1,9}")
 
 @contextmanager
 def open_demos(path: str | Path) -> Iterator[Node]:
-    """Open a demonstration file for reading; lends all of it.
+    """Open a demonstration file for reading and lend its root.
 
     Raises:
         FileNotFoundError: if there is no file.
@@ -46,7 +46,7 @@ def open_demos(path: str | Path) -> Iterator[Node]:
 
 
 def each_path(paths: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    """Return one path, or several, as a list.
+    """Return one path or several as a list.
 
     >>> each_path("data/lift.h5"), each_path(["a.h5", "b.h5"])
     (['data/lift.h5'], ['a.h5', 'b.h5'])
@@ -55,7 +55,7 @@ def each_path(paths: str | Path | Sequence[str | Path]) -> list[str | Path]:
 
 
 def demo_names(file: Node, filter_key: str | None = None) -> list[str]:
-    """Return the names of the demonstrations of an open file, in the order of their numbers.
+    """Return the names of the demonstrations in an open file, in numerical order.
 
     Args:
         file: the file.
@@ -85,7 +85,7 @@ def demo_names(file: Node, filter_key: str | None = None) -> list[str]:
 
 
 def demo_group(file: Node) -> Node:
-    """Return the group of an open file's demonstrations; `open_demo` opens one of them.
+    """Return the group that holds an open file's demonstrations; `open_demo` opens one of them.
 
     Raises:
         InputError: naming the file, if there is none.
@@ -97,7 +97,7 @@ def demo_group(file: Node) -> Node:
 
 
 def open_demo(data: Node, name: str) -> tuple[Node, int]:
-    """Return the demonstration ``name`` of the group of demonstrations and its number of steps, the attribute ``num_samples``.
+    """Return the demonstration ``name`` and its number of steps, the attribute ``num_samples``.
 
     Raises:
         InputError: if the demonstration is damaged or elsewhere, or does not tell.
@@ -107,7 +107,7 @@ def open_demo(data: Node, name: str) -> tuple[Node, int]:
 
 
 class ArrayReader:
-    """Reads arrays of an open file, together no more than its size bears out.
+    """Reader of an open file's arrays, whose total size is limited by the file's size.
 
     Args:
         file: the file, or an entry of it.
@@ -118,7 +118,7 @@ class ArrayReader:
         self._room = Room(file.file_size(), small)
 
     def numbers(self, demo: Node, name: str, length: int) -> np.ndarray:
-        """Return one array f64 [length, n] of a demonstration, all of its numbers finite.
+        """Return one array f64 [length, n] of a demonstration, checked to be finite.
 
         Raises:
             InputError: naming it, if it is missing, damaged, too large or of another shape.

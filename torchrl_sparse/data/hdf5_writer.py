@@ -1,4 +1,4 @@
-"""Writing demonstrations in robomimic's HDF5 layout, one episode at a time and safely.
+"""Writer of demonstrations in robomimic's HDF5 layout, one episode at a time, safe against kills.
 
 ============================  =====================  =========================================================
 in the file                   shape, type            meaning
@@ -62,14 +62,14 @@ class Episode:
 
 
 def write_episode(path: Path, episode: Episode) -> None:
-    """Write one episode as a file of its own. A kill leaves either the whole file or none."""
+    """Write one episode to a file of its own. A kill leaves either the whole file or none."""
     with new_hdf5(path) as file:
         _fill(file.create_group("demo"), episode)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode went: its steps, whether it succeeded, and how many of its first steps a policy drove."""
+    """Result of an episode: its steps, its success, and how many of its first steps a policy drove."""
 
     length: int
     success: bool
@@ -104,7 +104,7 @@ def merge_episodes(
 
 
 def split_episodes(path: Path, part: Callable[[int], Path]) -> None:
-    """Undo `merge_episodes`: write each demonstration as the file ``part(seed)``, unless that is there."""
+    """Undo `merge_episodes`: write each demonstration to the file ``part(seed)``, unless it exists."""
     with open_demos(path) as source:
         for name in (data := demo_group(source)).names():
             demo = data.group(name)
@@ -114,7 +114,7 @@ def split_episodes(path: Path, part: Callable[[int], Path]) -> None:
 
 
 def lay_out(file: h5py.File, names: Iterable[str], attributes: Mapping[str, Any]) -> h5py.Group:
-    """Create the group ``data`` with its attributes, mappings as json, and an empty group for each demonstration.
+    """Create the group ``data`` with its attributes, mappings as JSON, and an empty group for each demonstration.
 
     Made before anything is filled in, the index of demonstrations lies at the front of the file, so that one which is cut
     off later still tells which demonstration broke.

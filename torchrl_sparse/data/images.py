@@ -21,7 +21,7 @@ __all__ = ["RecordedImages", "chosen_cameras", "read_images"]
 
 
 def chosen_cameras(cameras: Mapping[str, str | None]) -> dict[str, str]:
-    """Name of an image here -> its name in the demonstrations, of those that have one.
+    """Map the name of each image here to its name in the demonstrations, for images that have one.
 
     >>> chosen_cameras({"image": "agentview_image", "wrist_image": None})
     {'image': 'agentview_image'}
@@ -31,7 +31,7 @@ def chosen_cameras(cameras: Mapping[str, str | None]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RecordedImages:
-    """The images of a file's demonstrations, ``obs/<key>`` u8 [T, h, w, 3] in each.
+    """Images of a file's demonstrations, ``obs/<key>`` u8 [T, h, w, 3] in each.
 
     Attributes:
         path: of the file.
@@ -42,7 +42,7 @@ class RecordedImages:
     lengths: Mapping[str, int]
 
     def episodes(self, key: str) -> Iterator[tuple[str, np.ndarray]]:
-        """Return for each demonstration where it is, for messages, and its images of one camera, u8 [T, 3, h, w]."""
+        """Return for each demonstration its location, for messages, and one camera's images, u8 [T, 3, h, w]."""
         with open_demos(self.path) as file:
             data, reader = demo_group(file), ArrayReader(file, IMAGES)
             for name, length in self.lengths.items():
@@ -51,7 +51,7 @@ class RecordedImages:
 
 
 def read_images(files: Sequence[RecordedImages], key: str, folder: str | Path | None) -> Tensor:
-    """Read images u8 [N, 3, h, w] of all demonstrations of all files, one demonstration in memory at a time.
+    """Read images u8 [N, 3, h, w] of all demonstrations of all files, holding one demonstration in memory at a time.
 
     Args:
         files: in this order.

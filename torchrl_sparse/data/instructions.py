@@ -34,7 +34,7 @@ def read_instruction(demo: Node) -> str | None:
 
 
 def read_instructions(paths: str | Path | Sequence[str | Path]) -> list[str]:
-    """Read the instruction of every demonstration of a robomimic file, or of several, in the order of `read_demos`.
+    """Read the instruction of every demonstration of one or several robomimic files, in the order of `read_demos`.
 
     Raises:
         FileNotFoundError: if there is no file.

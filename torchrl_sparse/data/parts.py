@@ -1,4 +1,4 @@
-"""A folder of finished parts beside a file in the making, so that long work resumes where a kill stopped it."""
+"""Folder of finished parts beside a file under construction, so that interrupted work resumes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["check_same", "claim_parts", "parts_of"]
 
 
 def parts_of(path: Path) -> Path:
-    """Return the folder of parts of a file.
+    """Return the folder for the parts of a file.
 
     >>> parts_of(Path("data/lift.h5")).name
     'lift.h5.parts'
@@ -22,7 +22,7 @@ def parts_of(path: Path) -> Path:
 
 
 def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
-    """Make the folder of parts of ``path``, or find it again for the same settings; without a part it is anybody's.
+    """Create or reuse the folder of parts of ``path`` for these settings; an empty one is taken over.
 
     Raises:
         InputError: if it holds parts that were made with other settings.
@@ -37,7 +37,7 @@ def claim_parts(path: Path, settings: Mapping[str, Any]) -> Path:
 
 
 def check_same(where: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    """Raise InputError unless ``where`` was made with the settings asked for."""
+    """Raise InputError unless ``where`` was made with these settings."""
     asked_of_it = {key: found[key] for key in asked if key in found}
     if differing := describe_differences(asked_of_it, asked):
         raise InputError(

@@ -1,4 +1,4 @@
-"""The human demonstrations of Push-T that Diffusion Policy (arXiv:2303.04137) published, in robomimic's layout.
+"""Conversion of Diffusion Policy's published human demonstrations of Push-T (arXiv:2303.04137) to robomimic's layout.
 
 The source is ``pusht_cchi_v7_replay.zarr`` without its images, as an ``.npz`` with one row a step of all episodes end to end:
 ``state`` f32 [N, 5] (agent x, y; block x, y; pixels; block angle, rad), ``keypoint`` f32 [N, 9, 2] (pixels), ``action``
@@ -43,7 +43,7 @@ _DAMAGES = (
 
 
 def convert_pusht(path: str | Path, out: str | Path) -> int:
-    """Write the published demonstrations as a file for `read_demos`.
+    """Write the published demonstrations to a file for `read_demos`.
 
     ``states`` are the recorded ones, for setting the simulator: angle first, then position. A kill leaves either the whole
     ``out`` or none.

@@ -1,4 +1,4 @@
-"""The task and the controller that a demonstration file's actions were meant for."""
+"""Task and controller for which a demonstration file's actions were recorded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RANGES = ("input_min", "input_max", "output_min", "output_max")
 
 @dataclass(frozen=True)
 class RecordedControl:
-    """Task and controller of all demonstrations of a file, as its attribute ``env_args`` tells them.
+    """Task and controller of all demonstrations of a file, from its attribute ``env_args``.
 
     Attributes:
         env_name: robosuite's name of the task.
@@ -61,18 +61,18 @@ class RecordedControl:
 
     @property
     def convention(self) -> Convention:
-        """Version of robosuite whose meaning the recorded objects have."""
+        """Version of robosuite that defines the recorded object states."""
         return "1.4" if self.keeps_orientation else "1.5"
 
     def clip(self, actions: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return deltas [T, 7 * arms] clipped to the controller's input, as the simulator does, and how many numbers were."""
+        """Return deltas [T, 7 * arms] clipped to the controller's input range, as in simulation, and the number clipped."""
         arms = actions.reshape(len(actions), -1, POSE_DIM)
         clipped = np.clip(arms, (*self.input_min, -1.0), (*self.input_max, 1.0))
         return clipped.reshape(actions.shape), int((clipped != arms).sum())
 
 
 def check_recorded_task(file: Node, task: str | None, *, poses: bool) -> str:
-    """Return the task that a file says its demonstrations are of.
+    """Return the task that a file names for its demonstrations.
 
     Raises:
         InputError: unless it is ``task``, or any known one where that is None. Of a task whose actions are no ``poses``, whose

@@ -1,4 +1,4 @@
-"""One demonstration of a file as a policy's contract has it: its state, and actions that its hands can follow."""
+"""One demonstration of a file under a policy's observation contract: its state, and actions that the hands can follow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read_episode(
     wanted: Contract,
     control: RecordedControl | None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the state [T, Ds] and action [T, A] of one demonstration, f32, and how many steps were driven.
+    """Return the state [T, Ds] and action [T, A] of one demonstration, f32, and its policy-driven steps.
 
     Poses under a controller become absolute actions, objects those of the wanted convention; without one all stay as they are.
     """

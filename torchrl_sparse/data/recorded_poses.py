@@ -1,4 +1,4 @@
-"""Whether recorded actions can be the poses that a file says they are."""
+"""Checks that recorded actions can be the poses that a file says they are."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_poses(
     positions: Sequence[np.ndarray | None],
     quaternions: Sequence[np.ndarray | None],
 ) -> None:
-    """Refuse absolute poses that no hand could follow, such as deltas, poses in another frame or degrees.
+    """Refuse absolute poses that no hand could follow, such as deltas, degrees, or poses in another frame.
 
     Args:
         where: of the actions, for messages.
@@ -54,7 +54,7 @@ def check_poses(
 def steps_out_of_reach(
     actions: np.ndarray, positions: Sequence[np.ndarray | None], quaternions: Sequence[np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far poses are from the hand, in m and in rad, of each step [T] the farthest arm's; see `check_poses`."""
+    """Return each step's [T] distance from hand to pose, in m and in rad, for the farthest arm; see `check_poses`."""
     far, turn = np.zeros(len(actions)), np.zeros(len(actions))
     arms = actions.reshape(len(actions), -1, POSE_DIM)
     for arm, (position, quaternion) in enumerate(zip(positions, quaternions, strict=True)):
@@ -67,7 +67,7 @@ def steps_out_of_reach(
 
 
 def check_rate(demo: Node, seconds: np.ndarray) -> None:
-    """Refuse states that are another time apart than this library's environments pass in a step."""
+    """Refuse states recorded at another time step than this library's environments use."""
     apart = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     if apart > 0 and abs(apart * CONTROL_FREQ - 1) > 0.1:
         raise InputError(
@@ -76,7 +76,7 @@ def check_rate(demo: Node, seconds: np.ndarray) -> None:
 
 
 def check_hands(demo: Node, arrays: Mapping[str, np.ndarray], length: int) -> None:
-    """Refuse states of another robot, table or version of the task, which put the hand elsewhere."""
+    """Refuse states whose hand positions belong to another robot, table or version of the task."""
     for key, value in arrays.items():
         if key.endswith("eef_pos") and (recorded := demo.find(key)) is not None:
             far = np.linalg.norm(ArrayReader(demo).numbers(demo, key, length) - value, axis=1).max()

@@ -1,4 +1,4 @@
-"""Camera images for demonstrations that were recorded without."""
+"""Rendering of camera images for demonstrations recorded without them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["render_demos"]
 
 
 def render_demos(path: str | Path, out: str | Path, cameras: Sequence[str], *, image_size: int = 84) -> None:
-    """Copy a demonstration file and add what can be seen to every demonstration.
+    """Copy a demonstration file and add camera images and object positions to every demonstration.
 
     ``obs/<camera>_image``, u8 [T, h, w, 3]; and ``obs/object_positions``, f32 [T, 3 n] in m, where the scene's n objects are:
     no policy reads it, but vision can be trained to tell it.

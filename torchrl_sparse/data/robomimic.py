@@ -1,4 +1,4 @@
-"""Demonstrations from robomimic's HDF5 layout (arXiv:2108.03298), cut into training windows.
+"""Demonstrations in robomimic's HDF5 layout (arXiv:2108.03298), cut into training windows.
 
 Layout: ``data/demo_<i>/actions`` [T, 7 * arms] absolute poses (position, rotation vector, gripper),
 ``data/demo_<i>/obs/<key>`` [T, n], images u8 [T, h, w, 3] among them, and the attribute ``num_samples`` = T on every
@@ -40,7 +40,7 @@ __all__ = ["Demonstrations", "join_demos", "read_demos"]
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """Episodes laid end to end.
+    """Demonstration episodes, concatenated along time.
 
     Attributes:
         data: [N] with ``("observation", "state")`` f32 [N, Ds], images ``("observation", name)`` u8 [N, 3, h, w] if
@@ -70,7 +70,7 @@ class Demonstrations:
         return self.data[int(self.starts[index]) : int(self.starts[index + 1])]
 
     def between(self, first: int, last: int) -> Demonstrations:
-        """Return the episodes from ``first`` up to, not including, ``last``."""
+        """Return the episodes from ``first`` to before ``last``."""
         starts = self.starts[first : last + 1]
         return replace(
             self,
@@ -82,7 +82,7 @@ class Demonstrations:
     def window_rows(
         self, horizon: int, n_obs_steps: int, n_action_steps: int, episodes: Sequence[int] | None = None
     ) -> Tensor:
-        """Return rows of all training windows, i64 [W, horizon], as Diffusion Policy's sampler cuts them.
+        """Return the rows of all training windows, i64 [W, horizon], cut as in Diffusion Policy's sampler.
 
         A window may begin up to ``n_obs_steps - 1`` rows before its episode and end up to
         ``n_action_steps - 1`` after it; rows outside repeat the first or last one. None crosses episodes. The present row,
@@ -114,7 +114,7 @@ class Demonstrations:
         return rows
 
     def windows(self, rows: Tensor, n_obs_steps: int) -> TensorDict:
-        """Return training samples [B] of windows ``rows`` i64 [B, H].
+        """Return training samples [B] for the windows ``rows`` i64 [B, H].
 
         Returns:
             ``("history", name)`` [B, To, ...] of each observation, and ``"action"`` [B, H, A]; action ``To - 1``
@@ -138,7 +138,7 @@ def read_demos(
     task: str | None = None,
     convention: Convention = "1.5",
 ) -> Demonstrations:
-    """Read all demonstrations of a robomimic file, in the order of their numbers, or of several files, see `join_demos`.
+    """Read all demonstrations of one robomimic file, in numerical order, or of several, see `join_demos`.
 
     Args:
         paths: of an HDF5 file, or of several, such as those of DAgger's rounds.
@@ -207,7 +207,7 @@ def _read_numbers(
 
 
 def join_demos(parts: Sequence[Demonstrations]) -> Demonstrations:
-    """Lay several sets of demonstrations end to end, in memory, such as those of DAgger's rounds.
+    """Concatenate several sets of demonstrations in memory, such as those of DAgger's rounds.
 
     Raises:
         InputError: if there is none, or they differ in what they observe, in its meaning or in sizes.

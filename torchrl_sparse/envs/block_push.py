@@ -26,7 +26,7 @@ _FIRST, _BOTH = 0.49, 0.51  # rewards
 
 
 class BlockPushEnv(SeededEnv):
-    """Two blocks, two target squares, 10 Hz: push each block into a square of its own. Episodes: see `SeededEnv`.
+    """Two blocks and two target squares at 10 Hz: push each block into a square of its own. Episodes: see `SeededEnv`.
 
     The state is the published one, f32 [16], m and rad: x, y and yaw of each block; x, y of the tip; x, y of the tip's target;
     x, y and yaw of each square. Yaws are taken modulo pi. The action, f32 [2], shifts the tip's target by x and y, m.
@@ -104,7 +104,7 @@ class BlockPushEnv(SeededEnv):
         return _distances(blocks, self.targets[:, :2])
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """Return a u8 [height, width, 3] picture of the workspace; there is one view, whatever the ``camera``."""
+        """Return a u8 [height, width, 3] picture of the workspace; the only view, whatever the ``camera``."""
         return self.scene.render(height, width)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -113,7 +113,7 @@ class BlockPushEnv(SeededEnv):
 
 
 def way_of(states: np.ndarray) -> int:
-    """Return the way of an episode with these states, [T, 16], as `BlockPushEnv` tells it; -1 if no block enters a square.
+    """Return the mode of an episode with these states, [T, 16], as `BlockPushEnv` numbers it; -1 if no block enters a square.
 
     >>> states = np.zeros((2, 16))
     >>> states[:, [0, 10, 13]] = [0.5, 0.1, 0.3]  # x of block 0 and of both squares; block 1 stays at 0

@@ -1,4 +1,4 @@
-"""The scene of block pushing as bodies in pybullet, and the published starts of episodes."""
+"""The scene of block pushing as pybullet bodies, and the published initial states of episodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Start:
 
 
 def published_start(seed: int) -> Start:
-    """Return the published start of a seed's episode, from the same stream of random numbers.
+    """Return the published initial state of a seed's episode, drawn from the same random stream.
 
     >>> start = published_start(100000)
     >>> (np.abs(np.diff(start.blocks[:, 0])) > 0.1).item(), start.targets[:, 1].round(2).tolist()
@@ -83,7 +83,7 @@ def _draw_pose(
 
 
 class BlockPushScene:
-    """Two blocks on a floor, two squares painted on it, and the tip of an end effector that is moved about.
+    """Two blocks on a floor, two squares painted on it, and the movable tip of an end effector.
 
     Raises:
         ImportError: without pybullet, with the command that installs it.
@@ -99,7 +99,7 @@ class BlockPushScene:
         self._ending = weakref.finalize(self, _disconnect, self.client)  # its own clean-up fails at exit
 
     def reset(self, start: Start) -> None:
-        """Build everything again: restoring a state would keep contacts of the last episode in the solver's memory."""
+        """Rebuild the scene: restoring a saved state would keep the last episode's contacts in the solver's memory."""
         client = self.client
         client.resetSimulation()
         client.setGravity(0, 0, -9.8)
@@ -120,29 +120,29 @@ class BlockPushScene:
             client.stepSimulation()
 
     def step(self, target: np.ndarray) -> None:
-        """Draw the tip towards ``target``, f64 [2], m, for 0.1 s."""
+        """Pull the tip towards ``target``, f64 [2], m, for 0.1 s."""
         for _ in range(SUBSTEPS):
             self._anchor = self._anchor + _PACE * (target - self._anchor)
             self.client.changeConstraint(self._hold, (*self._anchor, _TIP_HEIGHT), maxForce=_TIP_FORCE)
             self.client.stepSimulation()
 
     def tip_position(self) -> np.ndarray:
-        """Return f64 [2], m."""
+        """Return the tip's position, f64 [2], m."""
         return np.array(self.client.getBasePositionAndOrientation(self.tip)[0][:2])
 
     def block_pose(self, index: int) -> np.ndarray:
-        """Return f64 [3]: x and y in m, yaw in rad."""
+        """Return a block's pose, f64 [3]: x and y in m, yaw in rad."""
         position, quaternion = self.client.getBasePositionAndOrientation(self.blocks[index])
         return np.array([*position[:2], self.client.getEulerFromQuaternion(quaternion)[2]])
 
     def place_block(self, index: int, pose: np.ndarray) -> None:
-        """Put a block at rest at x, y (m) and yaw (rad)."""
+        """Place a block at rest at x, y (m) and yaw (rad)."""
         quaternion = self.client.getQuaternionFromEuler((0, 0, pose[2]))
         position = (pose[0], pose[1], BLOCK_SIZE / 2)
         self.client.resetBasePositionAndOrientation(self.blocks[index], position, quaternion)
 
     def render(self, height: int, width: int) -> np.ndarray:
-        """Return u8 [height, width, 3] from in front of the robot, by pybullet's own renderer, which needs no GL library."""
+        """Return u8 [height, width, 3], seen from in front of the robot, by pybullet's own renderer, which needs no GL."""
         client = self.client
         view = client.computeViewMatrix((1.0, 0.0, 0.75), (0.4, 0.0, 0.0), (0, 0, 1))
         projection = client.computeProjectionMatrixFOV(50, width / height, 0.1, 3.0)

@@ -1,4 +1,4 @@
-"""PickPlaceCan with a pillar between the bins, which the can is carried past; see `torchrl_sparse.envs.detours`.
+"""PickPlaceCan with a pillar between the bins that the can must pass; see `torchrl_sparse.envs.detours`.
 
 The way is chosen in mid-episode, with the can in hand. Importing this module registers ``"CanTwoWays"`` with robosuite;
 `make_simulator` does so.
@@ -18,14 +18,14 @@ _PILLAR = np.array([0.12, 0.015, 0.8])  # m: over the walls, where the straight 
 
 
 class CanTwoWays(Detour, PickPlaceCan):
-    """The pillar is passed between it and the robot (0) or behind it (1)."""
+    """PickPlaceCan with two modes: the can passes between pillar and robot (0) or behind the pillar (1)."""
 
     obstacle = Obstacle(0.03, (0.0, 1.0, 0.0), [(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)], upright=True)
     centre = _PILLAR
 
 
 def way_of(states: np.ndarray) -> int:
-    """Return the way of an episode with these states, [T, 23], as the environment tells it: see `Obstacle.way_of`.
+    """Return the mode of an episode with these states, [T, 23], as the environment does: see `Obstacle.way_of`.
 
     >>> states = np.zeros((2, 23))
     >>> states[:, 14:17] = [[0.1, -0.1, 1.0], [0.2, 0.02, 1.0]]

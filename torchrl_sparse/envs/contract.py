@@ -1,4 +1,4 @@
-"""What a policy's ``source`` says of what it is shown: the one place that whoever shows it anything asks.
+"""The observation contract of a policy, read from its ``source``, for everything that feeds it observations.
 
 Environments (`torchrl_sparse.envs.for_policy`), demonstrations (`torchrl_sparse.data.for_policy`) and policies that drive a
 collection (`torchrl_sparse.data.dagger`) all obey the same `Contract`. What cannot be translated into it is refused.
@@ -33,7 +33,7 @@ OBJECTS = "object"
 
 @dataclass(frozen=True)
 class Contract:
-    """Meaning of the numbers and pictures that a policy observes.
+    """Meaning of the state entries and images that a policy observes.
 
     Attributes:
         task: name of the task; None for one that is not known here.
@@ -49,13 +49,13 @@ class Contract:
 
     @property
     def meaning(self) -> str:
-        """The state in words, with the convention where it matters."""
+        """The state as text, with the convention where it matters."""
         names = ", ".join(self.state_keys)
         return f"{names} as of robosuite {self.convention}" if OBJECTS in self.state_keys else names
 
 
 def task_contract(task: str, cameras: Mapping[str, str] | None = None) -> Contract:
-    """Return the contract of policies that are trained here: with cameras, they do not observe the objects' state.
+    """Return the contract of policies trained with this library; with cameras, they do not observe the objects' state.
 
     Args:
         task: a name or alias.
@@ -70,7 +70,7 @@ def task_contract(task: str, cameras: Mapping[str, str] | None = None) -> Contra
 
 
 def policy_contract(task: str, policy: DiffusionPolicy) -> Contract:
-    """Return what a policy observes of a task: as its ``source`` says, else as policies that are trained here do.
+    """Return what a policy observes of a task, from its ``source`` or else the default for policies trained here.
 
     Args:
         task: a name or alias.
@@ -113,7 +113,7 @@ def _shown(task: Task, policy: DiffusionPolicy) -> Contract:
 
 
 def check_contract(policy: DiffusionPolicy, shown: Contract | None) -> None:
-    """Refuse to show a policy what means something else to it.
+    """Raise InputError if a policy would read the observations with another meaning.
 
     Args:
         policy: any.
@@ -141,7 +141,7 @@ def check_contract(policy: DiffusionPolicy, shown: Contract | None) -> None:
 
 
 def provenance(contract: Contract | None) -> dict[str, str]:
-    """Return what a file that is made under a contract notes of it: nothing of one that policies trained here have.
+    """Return the contract's note for a file of demonstrations; empty if it is the default contract of policies trained here.
 
     >>> provenance(task_contract("lift")), provenance(Contract("Lift", ("object",), "1.4"))
     ({}, {'observed': 'object as of robosuite 1.4'})
@@ -153,7 +153,7 @@ def provenance(contract: Contract | None) -> dict[str, str]:
 
 
 def continued_source(task: str, policy: DiffusionPolicy) -> dict[str, Any]:
-    """Return the ``source`` of a policy after training it on: its own, for the task that it was last trained on.
+    """Return the ``source`` of a policy after further training: its own, naming the task it was last trained on.
 
     Args:
         task: that it is trained on now, a name or alias.
@@ -174,7 +174,7 @@ def continued_source(task: str, policy: DiffusionPolicy) -> dict[str, Any]:
 
 
 def named_task(trained: str) -> str | None:
-    """Return the name of the task that a published name, such as "lift_lowdim" or "blockpush_image", means.
+    """Return the task that a published name, such as "lift_lowdim" or "blockpush_image", stands for.
 
     >>> named_task("tool_hang_image_abs"), named_task("my_own")
     ('ToolHang', None)

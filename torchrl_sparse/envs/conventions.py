@@ -1,4 +1,4 @@
-"""What robosuite's ``object-state`` meant up to version 1.4, and which meaning a policy was trained on.
+"""The meaning of robosuite's ``object-state`` up to version 1.4 and since, and conversions between them.
 
 Up to 1.4 the parts of the objects' state came in another order, those of an object before those between it and the hand, and
 Lift's ``gripper_to_cube_pos`` was the hand's position minus the cube's, of which 1.5 has the opposite. All other numbers
@@ -49,14 +49,14 @@ _NEGATED = ("gripper_to_cube_pos",)
 
 
 def check_convention(convention: str, task: str) -> None:
-    """Raise InputError unless observations of the robosuite task can be had in that convention."""
+    """Raise InputError unless the task's observations exist in that convention."""
     known = get_args(Convention) if task in _PARTS else ("1.5",)
     if convention not in known:
         raise InputError(f"convention: expected {' or '.join(known)} for {task}, got {convention!r}")
 
 
 def object_state(task: str, observed: Mapping[str, Any], convention: Convention) -> np.ndarray:
-    """Return f64 [object_dim], the objects' state as that version of robosuite observed it.
+    """Return the objects' state, f64 [object_dim], in that robosuite version's convention.
 
     Args:
         task: robosuite's name of it.
@@ -76,7 +76,7 @@ def object_state(task: str, observed: Mapping[str, Any], convention: Convention)
 def translate_objects(
     task: str, state: np.ndarray, *, observed: Convention, wanted: Convention
 ) -> np.ndarray:
-    """Return the objects' state [..., object_dim] that one convention observed as another observes it.
+    """Convert the objects' state [..., object_dim] from one convention to another.
 
     Args:
         task: robosuite's name of it.

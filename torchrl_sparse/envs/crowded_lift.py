@@ -1,4 +1,4 @@
-"""Lift one of five named cubes, while a ball that has nothing to do with it circles them.
+"""Lift one of five named cubes while an irrelevant ball circles them.
 
 What moves in the pictures is not what counts: a pruner that keeps the visual tokens that changed since the last policy call
     keeps the
@@ -28,7 +28,7 @@ Orbit = Callable[[float], np.ndarray]
 
 
 class LiftCrowded(LiftNamed):
-    """`LiftNamed` with two cubes more and a ball that circles all of them on the table.
+    """`LiftNamed` with two more cubes and a ball that circles all cubes on the table.
 
     The ball is seen and touches nothing: whether a cube is lifted does not depend on it. Where it starts is drawn at a reset;
     how fast and which way it goes follows from there, to the last bit, so what restores an episode's start restores its motion.
@@ -64,7 +64,7 @@ class LiftCrowded(LiftNamed):
 
 
 def orbit(place: np.ndarray, *, start: float = 0.0) -> Orbit:
-    """Return the path of a ball that starts at ``place``: rounds on the ellipse through it.
+    """Return the path of a ball starting at ``place``: laps of the ellipse through it.
 
     Args:
         place: f64 [2], m from the table's centre; every bit counts.

@@ -1,4 +1,4 @@
-"""Something in the way that may be passed on several sides, which are equally good: a task with several ways, by construction.
+"""An obstacle that may be passed on several equally good sides: a task with several modes by construction.
 
 It is not simulated: whoever takes the grip site into it has failed the episode. So a policy that averages over the ways of its
 demonstrations, which pass on all sides, goes into it; one that knows a single way succeeds, but its rollouts have less entropy
@@ -20,7 +20,7 @@ __all__ = ["Detour", "Obstacle"]
 
 @dataclass(frozen=True)
 class Obstacle:
-    """What is in the way, and how it is passed. Places are relative to its centre, f64 [3] in m.
+    """An obstacle and the ways around it. Positions are relative to its centre, f64 [3] in m.
 
     Attributes:
         radius: m.
@@ -35,19 +35,19 @@ class Obstacle:
     upright: bool = False
 
     def holds(self, places: np.ndarray) -> np.ndarray:
-        """Tell, bool [...], which places [..., 3] are inside."""
+        """Tell, bool [...], which positions [..., 3] are inside."""
         return np.linalg.norm(places[..., : 2 if self.upright else 3], axis=-1) < self.radius
 
     def passed(self, places: np.ndarray) -> np.ndarray:
-        """Return how far places [..., 3] are beyond the obstacle, m; negative before it."""
+        """Return how far positions [..., 3] are beyond the obstacle, m; negative before it."""
         return places @ np.asarray(self.along)
 
     def side(self, place: np.ndarray) -> int:
-        """Return the way whose side a place [3] is on."""
+        """Return the mode to which a position [3] belongs."""
         return int((np.asarray(self.directions) @ place).argmax())
 
     def way_of(self, places: np.ndarray) -> int:
-        """Return the way of an episode of these places [T, 3]; `NO_WAY` short of the obstacle, `BETWEEN` if any is inside.
+        """Return the mode of an episode's positions [T, 3]; `NO_WAY` if short of the obstacle, `BETWEEN` if any is inside.
 
         >>> ball = Obstacle(0.03, (1, 0, 0), [(0, 1, 0), (0, -1, 0)])
         >>> ball.way_of(np.array([[-0.1, 0, 0], [0.01, -0.05, 0]])), ball.way_of(np.array([[-0.1, 0, 0]]))
@@ -60,7 +60,7 @@ class Obstacle:
 
 
 class Detour:
-    """A robosuite environment with an obstacle, which a subclass puts before robosuite's own class and says where it is.
+    """Mixin for a robosuite environment with an obstacle, whose place the subclass defines.
 
     Attributes:
         obstacle: what is in the way.
@@ -75,7 +75,7 @@ class Detour:
 
     @property
     def passed(self) -> float:
-        """How far the hand is beyond the obstacle, m; negative before it."""
+        """Distance of the hand beyond the obstacle, m; negative before it."""
         return float(self.obstacle.passed(self._place()))
 
     def _place(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Importing simulators that come with optional extras."""
+"""Imports of simulators that are optional extras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["import_extra"]
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Import a module of an optional simulator, also where no GL library is installed.
+    """Import a module of an optional simulator, even where no GL library is installed.
 
     Raises:
         ImportError: without it, with the command that installs it.

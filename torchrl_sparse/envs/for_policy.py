@@ -1,4 +1,4 @@
-"""Environments that show exactly what a given diffusion policy observes."""
+"""Environments that return exactly the observations of a given diffusion policy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CAMERA_OPTIONS = {"image": "camera", "wrist_image": "wrist_camera"}
 
 
 def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None) -> Callable[..., EnvBase]:
-    """Return a maker of environments that show what ``policy`` was trained on; its keywords are those of `make_env`.
+    """Return a factory of environments with the observations ``policy`` was trained on; its keywords are those of `make_env`.
 
     Frames that no policy call of its executor sees are not rendered (``seen_frames`` of `RobosuiteEnv`; None renders all).
 
@@ -50,7 +50,7 @@ def diffusion_env(task: str, policy: DiffusionPolicy, horizon: int | None = None
 
 
 def camera_options(cameras: Mapping[str, str]) -> dict[str, str]:
-    """Translate names of images, here and in demonstrations, into arguments of `make_env`; ValueError for others than those.
+    """Translate image names, here and in demonstrations, to arguments of `make_env`; ValueError for unknown names.
 
     >>> camera_options({"image": "agentview_image"})
     {'camera': 'agentview'}

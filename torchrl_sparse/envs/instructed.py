@@ -1,4 +1,4 @@
-"""Environments that show and say what a given vision-language-action policy reads: tasks of robosuite, and suites of LIBERO."""
+"""Environments with the images and instructions of a given vision-language-action policy: robosuite tasks and LIBERO suites."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class InstructedTask:
-    """A task that words can ask for.
+    """A task that is specified by an instruction.
 
     Attributes:
         name: of the task in results.
@@ -46,7 +46,7 @@ class InstructedTask:
 
 
 def find_instructed_task(name: str) -> InstructedTask:
-    """Find a task of robosuite by its name or alias, or a suite of LIBERO.
+    """Find a robosuite task by name or alias, or a LIBERO suite.
 
     Raises:
         ImportError: for a suite without LIBERO, with the command that installs it.
@@ -72,7 +72,7 @@ def find_instructed_task(name: str) -> InstructedTask:
 def instructed_env(
     task: str, policy: VLAPolicy, cameras: Mapping[str, str], horizon: int | None = None
 ) -> Callable[..., EnvBase]:
-    """Return a maker of environments that show and say what ``policy`` reads; it is called with ``seeds``, as `make_env`.
+    """Return a factory of environments with the observations of ``policy``; call it with ``seeds``, like `make_env`.
 
     Args:
         task: see `find_instructed_task`, which says what it raises.
@@ -107,7 +107,7 @@ def instructed_env(
 
 
 def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -> InstructedTask:
-    """Find a task, and refuse it for a policy to which what it shows means something else.
+    """Find a task, and refuse it if the policy would read its observations with another meaning.
 
     Args:
         task: see `find_instructed_task`, which says what it raises.
@@ -127,7 +127,7 @@ def check_instructed(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -
 
 
 def continued_vla_source(task: str, policy: VLAPolicy, cameras: Mapping[str, str]) -> VLASource:
-    """Return the ``source`` of a policy after training it on: its own, for the task that it was last trained on.
+    """Return the ``source`` of a policy after further training: its own, naming the task it was last trained on.
 
     Args:
         task: that it is trained on now, see `find_instructed_task`.

@@ -33,7 +33,7 @@ _NOISE = np.repeat([0.1, 0.005, 0.0005, 0.005, 0.1, 0.005, 0.1, 0.005], [9, 2, 6
 
 
 class KitchenEnv(SeededEnv):
-    """Four of seven tasks in a kitchen, in any order, at 12.5 Hz. Episodes begin and end as in every `SeededEnv`.
+    """Four of seven kitchen tasks in any order, at 12.5 Hz. Episodes begin and end as in every `SeededEnv`.
 
     The state is the published one, f32 [60]: the robot's 9 joint positions (7 in rad, 2 fingers in m), the 21 positions of
     knobs, lights, doors and kettle, both with uniform noise, then 30 numbers for a goal, which published policies see as zeros.
@@ -116,7 +116,7 @@ class KitchenEnv(SeededEnv):
         return len(self.completed)
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """Return a u8 [height, width, 3] picture from behind the robot; there is one view, whatever the ``camera``.
+        """Return a u8 [height, width, 3] picture from behind the robot; the only view, whatever the ``camera``.
 
         The first call decides on the size.
 

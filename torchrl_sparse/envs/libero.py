@@ -1,4 +1,4 @@
-"""LIBERO (arXiv:2306.03310) through TorchRL's `LiberoEnv`, with what a vision-language-action policy and its controller read.
+"""LIBERO (arXiv:2306.03310) through TorchRL's `LiberoEnv`, with the observations of vision-language-action policies.
 
 An optional extra, as it brings 350 MB of scenes, which have to be linked once::
 
@@ -52,7 +52,7 @@ def make_libero_env(
     init_state_mode: str = "cycle",
     **kwargs: Any,
 ) -> TransformedEnv:
-    """Make one task of a suite: upright cameras; position, rotation vector and fingers; velocity; instruction; ``"is_init"``.
+    """Make one task of a suite, with upright cameras, state, velocity, instruction and ``"is_init"``.
 
     Args:
         suite: one of `SUITES`.
@@ -96,7 +96,7 @@ def make_libero_env(
 
 
 def suite_horizon(suite: str) -> int:
-    """Return the steps of `SUITES`.
+    """Return the horizon, in steps, from `SUITES`.
 
     Raises:
         InputError: on an unknown suite.
@@ -107,7 +107,7 @@ def suite_horizon(suite: str) -> int:
 
 
 def require_libero() -> None:
-    """Raise ImportError, with the command that installs it, unless LIBERO is there."""
+    """Raise ImportError, with the install command, unless LIBERO is installed."""
     if importlib.util.find_spec("libero") is None:
         raise ImportError(MISSING)
 
@@ -158,7 +158,7 @@ def _base_of_floor_robots() -> Iterator[None]:
 
 
 class RotationVectorState(Transform):
-    """Writes OpenVLA-OFT's state, f32 [*B, 8]: position, rotation vector (rad), both fingers."""
+    """Transform that writes OpenVLA-OFT's state, f32 [*B, 8]: position, rotation vector (rad), both fingers."""
 
     def __init__(self) -> None:
         super().__init__(in_keys=[_POSE], out_keys=[keys.STATE])
@@ -177,7 +177,7 @@ class RotationVectorState(Transform):
 
 
 def rotation_vector(quaternion: Tensor) -> Tensor:
-    """Return rotation vector, [..., 3] in rad, of a unit quaternion [..., 4] (xyzw); its angle lies between 0 and 2 pi.
+    """Return the rotation vector, [..., 3] in rad, of a unit quaternion [..., 4] (xyzw); its angle lies between 0 and 2 pi.
 
     As in robosuite, and so in the states that published checkpoints were trained on, the sign of w decides which of the two
     turns it is, not which is shorter.

@@ -1,4 +1,4 @@
-"""A suite of LIBERO as one environment: its ten tasks in turn, each episode fixed by its seed."""
+"""A LIBERO suite as one environment: its ten tasks in turn, each episode fixed by its seed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN = (keys.IMAGE, keys.WRIST_IMAGE, keys.EEF_VEL, keys.INSTRUCTION)
 
 
 def scene_of(seed: int) -> tuple[int, int | None]:
-    """Return an episode's task, and which of that task's initial states it begins in: None for one that the seed draws.
+    """Return an episode's task and the index of its initial state in that task; None if the seed draws the state.
 
     The i-th test seed is task i modulo 10 in state i // 10. So 500 episodes are those of the published evaluations, each state
     of each task once, and there are no more. On seeds for tuning LIBERO's own samplers place the objects, so that no state of
@@ -49,12 +49,12 @@ def scene_of(seed: int) -> tuple[int, int | None]:
 
 
 def make_suite_env(suite: str, **kwargs: Any) -> TransformedEnv:
-    """Make a `LiberoSuite` that tells with ``"is_init"`` where episodes begin; ``kwargs`` are its own."""
+    """Make a `LiberoSuite` with ``"is_init"`` at the start of episodes; ``kwargs`` are passed to it."""
     return TransformedEnv(LiberoSuite(suite, **kwargs), Compose(InitTracker()))
 
 
 class LiberoSuite(SeededEnv):
-    """The tasks of a suite: cameras, velocity and instruction of `make_libero_env`, its state f32 [8] and normalised actions.
+    """All tasks of a LIBERO suite, with the observations of `make_libero_env`, a state f32 [8] and normalised actions.
 
     An episode is what `scene_of` says, and what a reset draws beside it (where cabinets and stoves stand) comes of its seed
     too. The simulator is made again where the task changes, so as many environments as tasks, each with every tenth seed, spare

@@ -1,4 +1,4 @@
-"""Lift with a ball between the hand and the cube, where the straight way to it leads; see `torchrl_sparse.envs.detours`.
+"""Lift with a ball on the straight path from the hand to the cube; see `torchrl_sparse.envs.detours`.
 
 Importing this module registers ``"LiftTwoWays"`` and ``"LiftFourWays"`` with robosuite; `make_simulator` does so.
 """
@@ -26,7 +26,7 @@ def _ball(ways: int) -> Obstacle:
 
 
 class LiftWays(Detour, Lift):
-    """Lift behind a ball that hangs at a fixed offset from where the cube starts."""
+    """Lift with a ball fixed at an offset from the cube's initial position."""
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
@@ -41,19 +41,19 @@ class LiftWays(Detour, Lift):
 
 
 class LiftTwoWays(LiftWays):
-    """The ball is passed on its left (0) or right (1)."""
+    """`LiftWays` with two modes: the ball is passed on its left (0) or right (1)."""
 
     obstacle = _ball(2)
 
 
 class LiftFourWays(LiftWays):
-    """The ball is passed on its left (0), above to the left (1), above to the right (2), or right (3)."""
+    """`LiftWays` with four modes: left (0), above to the left (1), above to the right (2), or right (3) of the ball."""
 
     obstacle = _ball(4)
 
 
 def way_of_two(states: np.ndarray) -> int:
-    """Return the way of an episode with these states, [T, 19], as the environment tells it: see `Obstacle.way_of`.
+    """Return the mode of an episode with these states, [T, 19], as `LiftTwoWays` does: see `Obstacle.way_of`.
 
     >>> states = np.zeros((2, 19))
     >>> states[:, 10:13] = [[-0.1, 0, 0.17], [-0.04, -0.08, 0.08]]  # past the ball, on its right
@@ -64,7 +64,7 @@ def way_of_two(states: np.ndarray) -> int:
 
 
 def way_of_four(states: np.ndarray) -> int:
-    """The same where the ball is passed on four sides."""
+    """Return the mode of an episode with these states, [T, 19], as `LiftFourWays` does: see `Obstacle.way_of`."""
     return LiftFourWays.obstacle.way_of(_hands(states))
 
 

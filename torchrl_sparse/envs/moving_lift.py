@@ -1,4 +1,4 @@
-"""Lift with a cube that moves: robosuite's Lift, and something under the table that pulls the cube along a smooth path.
+"""robosuite's Lift with a moving cube, pulled along a smooth path from under the table.
 
 A policy that answers late grasps where the cube was. That makes this the task on which latency costs success.
 
@@ -27,7 +27,7 @@ Path = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 
 class LiftMoving(Lift):
-    """Lift whose cube is pulled along a path on the table until it is lifted off it.
+    """Lift whose cube is pulled along a path on the table until it is lifted.
 
     The path follows from the cube's initial pose alone, to its last bit, so whatever restores an episode's start
     restores its motion too. The pull acts on the cube's centre and has limited strength: fingers stop the cube, and
@@ -54,7 +54,7 @@ class LiftMoving(Lift):
 
 
 def cube_path(pose: np.ndarray, *, start: float = 0.0) -> Path:
-    """Return the path of a cube that starts at ``pose``: a sine along each axis of the table.
+    """Return the path of a cube starting at ``pose``: a sine along each axis of the table.
 
     Args:
         pose: f64 [7] position (m) and quaternion; every bit counts.

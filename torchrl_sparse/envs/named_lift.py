@@ -1,4 +1,4 @@
-"""Lift with three cubes, where the instruction names the one to lift: "lift the green cube".
+"""Lift with three cubes, one of which the instruction names: "lift the green cube".
 
 The scene does not say which cube counts, so a policy that ignores the instruction can be right in one episode of three.
 
@@ -35,7 +35,7 @@ _WOODEN = ("green", "blue")  # those of which robosuite has a texture
 
 
 class LiftNamed(Lift):
-    """Lift among a red, a green and a blue cube; only the named one counts.
+    """Lift with a red, a green and a blue cube, of which only the named one counts.
 
     Everything that `Lift` says of "the cube" (success, reward, object state) is true of the named one. Which one that is
     is drawn last at a reset, so the same seed gives the same scene whatever is asked for there.
@@ -70,7 +70,7 @@ class LiftNamed(Lift):
 
     @property
     def instruction(self) -> str:
-        """The instruction that counts in this episode; can be set at any moment."""
+        """Instruction of the current episode; may be set at any time."""
         return self._instruction
 
     @instruction.setter
@@ -81,7 +81,7 @@ class LiftNamed(Lift):
 
 
 class SpacedSampler(UniformRandomSampler):
-    """Draws all places again until centres are at least `SPACING` apart."""
+    """Placement sampler that redraws all places until centres are at least `SPACING` apart."""
 
     def sample(self, *args: Any, **kwargs: Any) -> dict:
         while True:

@@ -95,7 +95,7 @@ class PushTEnv(SeededEnv):
         return bool(self._coverage > self.sim_env.success_threshold)
 
     def render(self, camera: str = "", height: int = 256, width: int = 256) -> np.ndarray:
-        """Return a u8 [height, width, 3] picture of the world from above; there is one view, whatever the ``camera``.
+        """Return a u8 [height, width, 3] picture of the world from above; the only view, whatever the ``camera``.
 
         Raises:
             RunFailed: if OpenCV cannot be imported, for want of a GL library.
@@ -108,7 +108,7 @@ class PushTEnv(SeededEnv):
 
 
 def block_keypoints(position: Sequence[float], angle: float) -> np.ndarray:
-    """Return `KEYPOINTS` of a block at ``position`` (pixels), turned by ``angle`` (rad), f64 [9, 2].
+    """Return the `KEYPOINTS` of a block at ``position`` (pixels), rotated by ``angle`` (rad), f64 [9, 2].
 
     >>> block_keypoints((100.0, 200.0), np.pi / 2)[1].round(2).tolist()
     [101.19, 139.02]
@@ -118,7 +118,7 @@ def block_keypoints(position: Sequence[float], angle: float) -> np.ndarray:
 
 
 def published_start(seed: int) -> np.ndarray:
-    """Return the published start of a seed's episode, f64 [5]: agent x, y; block x, y, all pixels; block angle, rad.
+    """Return the published initial state of a seed's episode, f64 [5]: agent x, y; block x, y (pixels); block angle (rad).
 
     >>> published_start(100000).round(1).tolist()
     [235.0, 124.0, 335.0, 128.0, -0.9]

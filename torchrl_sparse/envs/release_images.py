@@ -1,4 +1,4 @@
-"""What OpenVLA-OFT's evaluation does to LIBERO's images before its checkpoints see them (arXiv:2502.19645, its release)."""
+"""Image preprocessing of OpenVLA-OFT's LIBERO evaluation, as in the authors' release (arXiv:2502.19645)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _QUALITY = 95  # TensorFlow's default, as is the halved resolution of colours
 
 
 def as_released(image: Tensor, size: int) -> Tensor:
-    """Compress an image as JPEG and scale it by an antialiased Lanczos filter: u8 [3, size, size] of u8 [3, h, w].
+    """Compress an image as JPEG and resize it with an antialiased Lanczos filter: u8 [3, h, w] to u8 [3, size, size].
 
     The checkpoints were trained on images that went that way. The release does it in TensorFlow; rounding of the filter and
     the decoder differs by a level or so.
@@ -41,7 +41,7 @@ def as_released(image: Tensor, size: int) -> Tensor:
 
 
 class ReleaseImages(Transform):
-    """Puts cameras' images, u8 [*B, 3, h, w], through `as_released`.
+    """Transform that applies `as_released` to camera images, u8 [*B, 3, h, w].
 
     Args:
         cameras: their keys.

@@ -1,4 +1,4 @@
-"""Off-screen camera images of a simulator, made only when asked for. Needs EGL or OSMesa from the system."""
+"""Off-screen camera images of a simulator, rendered on demand. Needs EGL or OSMesa from the system."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _UPLOADED = ("mesh_", "tex_", "hfield_", "skin_", "mat_")
 
 
 class CameraRenderer:
-    """Renders the cameras of one MuJoCo model; `follow` takes it on to the next, which a hard reset makes.
+    """Renderer of one MuJoCo model's cameras; after a hard reset, `follow` moves it to the new model.
 
     Args:
         sim: robosuite's ``MjSim``.
@@ -68,7 +68,7 @@ class CameraRenderer:
         atexit.register(self.close)  # a context that outlives EGL itself complains at exit
 
     def follow(self, sim: Any) -> bool:
-        """Render another simulator from now on; False, and nothing changes, if its meshes or textures are others.
+        """Switch to another simulator; return False and change nothing if its meshes or textures differ.
 
         To make a renderer takes as long as dozens of images: everything is copied into a new GL context.
         """
@@ -81,7 +81,7 @@ class CameraRenderer:
         self._model, self._data = sim.model._model, sim.data._data
 
     def image(self, camera: str) -> np.ndarray:
-        """Return u8 [height, width, 3], top row first.
+        """Return the image u8 [height, width, 3], top row first.
 
         Raises:
             InputError: if the model has no camera of that name.
@@ -128,7 +128,7 @@ class CameraRenderer:
 
 
 class Cameras:
-    """The cameras that an environment observes, and any other that is asked for; one renderer for each size of image.
+    """Observation cameras of an environment, and any others on request; one renderer per image size.
 
     Args:
         names: the cameras, by the key of each one's images.
@@ -144,7 +144,7 @@ class Cameras:
         self._last: dict[NestedKey, Tensor] = {}
 
     def images(self, sim: Any, *, again: bool = False) -> Mapping[NestedKey, Tensor]:
-        """Return u8 [3, size, size] of each camera; ``again`` gives those of the call before and renders nothing."""
+        """Return u8 [3, size, size] of each camera; ``again`` returns the previous call's images without rendering."""
         if not again:
             shown = {key: self.render(sim, name, self.size, self.size) for key, name in self.names.items()}
             self._last = {
@@ -153,7 +153,7 @@ class Cameras:
         return self._last
 
     def render(self, sim: Any, camera: str, height: int, width: int) -> np.ndarray:
-        """Return u8 [height, width, 3] of the present state, top row first."""
+        """Return u8 [height, width, 3] of the current state, top row first."""
         size = (height, width)
         renderer = self._renderers.get(size)
         if renderer is not None and not renderer.follow(sim):
@@ -164,7 +164,7 @@ class Cameras:
         return renderer.image(camera)
 
     def close(self) -> None:
-        """Free all GL contexts; what is asked for later gets new ones."""
+        """Free all GL contexts; later requests create new ones."""
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers = {}

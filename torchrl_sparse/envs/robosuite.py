@@ -1,4 +1,4 @@
-"""robosuite 1.5 tasks as TorchRL environments on the canonical keys."""
+"""robosuite 1.5 tasks as TorchRL environments with the library's keys."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from torchrl_sparse.storage.convention import Convention
 
 @dataclass(frozen=True)
 class InitialState:
-    """Everything that fixes how an episode starts.
+    """Complete initial state of an episode.
 
     Attributes:
         model_xml: the MuJoCo model; robosuite randomises sizes, so it belongs to the state.
@@ -180,7 +180,7 @@ class RobosuiteEnv(SeededEnv):
         self._ask_for(state.instruction)
 
     def get_initial_state(self) -> InitialState:
-        """Return the present state, to start another episode from: ``env.reset(initial_state=state)``."""
+        """Return the current state, to start another episode with ``env.reset(initial_state=state)``."""
         # The simulator's own XML is rounded to six digits; the one it was compiled from is exact.
         model_xml = self._restored_xml or self.sim_env.model.get_xml()
         state = self.sim_env.sim.get_state().flatten()
@@ -190,7 +190,7 @@ class RobosuiteEnv(SeededEnv):
 
     @property
     def instruction(self) -> str:
-        """The instruction of this episode."""
+        """Instruction of the current episode."""
         if isinstance(self._instruction, str):
             return self._instruction
         return self.sim_env.instruction if self.task.has_choice else self.task.instructions[0]
@@ -251,13 +251,13 @@ class RobosuiteEnv(SeededEnv):
 
     @property
     def recorded_keys(self) -> tuple[str, ...]:
-        """What demonstrations record: the task's state, and the hands' rotation that published policies observe."""
+        """Names of the observations that demonstrations record: the task's state, and published policies' hand rotation."""
         return (*self.task.state_keys, *(f"robot{arm}_eef_quat" for arm in range(self.task.arms)))
 
     def raw_observation(
         self, state_keys: Sequence[str] | None = None, convention: Convention | None = None
     ) -> Mapping[str, np.ndarray]:
-        """Return the parts of the state, or ``state_keys``, by robosuite's names, f64, in order, in a convention or its own."""
+        """Return the parts of the state, or ``state_keys``, f64, by robosuite's names, in a given or its own convention."""
         # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
         self.sim_env._update_observables(force=True)
         observed = self.sim_env._get_observations(force_update=True)
@@ -279,7 +279,7 @@ class RobosuiteEnv(SeededEnv):
         return out
 
     def object_positions(self) -> np.ndarray:
-        """Return f64 [3 n], m: where the n objects of the scene are, in the world frame."""
+        """Return the world positions of the scene's n objects, f64 [3 n], m."""
         sim, objects = self.sim_env.sim, self.sim_env.model.mujoco_objects
         bodies = [sim.model.body_name2id(thing.root_body) for thing in objects]
         return sim.data.body_xpos[bodies].reshape(-1)
@@ -291,7 +291,7 @@ class RobosuiteEnv(SeededEnv):
         return np.concatenate([part for twist in twists for part in twist])
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
-        """Return a u8 [height, width, 3] image of the present state, top row first. See `CameraRenderer` for errors."""
+        """Return a u8 [height, width, 3] image of the current state, top row first. See `CameraRenderer` for errors."""
         return self._cameras.render(self.sim_env.sim, camera, height, width)
 
     def close(self, *, raise_if_closed: bool = True) -> Any:

@@ -1,4 +1,4 @@
-"""Base of the environments: episodes fixed by one integer, success, horizon, and checked actions."""
+"""Base of all environments: reproducible episodes by integer seed, success, horizon, and checked actions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BETWEEN = -2
 
 
 class SeededEnv(EnvBase):
-    """An environment on the canonical keys, each of whose episodes is fixed by one integer.
+    """Environment with the library's keys, in which one integer fixes each episode.
 
     An episode is *terminated* on success and *truncated* at the horizon, never both. Its integer, reported under
     ``("episode", "seed")``, is the next of ``seeds``, or one more than the last after `set_seed`.

@@ -1,4 +1,4 @@
-"""Which episodes are for what, by their seeds: nothing is tested on what it was trained or tuned on.
+"""Ranges of episode seeds by purpose, so that nothing is tested on episodes that it was trained or tuned on.
 
 Demonstrations begin at seed 0. Whatever is tuned (calibrations, sweeps, searches, evaluations during training, benchmarks while
 a method is being made) looks at development seeds; a table is made on test seeds, once. Until November 2026 evaluations during
@@ -39,7 +39,7 @@ CALIBRATION_SEED = 180_000  # of the observations that cache schedules are compu
 
 
 def evaluation_seeds(split: str, offset: int, episodes: int) -> range:
-    """Return the seeds of a benchmark's episodes; a second benchmark with another ``offset`` may extend the first.
+    """Return the seeds of a benchmark's episodes; a second benchmark can extend the first by another ``offset``.
 
     Args:
         split: "test" or "development".
@@ -63,7 +63,7 @@ def evaluation_seeds(split: str, offset: int, episodes: int) -> range:
 
 
 def tuning_seeds(first: int, episodes: int) -> range:
-    """Return the seeds of episodes that something is tuned on.
+    """Return the seeds of episodes for tuning.
 
     Args:
         first: seed.
@@ -82,7 +82,7 @@ def tuning_seeds(first: int, episodes: int) -> range:
 
 
 def whole_seed(seed: Any) -> int:
-    """Return a seed as an integer, of any type that stands for one.
+    """Convert a seed of any integer-like type to an int.
 
     Raises:
         InputError: if it is a fraction, which would silently be another episode, negative, or of more than 63 bits.

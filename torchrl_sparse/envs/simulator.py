@@ -1,4 +1,4 @@
-"""Importing robosuite quietly, and making its simulators. Nothing here needs a GL library."""
+"""Quiet import of robosuite, and construction of its simulators. Nothing here needs a GL library."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LOADING = threading.Lock()
 
 
 def import_robosuite() -> Any:
-    """Import robosuite without its start-up warnings, and also where no GL library is installed.
+    """Import robosuite without its start-up warnings, even where no GL library is installed.
 
     Raises:
         ImportError: with the command that installs it.
@@ -46,7 +46,7 @@ def import_robosuite() -> Any:
 def make_simulator(
     task: RobosuiteTask, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
 ) -> Any:
-    """Make a state-only robosuite environment of Pandas under OSC_POSE.
+    """Make a state-only robosuite environment with Panda arms under OSC_POSE.
 
     Args:
         task: what to build.
@@ -172,7 +172,7 @@ def _look_once(controller: Any) -> None:
 
 
 def controller_config(absolute: bool) -> dict:
-    """Build the composite controller of one Panda, as robosuite takes it and as demonstration files record it."""
+    """Build one Panda's composite controller config, as robosuite takes it and demonstration files record it."""
     from robosuite.controllers import load_composite_controller_config
 
     config = load_composite_controller_config(controller="BASIC")
@@ -189,7 +189,7 @@ def _only_errors(record: logging.LogRecord) -> bool:
 
 @contextmanager
 def cv2_or_stand_in() -> Iterator[None]:
-    """Let simulators import cv2 where it cannot be imported for want of libGL.
+    """Let simulators import a stand-in for cv2 where libGL is missing.
 
     They need it for what is drawn on a screen, which nothing here does. The stand-in is gone when the block ends.
     """

@@ -1,4 +1,4 @@
-"""The protocol of tasks, whichever simulator they run in."""
+"""The protocol of a task, independent of its simulator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Task"]
 
 
 class Task(Protocol):
-    """One task; `RobosuiteTask` and `StateTask` are the two kinds here.
+    """Protocol of a task, implemented by `RobosuiteTask` and `StateTask`.
 
     Attributes:
         name: of the task in results.
@@ -62,10 +62,10 @@ class Task(Protocol):
     def demonstrator(self) -> type[Any]: ...
 
     def make(self, **kwargs: Any) -> EnvBase:
-        """Make the task's environment; its class documents ``kwargs`` and errors."""
+        """Make the task's environment; see its class for ``kwargs`` and errors."""
 
     def load_way_of(self) -> Callable[[np.ndarray], int]:
-        """Import the function that tells the way of an episode from its states, f32 [T, Ds], as the environment does.
+        """Import the function that returns an episode's mode from its states, f32 [T, Ds], as the environment does.
 
         Raises:
             InputError: if the task's episodes tell none.

@@ -1,4 +1,4 @@
-"""The tasks by name: `TASKS` is the one table, whose entries are each a `Task`.
+"""Table of all tasks by name, `TASKS`, whose entries are each a `Task`.
 
 A new task is a file with its environment, and one entry here or, from outside, ``TASKS[task.name] = task``. Simulators and
 experts are named as ``"module:attribute"`` and imported when one is made: optional extras cost nothing before.
@@ -51,7 +51,7 @@ class _Named:
 
 @dataclass(frozen=True)
 class RobosuiteTask(_Named):
-    """A robosuite task of Panda arms under absolute poses; a `Task`.
+    """A robosuite task with Panda arms and absolute pose actions; a `Task`.
 
     Attributes:
         name: robosuite's name, or ours for a variant.
@@ -81,23 +81,23 @@ class RobosuiteTask(_Named):
 
     @property
     def has_choice(self) -> bool:
-        """True where episodes differ in what they ask for."""
+        """True if episodes differ in their instruction."""
         return len(self.instructions) > 1
 
     def check_instruction(self, words: str) -> None:
-        """Raise InputError unless ``words`` are one of `instructions`."""
+        """Raise InputError unless ``words`` is one of `instructions`."""
         if words not in self.instructions:
             expected = ", ".join(map(repr, self.instructions))
             raise InputError(f"instruction: expected one of {expected} for {self.name}, got {words!r}")
 
     @property
     def state_keys(self) -> tuple[str, ...]:
-        """robosuite observations whose concatenation is the state."""
+        """Names of the robosuite observations whose concatenation is the state."""
         return ("object", *self.proprioception_keys)
 
     @property
     def proprioception_keys(self) -> tuple[str, ...]:
-        """Those of the arms: the state of image tasks, where cameras show the objects."""
+        """Names of the arms' observations: the state of image tasks, where cameras show the objects."""
         return tuple(f"robot{i}_{name}" for i in range(self.arms) for name in _PROPRIOCEPTION)
 
     @property
@@ -113,18 +113,18 @@ class RobosuiteTask(_Named):
         return _load(f"{_EXPERTS}.demonstrators:RobosuiteDemonstrator")
 
     def pose_slices(self, state_keys: Sequence[str] | None = None) -> list[tuple[slice, slice]]:
-        """For each arm, where its position and its quaternion (xyzw) lie in a state; see `state_slice`."""
+        """Slices of the state that hold each arm's position and quaternion (xyzw); see `state_slice`."""
         place = partial(self.state_slice, state_keys=state_keys)
         return [(place(f"robot{i}_eef_pos"), place(f"robot{i}_eef_quat_site")) for i in range(self.arms)]
 
     def state_slice(self, key: str, state_keys: Sequence[str] | None = None) -> slice:
-        """Locate an observation in a state of `state_keys`; None: those of the task."""
+        """Return an observation's slice of a state with `state_keys`; None means the task's own."""
         names = state_keys or self.state_keys
         end = self.state_size(names[: names.index(key) + 1])
         return slice(end - self.state_size([key]), end)
 
     def state_size(self, state_keys: Sequence[str]) -> int:
-        """Return how many numbers the observations have together; ValueError for an unknown name, or one that comes twice."""
+        """Return the total size of the observations; ValueError for an unknown or repeated name."""
         arms = {f"robot{i}_{name}": size for i in range(self.arms) for name, size in _OBSERVED.items()}
         sizes = {"object": self.object_dim, **arms}
         if not state_keys or not set(state_keys) <= sizes.keys() or len({*state_keys}) < len(state_keys):
@@ -133,18 +133,18 @@ class RobosuiteTask(_Named):
         return sum(sizes[key] for key in state_keys)
 
     def make(self, **kwargs: Any) -> EnvBase:
-        """Make its `torchrl_sparse.envs.robosuite.RobosuiteEnv`."""
+        """Make the task's `torchrl_sparse.envs.robosuite.RobosuiteEnv`."""
         return _load(f"{_ENVS}.robosuite:RobosuiteEnv")(self.name, **kwargs)
 
     def register(self) -> None:
-        """Make robosuite know the task, where it is not robosuite's own."""
+        """Register the task with robosuite, unless it is one of robosuite's own."""
         if self.module is not None:
             import_module(self.module)
 
 
 @dataclass(frozen=True)
 class StateTask(_Named):
-    """A task of another simulator, which an optional extra brings; a `Task` whose policies observe the simulator's state.
+    """A `Task` of another simulator (an optional extra), whose policies observe the simulator's state.
 
     Attributes:
         name, alias: of the task in results, and a short one.
@@ -174,7 +174,7 @@ class StateTask(_Named):
 
     @property
     def proprioception_keys(self) -> tuple[str, ...]:
-        """Raise InputError: no camera shows the rest."""
+        """Raise InputError: these tasks have no cameras to show the rest of the state."""
         raise InputError(f"cameras: expected none for {self.name}, whose policies see its state")
 
     @property
@@ -188,7 +188,7 @@ class StateTask(_Named):
         return _load(f"{_EXPERTS}.demonstrators:StateDemonstrator")
 
     def make(self, **kwargs: Any) -> EnvBase:
-        """Make its environment; see the class for ``kwargs`` and errors."""
+        """Make the task's environment; see its class for ``kwargs`` and errors."""
         return _load(self.environment)(**kwargs)
 
 
@@ -286,7 +286,7 @@ def find_task(name: str) -> Task:
 
 
 def find_robosuite_task(name: str) -> RobosuiteTask:
-    """Find a task that robosuite simulates, as `find_task` does."""
+    """Find a robosuite task, as `find_task` does."""
     return _find(name, [task for task in TASKS.values() if isinstance(task, RobosuiteTask)])
 
 

@@ -1,4 +1,4 @@
-"""Transforms between an environment and a policy: observation history, and velocity where no simulator gives it."""
+"""Transforms between environment and policy: observation history, and velocity where the simulator does not report it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl_sparse.errors import InputError
 
 
 def make_env(task: str, *, n_obs_steps: int = 2, **kwargs: Any) -> TransformedEnv:
-    """Make a task's environment with what a `DiffusionPolicy` in a `ChunkExecutor` reads: histories and ``"is_init"``.
+    """Make a task's environment with the histories and ``"is_init"`` that a `DiffusionPolicy` in a `ChunkExecutor` reads.
 
     Args:
         task: of robosuite, see `RobosuiteEnv`, or of another simulator, see `torchrl_sparse.envs.tasks.TASKS`.
@@ -47,7 +47,7 @@ def state_history(n_obs_steps: int, state: NestedKey = keys.STATE) -> list[Trans
 
 
 def image_history(n_obs_steps: int, cameras: Sequence[tuple[str, str]]) -> list[Transform]:
-    """Return transforms that write ``("history", name)``, u8 [*B, n_obs_steps, 3, h, w], of ``("observation", name)``."""
+    """Return transforms that write ``("history", name)``, u8 [*B, n_obs_steps, 3, h, w], from ``("observation", name)``."""
     if not cameras:
         return []
     histories = [keys.history(name) for _, name in cameras]
@@ -58,7 +58,7 @@ def image_history(n_obs_steps: int, cameras: Sequence[tuple[str, str]]) -> list[
 
 
 class EndEffectorVelocity(Transform):
-    """Writes ``("observation", "eef_vel")`` from two successive poses, where there is no simulator to ask.
+    """Transform that writes ``("observation", "eef_vel")`` from two successive poses, without a simulator.
 
     It is the mean over the step just made; the simulator's own, which `RobosuiteEnv` writes, is that at the step's end. Zero
     after a reset.
@@ -90,7 +90,7 @@ class EndEffectorVelocity(Transform):
 
 
 def twists(before: Tensor, after: Tensor, poses: Sequence[tuple[slice, slice]]) -> Tensor:
-    """Return by how far each arm moved and turned from one state to another, f32 [..., 6 * arms] in m and rad.
+    """Return each arm's translation and rotation from one state to another, f32 [..., 6 * arms] in m and rad.
 
     Args:
         before, after: states [..., Ds].
@@ -108,7 +108,7 @@ def twists(before: Tensor, after: Tensor, poses: Sequence[tuple[slice, slice]]) 
 
 
 def rotation_between(before: Tensor, after: Tensor) -> Tensor:
-    """Return rotation vector, [..., 3] rad, world frame, that turns quaternion ``before`` into ``after`` ([..., 4], xyzw)."""
+    """Return the world-frame rotation vector, [..., 3] rad, from quaternion ``before`` to ``after`` ([..., 4], xyzw)."""
     xyz0, w0 = before[..., :3], before[..., 3:]
     xyz1, w1 = after[..., :3], after[..., 3:]
     xyz = w0 * xyz1 - w1 * xyz0 - torch.linalg.cross(xyz1, xyz0)  # after * conjugate(before)

@@ -1,4 +1,4 @@
-"""Paired evaluation: shared seeds, intervals and verdicts, latency, ``results.json``, figures, videos."""
+"""Paired evaluation on shared seeds: intervals, verdicts, latency, ``results.json``, figures and videos."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Methods by name: a table says how each is made, what controls it, and its colour in figures."""
+"""Methods by name: one table each says how methods are made, controlled and coloured in figures."""
 
 import lazy_loader as lazy
 

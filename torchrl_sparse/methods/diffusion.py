@@ -56,7 +56,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class MethodInputs:
-    """Everything that a method may be made from.
+    """Inputs from which methods are made.
 
     Attributes:
         method: what is made.
@@ -76,7 +76,7 @@ class MethodInputs:
 
 
 def move_rate(rates: tuple[float, ...]) -> ActionAwareController | None:
-    """Return what moves the prune rate between two that were written, and nothing for one or none."""
+    """Return the controller that switches between two given prune rates; None for fewer."""
     if len(rates) < 2:
         return None
     coarse, fine = rates
@@ -85,7 +85,7 @@ def move_rate(rates: tuple[float, ...]) -> ActionAwareController | None:
 
 @dataclass(frozen=True)
 class Method:
-    """Recipe of a method.
+    """One entry of the method table.
 
     Attributes:
         make: returns planner and sampler; ValueError where the inputs do not allow it.
@@ -149,7 +149,7 @@ SAVED = Method(_saved)
 
 
 def check_method(method: MethodSpec | str, planners: Path) -> None:
-    """Raise InputError unless a label is written as `MethodSpec` says, and the method is known or saved in ``planners``."""
+    """Raise InputError unless a label follows `MethodSpec` and its method is known or saved in ``planners``."""
     _find(method, planners)
 
 
@@ -161,7 +161,7 @@ def make_method(
     planners: Path,
     calibration: Callable[[], Calibration],
 ) -> DiffusionPolicy:
-    """Return the policy under a method; it shares the networks with ``policy``.
+    """Return the policy under a method; it shares its networks with ``policy``.
 
     Args:
         method: see the module.
@@ -199,13 +199,13 @@ def make_method(
 
 
 def make_controller(method: MethodSpec | str) -> TensorDictModuleBase | None:
-    """Return the controller of a method, of a saved one too."""
+    """Return the controller of a method, saved methods included."""
     written = MethodSpec.parse(method)
     return (_lookup(written) or SAVED).controller(written.rates)
 
 
 def method_identity(method: MethodSpec | str, policy: DiffusionPolicy) -> dict[str, Any]:
-    """Return all that makes the episodes of one method its own, as JSON values for an `EpisodeLog`.
+    """Return the JSON values that tell one method's episodes from others', for an `EpisodeLog`.
 
     Args:
         method: as it is to be called.

@@ -1,4 +1,4 @@
-"""How the chunks of a method are executed: how often it is asked, for how many chunks at a time, beside which controller."""
+"""Execution of a method's chunks: how often the policy is called, for how many samples, with which controller."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["execution_options", "executed_every", "make_executor", "make_realtim
 
 
 def executed_every(method: MethodSpec | str, policy: DiffusionPolicy, n_action_steps: int) -> int:
-    """Return the environment steps from one policy call of a method to the next.
+    """Return the environment steps between two policy calls of a method.
 
     Args:
         method: such as ``"ddpm3_logsnr_every2"``.
@@ -37,14 +37,14 @@ def executed_every(method: MethodSpec | str, policy: DiffusionPolicy, n_action_s
 
 
 def execution_options(method: MethodSpec | str) -> dict[str, Any]:
-    """Return ``num_samples`` and ``selector`` of an executor: backward coherence alone, where several chunks are sampled."""
+    """Return ``num_samples`` and ``selector`` of an executor: backward coherence alone if several chunks are sampled."""
     samples = MethodSpec.parse(method).samples
     selector: TensorDictModuleBase | None = CoherentChunk() if samples > 1 else None
     return {"num_samples": samples, "selector": selector}
 
 
 def make_executor(method: MethodSpec | str, policy: DiffusionPolicy, n_action_steps: int) -> ChunkExecutor:
-    """Return what executes the chunks of a method; the arguments are those of `executed_every`.
+    """Return the executor of a method's chunks; arguments are those of `executed_every`.
 
     Raises:
         InputError: as `executed_every`, and for a method that looks ahead to when its answer begins: this world waits.
@@ -73,7 +73,7 @@ def make_realtime_executor(
     control_freq: float,
     model: StateModel | None = None,
 ) -> RealtimeExecutor:
-    """Return what executes the chunks of a method in a world that does not wait.
+    """Return the executor of a method's chunks under inference delay.
 
     Args:
         method, policy, n_action_steps: of `executed_every`.

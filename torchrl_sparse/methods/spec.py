@@ -1,4 +1,4 @@
-"""A method as a value, and the label it is written as: the one grammar of methods.
+"""Methods as values, with the label grammar from which they are parsed.
 
 ::
 
@@ -33,7 +33,7 @@ _NAME = re.compile(rf"(?:uniform{_COUNT}(?:_(?!$)|$))?(?:({CHAIN_PATTERN})(?:_wa
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """Describe a method: what it prunes, how it samples, and how its chunks are executed.
+    """Specification of a method: what it prunes, how it samples, and how its chunks are executed.
 
     Every function that takes a method takes this or its label; ``str(spec)`` is the label.
 
@@ -84,7 +84,7 @@ class MethodSpec:
 
     @classmethod
     def parse(cls, method: MethodSpec | str) -> MethodSpec:
-        """Return the method of a label, and one that is read already as it is.
+        """Parse a label to a method; a `MethodSpec` is returned unchanged.
 
         Raises:
             InputError: unless the label is written as the module says.
@@ -93,7 +93,7 @@ class MethodSpec:
 
     @property
     def name(self) -> str:
-        """The part of the label that says planner, sampler and start."""
+        """The label's part for planner, sampler and start."""
         planner = f"{self.planner}{self.interval or ''}"
         alone = self.sampler is not None and planner == "dense"
         start = (f"warm{self.warm}" if self.warm else None, "rtc" if self.rtc else None)

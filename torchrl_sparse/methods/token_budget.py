@@ -1,4 +1,4 @@
-"""A calibrated token budget: the number of a token pruner, chosen by a stated tolerance instead of by hand, as a JSON file.
+"""Calibrated token budgets: a pruner's number, chosen for a stated tolerance, stored as a JSON file.
 
 SpecPrune's paper (arXiv:2509.05614) sets alpha by hand for each task suite, from 0.6 to 1, and a baseline that is not tuned as
 well says nothing. `torchrl_sparse.training.vla.token_budget` measures what each number loses; here the choice is made, kept and
@@ -22,7 +22,7 @@ __all__ = ["BudgetPoint", "TokenBudget", "fewest_tokens", "numbered_pruner"]
 
 @dataclass(frozen=True)
 class BudgetPoint:
-    """The loss and the saving of one number.
+    """Loss and savings at one number.
 
     Attributes:
         number: SpecPrune's alpha, which multiplies its budget, a baseline's share of the tokens, and so on.
@@ -38,7 +38,7 @@ class BudgetPoint:
 
 @dataclass(frozen=True)
 class TokenBudget:
-    """A calibrated number, and the measurements that it was chosen from.
+    """A calibrated number and the measurements behind it.
 
     Attributes:
         method: key of `TOKEN_METHODS`.
@@ -73,12 +73,12 @@ class TokenBudget:
         return numbered_pruner(self.method, self.number, self.settings)
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write a JSON file that `from_pretrained` reads, in one piece or not at all."""
+        """Write a JSON file for `from_pretrained`, completely or not at all."""
         write_json(path, self)
 
     @classmethod
     def from_pretrained(cls, path: str | Path) -> TokenBudget:
-        """Load what `save_pretrained` wrote.
+        """Load a budget written by `save_pretrained`.
 
         Raises:
             FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
@@ -91,7 +91,7 @@ class TokenBudget:
 
 
 def numbered_pruner(method: str, number: float, settings: dict[str, Any]) -> TokenPruner:
-    """Return the pruner of a method of the table at a number.
+    """Return the pruner of a method in the table with its number set.
 
     Args:
         method: key of `TOKEN_METHODS`.
@@ -119,7 +119,7 @@ def numbered_pruner(method: str, number: float, settings: dict[str, Any]) -> Tok
 
 
 def fewest_tokens(points: Sequence[BudgetPoint], tolerance: float) -> float:
-    """Return the number that keeps the fewest tokens of those from which on none with more loses more than ``tolerance``.
+    """Return the number that keeps fewest tokens such that it and all larger budgets lose at most ``tolerance``.
 
     Numbers that keep as many tokens, as all of VLA-Cache do, go from the smallest to the largest.
 

@@ -47,7 +47,7 @@ Settings = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class TokenMethod:
-    """One entry of the table: how a method is made, controlled and drawn.
+    """One entry of the method table: how a method is made, controlled and drawn.
 
     Attributes:
         make: called with keyword arguments; returns the pruner, or None for the dense policy.
@@ -137,7 +137,7 @@ tokens, ``efficientvla_layers`` skips layers too. ``sparsevlm`` chooses the word
 
 
 def parse_token_method(method: MethodSpec | str) -> MethodSpec:
-    """Return a method that is in the table; InputError if it is not, or is asked for what it does not take.
+    """Parse the label of a method in the table; InputError if it is unknown or has unsupported parts.
 
     >>> parse_token_method("random@specprune@0.4").like
     'specprune@0.4'
@@ -159,7 +159,7 @@ def parse_token_method(method: MethodSpec | str) -> MethodSpec:
 
 
 def check_matches(texts: Iterable[str]) -> None:
-    """Raise InputError if a method matches one that is not among ``texts``, or that matches another itself.
+    """Raise InputError if a method matches one that is not among ``texts``, or that itself matches another.
 
     >>> check_matches(["dense", "fastv@specprune"])
     Traceback (most recent call last):
@@ -176,7 +176,7 @@ def check_matches(texts: Iterable[str]) -> None:
 def make_pruner(
     method: MethodSpec | str, *, number: float | None = None, settings: Settings | None = None
 ) -> TokenPruner | None:
-    """Return the pruner of a method, None for the dense policy.
+    """Return the pruner of a method; None for the dense policy.
 
     Args:
         method: as the module says.
@@ -202,7 +202,7 @@ def make_pruner(
 def make_controller(
     method: MethodSpec | str, settings: Settings | None = None
 ) -> TensorDictModuleBase | None:
-    """Return the controller of a method, None where it has none.
+    """Return the controller of a method; None if it has none.
 
     Args:
         method: as the module says.
@@ -217,6 +217,6 @@ def make_controller(
 
 
 def settings_of(method: MethodSpec | str, settings: Settings | None) -> dict[str, Any]:
-    """Return the section of ``settings`` that a method reads; empty where it reads none."""
+    """Return the section of ``settings`` that a method reads; empty if it reads none."""
     section = TOKEN_METHODS[parse_token_method(method).name].settings
     return {} if section is None else dict((settings or {}).get(section, {}))

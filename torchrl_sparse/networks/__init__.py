@@ -1,4 +1,4 @@
-"""Networks and samplers: what is computed, whatever decides when."""
+"""Networks and samplers, independent of planners and engines."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""A name of a policy, for everything that is made for one: schedules, pruners, episodes, calibrations."""
+"""Fingerprints of policies, for everything made for one of them: schedules, pruners, episodes, calibrations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _DIGITS, _DIGITS_OF_UNITS = 16, 8
 
 
 def networks_fingerprint(*networks: nn.Module) -> str:
-    """Return sixteen hexadecimal digits that name the configs and weights of networks, at the fp16 precision of their files.
+    """Return sixteen hexadecimal digits that identify networks' configs and weights, at the fp16 precision of their files.
 
     Args:
         networks: each with a dict ``config`` beside its weights.
@@ -31,7 +31,7 @@ def networks_fingerprint(*networks: nn.Module) -> str:
 def policy_fingerprint(
     *networks: nn.Module, normalizer: Mapping[str, Tensor], trained: Mapping[str, Any]
 ) -> str:
-    """Return the `networks_fingerprint`, a hyphen, and eight digits that name what the weights mean something under.
+    """Return the `networks_fingerprint`, a hyphen, and eight digits that identify normaliser and training settings.
 
     Args:
         networks: see `networks_fingerprint`.
@@ -45,7 +45,7 @@ def policy_fingerprint(
 
 
 def full_fingerprint(weights: str, units: bytes) -> str:
-    """Return the name of weights, a hyphen, and eight digits that name what they mean something under.
+    """Return a weights' fingerprint, a hyphen, and eight digits that identify normaliser and training settings.
 
     >>> full_fingerprint("0123456789abcdef", b"[-1, 1]")
     '0123456789abcdef-3981c725'
@@ -54,7 +54,7 @@ def full_fingerprint(weights: str, units: bytes) -> str:
 
 
 def is_same_policy(noted: Any, asked: Any) -> bool:
-    """Tell whether what a file notes is the fingerprint ``asked``, or what earlier files note of that policy.
+    """Tell whether a file's noted fingerprint is ``asked``, or the older form of it.
 
     Those name the weights alone: policies that differ in their normaliser alone are one to them.
 

@@ -1,4 +1,4 @@
-"""Weights that cannot be written: every way that PyTorch offers raises, so that what was made of them needs no second look.
+"""Write protection of weights: every PyTorch write raises, so that values derived from them stay valid without checks.
 
 Parameters and buffers get a class that refuses whatever writes in place, as does all that shares their memory, and the
 dictionaries in which modules hold them refuse others. What was taken of them before has none of their memory: they are moved.
@@ -30,14 +30,14 @@ _HARMLESS_SETTERS = {"grad", "requires_grad"}
 
 
 class FrozenError(RuntimeError):
-    """A write to weights that ``policy.freeze()`` has promised to keep."""
+    """Error for a write to weights that ``policy.freeze()`` protects."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"{name}: frozen by policy.freeze(); change copy.deepcopy(policy), which is not")
 
 
 class Frozen:
-    """The frozen parameters and buffers of a module, from when this is made; :meth:`of` gives that of a module.
+    """Write protection of a module's parameters and buffers, from construction on; :meth:`of` returns a module's.
 
     Args:
         module: whose weights to freeze; copies and pickles of it are not frozen.
@@ -73,25 +73,25 @@ class Frozen:
 
     @staticmethod
     def of(module: nn.Module) -> Frozen | None:
-        """Return what is frozen of ``module``, or None."""
+        """Return the write protection of ``module``, or None."""
         return getattr(module._parameters, "frozen", None)
 
     def check(self) -> None:
-        """Raise FrozenError, naming it, if a weight was written through what was taken of it before it was frozen."""
+        """Raise FrozenError, naming the weight, if it was written through a reference taken before it was frozen."""
         versions = [*map(_VERSION, self._counted)]
         if versions != self._versions:
             pairs = zip(self._names, versions, self._versions, strict=True)
             raise FrozenError(next(name for name, now, before in pairs if now != before))
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return what ``make`` returned when it was first asked for under this key."""
+        """Return the result of ``make`` from its first call under this key."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
 
 
 class FrozenDict(dict):
-    """Parameters, buffers or parts of a frozen module; copies and pickles are plain dictionaries."""
+    """Parameters, buffers or submodules of a frozen module; copies and pickles are plain dictionaries."""
 
     def __init__(self, members: dict, path: str, frozen: Frozen) -> None:
         super().__init__(members)
@@ -118,7 +118,7 @@ class FrozenDict(dict):
 
 
 class FrozenTensor(Tensor):
-    """A buffer, or what shares the memory of a weight; reading it is all that it allows."""
+    """A buffer, or a tensor that shares a weight's memory; read-only."""
 
     @classmethod
     def __torch_function__(
@@ -154,7 +154,7 @@ class FrozenTensor(Tensor):
 
 
 class FrozenParameter(nn.Parameter):
-    """A parameter that refuses to be written; copies and pickles of it do not."""
+    """A read-only parameter; its copies and pickles are writable."""
 
     __torch_function__ = FrozenTensor.__torch_function__
     set_ = FrozenTensor.set_

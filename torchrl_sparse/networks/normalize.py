@@ -1,4 +1,4 @@
-"""Affine maps between environment units and those of the policy, as published for Diffusion Policy.
+"""Affine maps between environment units and policy units, as published for Diffusion Policy.
 
 Absolute-pose actions (arXiv:2303.04137, robomimic tasks): positions are range-normalised to [-1, 1] per
 dimension, the 6-D rotation and the gripper, already in that range, are kept. Low-dimensional states: one
@@ -23,7 +23,7 @@ MIN_RANGE = 1e-4
 
 
 class Normalizer(nn.Module):
-    """``normalised = x * scale + offset`` for states and actions; the four tensors are buffers.
+    """Normaliser of states and actions, ``normalised = x * scale + offset``; the four tensors are buffers.
 
     Args:
         state_scale, state_offset: f32 [Ds].
@@ -89,15 +89,15 @@ class Normalizer(nn.Module):
         return cls(scale.clone(), offset.clone(), *(_pose_map(action) if poses else _range_map(action)))
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Map states [..., Ds] in environment units to the policy's."""
+        """Map states [..., Ds] from environment units to the policy's."""
         return state * self.state_scale + self.state_offset
 
     def normalize_action(self, action: Tensor) -> Tensor:
-        """Map actions [..., A] in environment units to the policy's."""
+        """Map actions [..., A] from environment units to the policy's."""
         return action * self.action_scale + self.action_offset
 
     def unnormalize_action(self, action: Tensor) -> Tensor:
-        """Map actions [..., A] of the policy to environment units."""
+        """Map actions [..., A] from the policy's units to environment units."""
         return (action - self.action_offset) / self.action_scale
 
 

@@ -1,4 +1,4 @@
-"""Sizes that a file or a caller asks for, checked before anything is made of them."""
+"""Checks of sizes from a file or a caller, before memory is allocated for them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["check_size"]
 
 
 def check_size(name: str, value: Any, most: int, least: int = 1) -> None:
-    """Raise InputError unless ``value`` is a whole number from ``least`` to ``most``.
+    """Raise InputError unless ``value`` is an integer from ``least`` to ``most``.
 
     A network's ``most`` lies far beyond any use. It bounds what a configuration can take before its weights are seen.
 

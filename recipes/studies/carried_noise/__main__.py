@@ -1,4 +1,4 @@
-"""Measure how much of the noise that a chain begins with is left in its answers: why deterministic samplers lose.
+"""Measure how strongly a policy's actions depend on the initial noise, to explain why deterministic samplers lose.
 
     python -m recipes.studies.carried_noise task=lift demos=data/lift_proficient.h5
 

@@ -1,4 +1,4 @@
-"""How much of the noise that a chain begins with is left in its answers.
+"""Measurement of how strongly a policy's actions depend on the initial noise of the denoising chain.
 
 A deterministic sampler hands the noise that it predicted on to the next step, so that every step sees the same noise, and errs
 in the same direction, until the last. A stochastic one draws new noise between steps, and the errors of its clean predictions
@@ -26,7 +26,7 @@ _BATCH = 128  # samples that go through the network at a time
 
 @dataclass(frozen=True)
 class CarriedNoise:
-    """What the noise of a chain does to the actions that are executed, all normalised.
+    """Effect of the initial noise on the executed actions, all normalised.
 
     Attributes:
         timesteps: of the K steps.
@@ -53,7 +53,7 @@ def carried_noise(
     n_action_steps: int = 8,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> CarriedNoise:
-    """Answer every policy call ``draws`` times and say what is left of the first noise.
+    """Answer every policy call ``draws`` times and measure how much the actions depend on the initial noise.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.

@@ -1,4 +1,4 @@
-"""Draw what is left of the noise that a chain begins with."""
+"""Figure of how strongly predictions depend on the initial noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["plot_carried_noise"]
 
 
 def plot_carried_noise(results: CarriedNoiseResults, path: str | os.PathLike) -> Path:
-    """Draw the correlation of each step's clean prediction with the first noise, and spread and error of the answers.
+    """Draw each step's correlation with the initial noise, and the spread and error of the final actions.
 
     Args:
         results: content of a ``carried_noise_TASK.json``.

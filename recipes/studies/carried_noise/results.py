@@ -1,4 +1,4 @@
-"""``carried_noise_TASK.json``: what is left of the first noise under several samplers."""
+"""``carried_noise_TASK.json``: how strongly actions depend on the initial noise, under several samplers."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def save_carried_noise(results: CarriedNoiseResults, path: str | os.PathLike) ->
 
 
 def carried_noise_rows(results: CarriedNoiseResults) -> list[dict[str, str]]:
-    """Return a row for every sampler: how its last prediction follows its first noise, and its answers."""
+    """Return one row per sampler: correlation of its last prediction with its initial noise, and its actions' statistics."""
     return [
         {
             "sampler": name,

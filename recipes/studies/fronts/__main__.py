@@ -1,4 +1,4 @@
-"""Draw what methods gain and lose on all tasks of this repository in one picture.
+"""Draw success against speed-up for all methods on all tasks of this repository in one picture.
 
     python -m recipes.studies.fronts results=[assets/lift/results.json,assets/pusht/results.json]
 

@@ -1,4 +1,4 @@
-"""All tasks in one picture: how much faster methods are, or what they spend, and what that does to success and its time."""
+"""One picture of all tasks: speed-up or compute spent, against the change in success and in time to success."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ _SPENDERS = (
 
 
 def plot_fronts(results: Sequence[Results], path: str | os.PathLike) -> Path:
-    """Draw, for each task, what methods lose to dense against how many times as fast as dense a policy call is.
+    """Draw, for each task, the loss of success and time against the speed-up of a policy call over dense.
 
     Above is success in points, or the score; below the ratio of times to success. Bars are 95 % intervals, the dashed
     lines the margins. Methods that are of no known kind are left out. Steps of one sampler are joined and numbered.
@@ -106,7 +106,7 @@ def plot_fronts(results: Sequence[Results], path: str | os.PathLike) -> Path:
 
 
 def plot_spending(results: Sequence[Results], path: str | os.PathLike) -> Path:
-    """Draw the same against what a second of the robot's time costs, for methods that ask more often or for several samples.
+    """Draw the same loss against compute per second of robot time, for methods that replan more often or sample several chunks.
 
     Points are marked with the environment steps from one policy call to the next, eight where a name says nothing.
 

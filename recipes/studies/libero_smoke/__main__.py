@@ -1,4 +1,4 @@
-"""Step one task of each LIBERO suite with a vision-language-action policy, pruned by speed, and draw what it looked at.
+"""Step one task of each LIBERO suite with a vision-language-action policy pruned by hand speed, and draw the tokens it kept.
 
     python -m recipes.studies.libero_smoke                         # random weights: does everything fit together?
     python -m recipes.studies.libero_smoke policy=PATH steps=220   # a policy of `VLAPolicy.save_pretrained`
@@ -43,7 +43,7 @@ def main(config: DictConfig) -> None:
 
 
 def play(suite: str, config: DictConfig) -> str:
-    """Step and draw one suite, and tell what happened; a policy is loaded for each, and none while another is in memory."""
+    """Step and draw one suite and return a summary. Each suite loads its own policy, so only one is in memory at a time."""
     policy = make_policy(suite, config).to(config.device)
     policy.pruner = SpecPrune(config.preset, alpha=config.alpha)
     steps = rollout(policy, suite, config)
@@ -56,7 +56,7 @@ def play(suite: str, config: DictConfig) -> str:
 
 
 def make_policy(suite: str, config: DictConfig) -> VLAPolicy:
-    """Load the policy in a folder, with the suite's own range of actions, or make a small one with random weights."""
+    """Load the policy in a folder with the suite's own action range, or make a small one with random weights."""
     if config.policy is not None:
         return load_vla(config, suite)
     torch.manual_seed(0)
@@ -64,7 +64,7 @@ def make_policy(suite: str, config: DictConfig) -> VLAPolicy:
 
 
 def rollout(policy: VLAPolicy, suite: str, config: DictConfig) -> TensorDictBase:
-    """Run ``steps`` steps of the suite's task, [T]."""
+    """Run ``steps`` steps of the suite's task and return them, [T]."""
     size = policy.network.config.image_size
     as_released = policy.source.images == "openvla_oft"
     env = make_libero_env(suite, config.task_id, image_size=size, as_released=as_released)

@@ -1,4 +1,4 @@
-"""Measure whether a pruner looks, and what its blocks could reuse: over rollouts that it was not trained on.
+"""Measure on unseen rollouts whether a pruner's masks depend on the observation, and what its pruned blocks could reuse.
 
     python -m recipes.studies.looking task=lift policy=assets/lift pruner=assets/lift/sag
 
@@ -88,7 +88,7 @@ def main(config: DictConfig) -> None:
 def climbed(
     policy: DiffusionPolicy, queries: TensorDictBase, n_action_steps: int, config: DictConfig
 ) -> dict:
-    """Return, and print, what masks of each policy call's own could gain."""
+    """Return and print how much separate masks for each policy call could gain."""
     total = 3 * config.oracle.attempts
     with tqdm(desc=f"{'oracle':>14}", total=total, unit="attempt", mininterval=2) as bar:
         found = oracle(policy, queries, **config.oracle, n_action_steps=n_action_steps, on_attempt=bar.update)
@@ -99,7 +99,7 @@ def climbed(
 
 
 def make_policy(config: DictConfig) -> DiffusionPolicy:
-    """Return the policy with the pruner and its sampler, or with the sampler that is asked for."""
+    """Return the policy with the pruner and its sampler, or with the requested sampler."""
     policy = DiffusionPolicy.from_pretrained(config.policy).to(config.device)
     if config.pruner is None:
         return (

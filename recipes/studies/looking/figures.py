@@ -1,4 +1,4 @@
-"""Draw whether and when a pruner looks, and what pruned blocks could reuse."""
+"""Figures of when a pruner's masks change with the observation, and of what pruned blocks could reuse."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SOURCES = {
 
 
 def plot_looking(found: Looking, path: str | os.PathLike, *, title: str) -> Path:
-    """Draw where masks change over the phases of an episode: a row per phase, a column per cell, step after step.
+    """Draw where masks change over the phases of an episode: one row per phase, one column per cell, step after step.
 
     Args:
         found: of :func:`~recipes.studies.looking.following.looking`.
@@ -48,7 +48,7 @@ def plot_looking(found: Looking, path: str | os.PathLike, *, title: str) -> Path
 
 
 def plot_reuse_sources(found: ReuseSources, path: str | os.PathLike, *, title: str) -> Path:
-    """Draw how alike each block's output is to what it could reuse, mean over the denoising steps after the first.
+    """Draw how similar each block's output is to each reuse source, mean over the denoising steps after the first.
 
     Args:
         found: of :func:`~recipes.studies.looking.reuse_sources.reuse_sources`.

@@ -1,4 +1,4 @@
-"""Whether a pruner looks: how much its masks differ between observations, when they do, and whether that pays.
+"""Measurement of how much a pruner's masks differ between observations, when they differ, and whether that pays.
 
 A pruner that reads the observation (SAG, arXiv:2601.12894) can end up with one mask for all observations and lose nothing by
 its own loss. So its masks are compared with their own mean, which prunes as much and reads nothing, and with each other's: if
@@ -35,7 +35,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Looking:
-    """What the masks of a pruner do over rollouts.
+    """Statistics of a pruner's masks over rollouts.
 
     Attributes:
         policy calls, episodes: that were looked at.
@@ -71,7 +71,7 @@ def looking(
     phases: int = 4,
     seed: int = 0,
 ) -> Looking:
-    """Ask recorded policy calls for their masks, and for their actions under these and others.
+    """Compute the masks of recorded policy calls, and their actions under these masks and others.
 
     Args:
         policy: with the pruner as its planner.
@@ -113,19 +113,19 @@ def looking(
 
 
 def planned_queries(policy: DiffusionPolicy, queries: TensorDictBase) -> TensorDictBase:
-    """Return policy calls with their conditions and the masks that the policy's planner has for them."""
+    """Return policy calls with their conditions and the masks that the policy's planner writes for them."""
     return policy.module["plan"](policy.module["encode"](queries.select(*policy.in_keys, strict=False)))
 
 
 def actions_under(policy: DiffusionPolicy, encoded: TensorDictBase, masks: Tensor) -> Tensor:
-    """Return normalised actions [N, H, A] of policy calls under ``masks``, by the planner's rule of reuse."""
+    """Return normalised actions [N, H, A] of policy calls under ``masks`` and the planner's reuse rule."""
     noise = policy.sample_noise(encoded[keys.SEED].flatten())
     parts = zip(*(part.split(ANSWER_BATCH) for part in (noise, encoded[keys.COND], masks)), strict=True)
     return torch.cat([policy.denoise(*part, reuse=policy.plan.reuse) for part in parts])
 
 
 def episode_rows(queries: TensorDictBase) -> list[Tensor]:
-    """Return the rows of each episode, in their order.
+    """Return the rows of each episode, in order.
 
     Raises:
         InputError: if there are fewer than two.
@@ -138,7 +138,7 @@ def episode_rows(queries: TensorDictBase) -> list[Tensor]:
 
 
 def episode_phases(episodes: list[Tensor], count: int, phases: int) -> Tensor:
-    """Return i64 [count]: in which of the equal parts of its episode each policy call is."""
+    """Return, i64 [count], the phase of each policy call: which of the equal parts of its episode it is in."""
     phase = torch.empty(count, dtype=torch.long)
     for rows in episodes:
         phase[rows.cpu()] = torch.arange(len(rows)) * phases // len(rows)
@@ -146,7 +146,7 @@ def episode_phases(episodes: list[Tensor], count: int, phases: int) -> Tensor:
 
 
 def paired_interval(difference: Tensor, episodes: list[Tensor]) -> tuple[float, float, float]:
-    """Return the mean over episodes and its 95 % interval; an episode's policy calls are no independent samples."""
+    """Return the mean over episodes and its 95 % interval; policy calls of one episode are not independent samples."""
     by_episode = torch.stack([difference[rows].mean() for rows in episodes])
     mean, half = by_episode.mean().item(), 1.96 * by_episode.std().item() / len(episodes) ** 0.5
     return mean, mean - half, mean + half

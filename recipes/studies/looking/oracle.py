@@ -1,4 +1,4 @@
-"""What looking could gain, as far as a search finds it: masks for all calls, for each phase of an episode, for each call.
+"""A search for how much observation-conditioned masks could gain: masks shared by all calls, by a phase, or by none.
 
 Masks are climbed to, from one that all share, with the answers of the dense policy known, which no pruner knows, on some draws
 of noise; and they are judged on others. What masks of their own gain there is what a pruner that reads the observation could
@@ -36,7 +36,7 @@ __all__ = ["Climber", "Oracle", "oracle", "swap_cells"]
 
 @dataclass(frozen=True)
 class Oracle:
-    """What masks are worth that are shared by fewer and fewer policy calls.
+    """Errors of searched masks that are shared by fewer and fewer policy calls.
 
     Attributes:
         calls, episodes: that masks were climbed to for.
@@ -58,7 +58,7 @@ class Oracle:
 
 
 class Climber:
-    """Says what masks are worth on some draws of noise.
+    """Hill climber over masks, scored on fixed draws of noise.
 
     Args:
         policy: with the sampler that is pruned, and the planner whose rule of reuse holds.
@@ -88,7 +88,7 @@ class Climber:
 
     @torch.no_grad()
     def errors(self, masks: Tensor) -> Tensor:
-        """Return f32 [N] on the CPU, of each policy call under its own of ``masks``, bool [N, K, 3L]."""
+        """Return the error of each policy call under its mask, f32 [N] on the CPU, for ``masks`` bool [N, K, 3L]."""
         repeated = masks.to(self._policy.device).repeat_interleave(self._draws, dim=0)
         answers = actions_under(self._policy, self._asked, repeated)[:, self._executed]
         error = (answers - self._dense).abs().mean(dim=(1, 2))
@@ -103,7 +103,7 @@ class Climber:
         seed: int = 0,
         on_attempt: Callable[[], object] = lambda: None,
     ) -> Tensor:
-        """Return the masks that were climbed to, bool [N, K, 3L], equal within a group.
+        """Return the masks that hill climbing found, bool [N, K, 3L], equal within a group.
 
         Args:
             start: bool [K, 3L], where all begin.
@@ -129,7 +129,7 @@ class Climber:
 
 
 def swap_cells(mask: Tensor, rng: np.random.Generator) -> Tensor:
-    """Return a mask that computes as many blocks of each type, most often all but one in the same cells.
+    """Return a mask with as many computed blocks of each type, usually with one cell swapped for another.
 
     Args:
         mask: bool [K, 3L], True = pruned; the first step stays as it is.
@@ -169,7 +169,7 @@ def oracle(
     seed: int = 0,
     on_attempt: Callable[[], object] = lambda: None,
 ) -> Oracle:
-    """Climb to masks for all policy calls, for each phase of an episode and for each call, and judge them on other noise.
+    """Search masks for all policy calls, for each episode phase and for each call, and score them on fresh noise.
 
     Args:
         policy: with the pruner as its planner; all begin at the mean of its masks.

@@ -1,4 +1,4 @@
-"""How alike a block's output is to everything that a pruned block could reuse in its place.
+"""Similarity of a block's output to everything that a pruned block could reuse in its place.
 
 Three rules are published. BAC (arXiv:2506.13456) reuses the block's own output of an earlier denoising step. SAG
 (arXiv:2601.12894, "one-for-all") reuses the latest output of any block of its type: that of the layer before in the same step,
@@ -26,7 +26,7 @@ __all__ = ["ReuseSources", "reuse_sources", "source_similarity"]
 
 @dataclass(frozen=True)
 class ReuseSources:
-    """Cosine similarity of each block's output to what it could reuse, mean over policy calls; ``[3L][K]`` each.
+    """Cosine similarity of each block's output to each reuse source, mean over policy calls; ``[3L][K]`` each.
 
     Attributes:
         queries: that were asked, densely.
@@ -63,7 +63,7 @@ def source_similarity(features: Tensor, before: Tensor | None = None) -> Tensor:
 
 @torch.no_grad()
 def reuse_sources(policy: DiffusionPolicy, queries: TensorDictBase) -> ReuseSources:
-    """Ask recorded policy calls densely and compare what their blocks return.
+    """Run recorded policy calls densely and compare the outputs of their blocks.
 
     Args:
         policy: the trained policy with its sampler; its planner does not matter.

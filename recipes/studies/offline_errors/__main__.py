@@ -1,4 +1,4 @@
-"""Measure what methods do to a policy's answers, and whether that says what they do to its episodes.
+"""Measure how methods change a policy's actions, and whether that predicts how its episodes go.
 
     python -m recipes.studies.offline_errors task=can demos=data/can.h5 results=[assets/can/weaker/results_300.json]
 
@@ -78,7 +78,7 @@ def main(config: DictConfig) -> None:
 
 
 def put_together(paths: Sequence[str], out: Path) -> None:
-    """Write and show, over several tasks, which measure says how episodes go."""
+    """Write and show, over several tasks, which action measure predicts the results of episodes."""
     agreement = agreement_of([load_offline(path) for path in paths])
     save_agreement(agreement, out / "offline_agreement.json")
     plot_agreement(agreement, out / "offline_agreement.png")
@@ -87,7 +87,7 @@ def put_together(paths: Sequence[str], out: Path) -> None:
 
 
 def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
-    """Return what each table's methods came to, of those whose answers it can be due to."""
+    """Return each table's episode results, for the methods that differ from dense in their actions alone."""
     played = {}
     for path in config.results:
         results = load_results(path)
@@ -99,7 +99,7 @@ def read_tables(config: DictConfig, task: str) -> dict[str, Any]:
 
 
 def answers_alone(name: MethodSpec) -> bool:
-    """Tell whether episodes follow from the method's answers, not from how often or for how many it is asked."""
+    """Tell whether a method changes only the actions, not how often or how many times the policy is called."""
     return name.every is None and name.samples == 1 and not name.ensembled and not name.ahead
 
 
@@ -110,7 +110,7 @@ def no_calibration() -> Any:
 def measure(
     methods: dict[str, DiffusionPolicy], targets: Any, config: DictConfig, n_action_steps: int
 ) -> dict[str, OfflineErrors]:
-    """Draw the answers of dense, twice, and of every method, each with noise of its own."""
+    """Sample the actions of dense, twice, and of every method, each with independent noise."""
     options = {"draws": config.draws, "n_action_steps": n_action_steps}
     first = methods[DENSE].n_obs_steps - 1
     wanted = targets["target"][:, first : first + n_action_steps].flatten(1)

@@ -1,4 +1,4 @@
-"""``offline_agreement.json``: over several tasks, which number of a method's answers says how its episodes go."""
+"""``offline_agreement.json``: which offline measure of a method's actions predicts its episodes, over several tasks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _COSTS: dict[str, Callable[[Outcome], float]] = {
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the order of methods by a measure agrees with their order by what episodes came to.
+    """Agreement between the order of methods by an offline measure and their order by episode results.
 
     Attributes:
         tables: table -> Spearman's rank correlation of its methods; 1 where less always went with better.
@@ -80,7 +80,7 @@ def save_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path
 
 
 def agreement_of(results: Sequence[OfflineResults]) -> OfflineAgreement:
-    """Put all tables of several tasks together, by the errors of the file that holds them.
+    """Combine all tables of several tasks, each with the errors of the file that lists it.
 
     Raises:
         InputError: for a table that is in two files.
@@ -111,7 +111,7 @@ def _short(path: str) -> str:
 
 
 def together_rows(agreement: OfflineAgreement) -> dict[str, list[dict[str, str]]]:
-    """Return two tables, ``"success"`` and ``"time"``, with a row for each measure."""
+    """Return two tables, ``"success"`` and ``"time"``, with one row per measure."""
 
     def row(measure: str, found: Agreement) -> dict[str, str]:
         cells = {

@@ -1,4 +1,4 @@
-"""Draw which number of a method's answers says how its episodes go, table by table."""
+"""Figure of which offline measure predicts episode results, table by table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TITLES = {"success": "with success", "time": "with time to success"}
 
 
 def plot_agreement(agreement: OfflineAgreement, path: str | os.PathLike) -> Path:
-    """Draw, for each measure, the rank correlation of each table as a dot and that of all as a bar.
+    """Draw, for each measure, each table's rank correlation as a dot and the overall one as a bar.
 
     Args:
         agreement: content of an ``offline_agreement.json``.

@@ -1,4 +1,4 @@
-"""How far a method's answers are from demonstrations and from dense's, measured without an episode.
+"""Distance of a method's actions from the demonstrations and from dense's, measured without playing episodes.
 
 A policy's answer is a distribution, of which a policy call shows one draw. Errors of single answers reward a chain that
 averages over several good ones; the energy score does not: it is least, in the mean, for answers that are distributed as what
@@ -23,7 +23,7 @@ __all__ = ["OfflineErrors", "draw_answers", "energy_scores", "offline_errors"]
 
 @dataclass(frozen=True)
 class OfflineErrors:
-    """Of the actions that are executed, normalised; means over policy calls and draws.
+    """Errors of the executed actions, normalised; means over policy calls and draws.
 
     Attributes:
         error: absolute difference to the demonstrated actions.
@@ -42,7 +42,7 @@ class OfflineErrors:
 def draw_answers(
     policy: DiffusionPolicy, queries, *, draws: int, n_action_steps: int, seed: int = 0
 ) -> Tensor:
-    """Answer every policy call ``draws`` times, each with noise of its own.
+    """Answer every policy call ``draws`` times, each with independent noise.
 
     Args:
         policy: under the method's sampler and planner.
@@ -64,7 +64,7 @@ def draw_answers(
 
 
 def offline_errors(answers: Tensor, demonstrated: Tensor, dense: Tensor) -> OfflineErrors:
-    """Compare a method's answers with what was demonstrated and with dense's.
+    """Compare a method's actions with the demonstrated ones and with dense's.
 
     Args:
         answers: f32 [N, S, D], S >= 2 draws for each of N policy calls.

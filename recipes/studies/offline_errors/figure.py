@@ -1,4 +1,4 @@
-"""Draw what methods do to answers against what they do to episodes."""
+"""Figure of how methods change actions against how they change episodes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PANELS = {
 
 
 def plot_offline(results: OfflineResults, table: str, path: str | os.PathLike) -> Path:
-    """Draw the mean time of a table's methods, as a share of dense's, against three measures of their answers.
+    """Draw the mean time of a table's methods, as a share of dense's, against three measures of their actions.
 
     Args:
         results: content of an ``offline_errors_TASK.json``.

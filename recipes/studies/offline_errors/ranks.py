@@ -1,4 +1,4 @@
-"""Whether two numbers order the same things alike, over several groups that are not to be mixed."""
+"""Rank correlation of two numbers over several groups whose members must not be compared across groups."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Numbers = Sequence[float]
 
 
 def rank_correlation(xs: Numbers, ys: Numbers) -> float:
-    """Return Spearman's rank correlation, ties at their mean rank; 0 where one of them tells nothing apart.
+    """Return Spearman's rank correlation, with mean ranks for ties; 0 if either input is constant.
 
     >>> rank_correlation([1, 2, 3], [10, 30, 20]), rank_correlation([1, 2, 3], [5, 5, 5])
     (0.5, 0.0)
@@ -24,7 +24,7 @@ def rank_correlation(xs: Numbers, ys: Numbers) -> float:
 def mean_rank_correlation(
     groups: Sequence[tuple[Numbers, Numbers]], *, trials: int = 10_000, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the mean rank correlation of groups, each weighed by its size, and how often chance makes one as large.
+    """Return the size-weighted mean rank correlation of groups, and how often chance makes one as large.
 
     Args:
         groups: pairs of equally many x and y.
@@ -49,7 +49,7 @@ def mean_rank_correlation(
 def difference_ci95(
     groups: Sequence[tuple[Numbers, Numbers, Numbers]], *, draws: int = 10_000, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the interval of 95 % of by how much x correlates better with y than another number does.
+    """Return the 95 % interval of how much better x correlates with y than another number does.
 
     Args:
         groups: equally many of x, of the other number and of y; see `mean_rank_correlation`.

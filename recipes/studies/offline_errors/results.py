@@ -1,4 +1,4 @@
-"""``offline_errors_TASK.json``: what methods do to the answers, and whether that says what they do to episodes."""
+"""``offline_errors_TASK.json``: how methods change a policy's actions, and whether that predicts its episodes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MEASURES = tuple(field.name for field in fields(OfflineErrors))
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method's episodes came to beside dense's of the same table.
+    """Episode results of a method relative to dense in the same table.
 
     Attributes:
         success: difference of success rates.
@@ -79,7 +79,7 @@ def save_offline(results: OfflineResults, path: str | os.PathLike) -> Path:
 
 
 def outcomes(results: Results) -> dict[str, Outcome]:
-    """Return what the methods of a table came to, but for dense itself; of a graded task, in their scores."""
+    """Return the episode results of a table's methods except dense; scores where the task is graded."""
     dense = results.dense
     return {
         name: Outcome(_reached(entry) - _reached(dense), entry.episode_length / dense.episode_length)
@@ -93,7 +93,7 @@ def _reached(entry: MethodEntry) -> float:
 
 
 def error_rows(results: OfflineResults) -> list[dict[str, str]]:
-    """Return a row for every method."""
+    """Return one row per method."""
     return [
         {"method": name, **{_words(measure): f"{value:.3f}" for measure, value in asdict(errors).items()}}
         for name, errors in results.errors.items()
@@ -101,7 +101,7 @@ def error_rows(results: OfflineResults) -> list[dict[str, str]]:
 
 
 def rank_agreement(results: OfflineResults, table: str, measure: str) -> Outcome:
-    """Return how the order of a table's methods by a measure agrees with their order by what episodes came to.
+    """Return how well the order of a table's methods by a measure agrees with their order by episode results.
 
     Spearman's rank correlation: 1 where a smaller error always went with a higher success, and with a shorter time.
     """
@@ -112,7 +112,7 @@ def rank_agreement(results: OfflineResults, table: str, measure: str) -> Outcome
 
 
 def agreement_rows(results: OfflineResults) -> list[dict[str, str]]:
-    """Return a row for every measure: its rank correlations with success and with time, of each table."""
+    """Return one row per measure: its rank correlations with success and with time, for each table."""
     rows = []
     for measure in MEASURES:
         row = {"measure": _words(measure)}

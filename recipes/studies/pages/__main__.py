@@ -1,4 +1,4 @@
-"""Write every table of results on the pages again, from the committed JSON that it shows.
+"""Rewrite every table of results on the pages from the committed JSON files.
 
 python -m recipes.studies.pages
 """

@@ -1,4 +1,4 @@
-"""Which method of a ``results.json`` to take: at a time a policy call may need, and at twenty times dense's speed.
+"""Recommendations from a ``results.json``: the best method within a time budget, and the best at twenty times dense's speed.
 
 Both are read off the table, so a choice among many methods looks better than it will play: what is chosen is to be confirmed
 on other seeds.
@@ -26,7 +26,7 @@ BUDGETS_MS = (1.5, 3.0, 5.0, 10.0, 30.0)
 
 
 def best_within(results: Results, seconds: float) -> str | None:
-    """Return the method that succeeds soonest of those whose median policy call takes no longer; None if none does.
+    """Return the method with the shortest time to success whose median policy call is within the budget, or None.
 
     Soonest is the smallest ratio of its restricted mean time, failures counted as the horizon, to dense's on the same seeds.
 
@@ -39,7 +39,7 @@ def best_within(results: Results, seconds: float) -> str | None:
 
 
 def budget_rows(results: Results) -> list[dict[str, str]]:
-    """Return one row per budget of time: the method that succeeds soonest within it, column -> text."""
+    """Return one row per time budget, column -> text: the method with the shortest time to success within it."""
     return [_budget_row(results, budget) for budget in BUDGETS_MS]
 
 
@@ -51,7 +51,7 @@ def _budget_row(results: Results, milliseconds: float) -> dict[str, str]:
 
 
 def headline(results: Results, goal: float = GOAL) -> tuple[str | None, str]:
-    """Return the method to name first, and what it reaches.
+    """Return the method to name first, with its results.
 
     That is the fastest one that is non-inferior to dense in success and in time. Where it is slower than ``goal``, the second
     text says what the method with the least time to success lacks that is fast enough.
@@ -82,7 +82,7 @@ def headline(results: Results, goal: float = GOAL) -> tuple[str | None, str]:
 
 
 def headline_rows(results: Results) -> list[dict[str, str]]:
-    """Return the one row of `headline`: column -> text."""
+    """Return `headline` as one row: column -> text."""
     name, remark = headline(results)
     if name is None:
         return [dict.fromkeys(("method", *_cells(results.dense)), "") | {"method": "none", _REMARK: remark}]

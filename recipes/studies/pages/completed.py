@@ -1,4 +1,4 @@
-"""How many parts of a task episodes did, method by method: the published p1 and p2 of block pushing, p1 to p4 of kitchen."""
+"""Table of subtasks completed by each method: the published p1 and p2 of block pushing, p1 to p4 of kitchen."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["completed_rows", "told_completed"]
 
 
 def told_completed(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
-    """Return the parts that each method's episodes did; a method whose task counts none is left out."""
+    """Return the number of subtasks in each method's episodes; methods whose task counts none are left out."""
     counts = {
         name: [e.completed for e in played if e.completed is not None] for name, played in episodes.items()
     }
@@ -21,7 +21,7 @@ def told_completed(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str,
 
 
 def completed_rows(completed: Mapping[str, Sequence[int]]) -> list[dict[str, str]]:
-    """Return one row per method: of how many episodes at least so many parts were done, with Wilson's 95 % interval.
+    """Return one row per method: the share of episodes with at least n subtasks done, with Wilson's 95 % interval.
 
     Args:
         completed: method -> the parts that its episodes did, see `EpisodeResult.completed`.

@@ -1,4 +1,4 @@
-"""Methods of a ``realtime.json`` against each other, each as late as it is: what its comparisons with dense leave open."""
+"""Pairwise comparisons of the methods in a ``realtime.json``, each at its own delay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of text from any file of results, the studies' too, with every column that a page may ask for."""
+"""Rows of text from any results file, including the studies', with every column that a page can show."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["read_table"]
 
 
 def read_table(path: Path, which: str | None = None, pairs: Sequence[tuple[str, str]] = ()) -> Table:
-    """Read a file of results, whose kind its name begins with.
+    """Read a results file; the start of its name says its kind.
 
     Args:
         path: ``results*.json``, ``acceleration*.json``, ``aggregate*.json``, ``realtime*.json``, ``engine*.json``,

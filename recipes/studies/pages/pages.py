@@ -1,4 +1,4 @@
-"""Tables of results on pages of Markdown, made from the JSON that they show: a page says which, one command writes it.
+"""Result tables in Markdown pages: each names the JSON file that it shows, and one command rewrites all of them.
 
 Two comments of a line each enclose every such table; what lies between them is replaced, and
 `tests/test_pages.py` fails where a page and its JSON differ::
@@ -81,13 +81,13 @@ class _Directive:
 
 
 def find_pages(root: str | os.PathLike) -> list[Path]:
-    """Return the pages of a repository: Markdown at its root and in its folders of pages, sorted."""
+    """Return the Markdown pages at a repository's root and in its page folders, sorted."""
     root = Path(root)
     return sorted([*root.glob("*.md"), *(page for name in _FOLDERS for page in (root / name).rglob("*.md"))])
 
 
 def write_pages(root: str | os.PathLike, *, dry: bool = False) -> list[Path]:
-    """Write the tables of all pages again.
+    """Rewrite the tables of all pages.
 
     Args:
         root: of the repository.
@@ -114,7 +114,7 @@ def write_pages(root: str | os.PathLike, *, dry: bool = False) -> list[Path]:
 
 
 def write_tables(text: str, root: str | os.PathLike, name: str = "page") -> str:
-    """Return a page with its tables written again.
+    """Return a page with its tables rewritten.
 
     Args:
         text: of the page.

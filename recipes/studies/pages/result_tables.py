@@ -1,4 +1,4 @@
-"""Tables of the files that a benchmark writes, with every column that a page may ask for."""
+"""Tables of the files that a benchmark writes, with every column that a page can show."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["acceleration_tables", "realtime_tables", "results_tables", "subject"
 
 
 def subject(results: Results) -> str:
-    """Return what tables and figures of several results tell apart: the task, and whether the policy has cameras for it."""
+    """Return the heading that tells results apart: the task, and whether the policy has cameras for it."""
     return f"{results.task}, cameras" if results.policy.cameras else results.task
 
 
 def results_tables(path: Path) -> dict[str, Table]:
-    """Return the tables of a ``results.json``: of its methods, its pairs, and what to choose."""
+    """Return the tables of a ``results.json``: its methods, its pairs, and the recommendations."""
     results = load_results(path)
     rows = results_rows(results)
     whole = [{**row, **_more(results, row["method"])} for row in rows]
@@ -65,7 +65,7 @@ def realtime_tables(path: Path) -> dict[str, Table]:
 
 
 def acceleration_tables(path: Path) -> dict[str, Table]:
-    """Return the tables of an ``acceleration.json``: of its candidates, and of those that were played."""
+    """Return the tables of an ``acceleration.json``: its candidates, and the methods that were played."""
     found = load_acceleration(path)
     rows = acceleration_rows(found)
     played = [row for row in rows if row["method"].removesuffix(" (chosen)") in found.played]

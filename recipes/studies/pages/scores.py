@@ -1,4 +1,4 @@
-"""How far episodes came, method by method, where a task is graded: Push-T's overlap, parts that are done."""
+"""Mean scores by method on graded tasks: Push-T's overlap, or subtasks done."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["score_rows", "told_scores"]
 
 
 def told_scores(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, dict[int, float]]:
-    """Return the scores of each method's episodes by seed; a method whose task has none is left out."""
+    """Return the scores of each method's episodes by seed; methods whose task has no scores are left out."""
     scores = {
         name: {e.seed: e.score for e in played if e.score is not None} for name, played in episodes.items()
     }
@@ -22,7 +22,7 @@ def told_scores(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, di
 
 
 def score_rows(scores: Mapping[str, Mapping[int, float]], margin: float) -> list[dict[str, str]]:
-    """Return one row per method: its mean score, and the paired difference to dense on the seeds of both.
+    """Return one row per method: its mean score, and the paired difference to dense on the shared seeds.
 
     Args:
         scores: method -> seed -> score in [0, 1]; at least two seeds that each method shares with ``dense``.

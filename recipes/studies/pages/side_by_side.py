@@ -1,4 +1,4 @@
-"""Methods of several tasks side by side, and beside the figures that a paper reports."""
+"""Methods of several tasks side by side, next to a paper's figures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Published", "PublishedFigure", "side_by_side"]
 
 @dataclass(frozen=True)
 class PublishedFigure:
-    """A paper's figures of one method on one task: success in percent, and how many times as fast as dense it is."""
+    """A paper's figures for one method on one task: success in percent, and speed-up over dense."""
 
     success: float
     speedup: float | None = None
@@ -29,7 +29,7 @@ class PublishedFigure:
 
 @dataclass(frozen=True)
 class Published:
-    """The figures of a paper.
+    """All figures taken from one paper.
 
     Attributes:
         source: where they are from, for people.

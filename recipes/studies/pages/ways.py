@@ -1,4 +1,4 @@
-"""Which ways episodes took, method by method: a method that solves as many but knows one way has collapsed."""
+"""Modes that each method's episodes take: a method that solves as many but takes only one mode has collapsed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["way_rows"]
 
 
 def way_rows(ways: Mapping[str, Sequence[int]]) -> list[dict[str, str]]:
-    """Return one row per method: how many episodes took each way, how many went between them, and the entropy in bits.
+    """Return one row per method: episodes in each mode, episodes between modes, and the entropy in bits.
 
     Args:
         ways: method -> the ways of its episodes, see `EpisodeResult.way`.

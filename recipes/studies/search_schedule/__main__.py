@@ -1,4 +1,4 @@
-"""Search which blocks of a few stochastic steps are computed, and at which timesteps, for the price of fewer whole ones.
+"""Search which blocks of a few stochastic steps to compute, and at which timesteps, at the cost of fewer full steps.
 
     python -m recipes.studies.search_schedule task=can demos=data/can.h5 budget=2 lengths=[3,4,5]
 
@@ -98,7 +98,7 @@ def main(config: DictConfig) -> None:
 
 
 def make_judges(policy: DiffusionPolicy, config: DictConfig) -> tuple[Judge, Judge]:
-    """Return one of the demonstrations that are searched with, and one of the last ones, which are not."""
+    """Return two judges: one on the demonstrations used by the search, one on the last ones, which are held out."""
     task = find_task(config.task)
     demos = policy_demos(config.demos, task.name, policy)
     if len(demos) < 2:
@@ -115,7 +115,7 @@ def make_judges(policy: DiffusionPolicy, config: DictConfig) -> tuple[Judge, Jud
 
 
 def made_for(policy: DiffusionPolicy, config: DictConfig) -> dict:
-    """Return what a search depends on: all options but those of its end, its place and its machine."""
+    """Return the options that a search depends on: all except its end, its folder and its machine."""
     settings = OmegaConf.to_container(config, resolve=True)
     kept = {name: settings[name] for name in ("task", "demos", "targets", "draws", "held_out")}
     kept |= {name: settings[name] for name in ("lengths", "budget", "cost", "reuse", "fitness")}

@@ -1,4 +1,4 @@
-"""A search for which blocks of a short chain are computed, and at which timesteps, that asks for no gradient.
+"""A gradient-free search for the computed blocks and the timesteps of a short denoising chain.
 
 Evolution of the kind (mu + lambda) with mu = lambda: of all chains that were tried, the best ones have as many children, which
 differ from them in some cells of the mask, in a timestep, or in both, and none costs more than the budget. (For timesteps and
@@ -32,7 +32,7 @@ _STRIDES = (1, 2, 5, 10)  # by which a timestep moves
 
 @dataclass(frozen=True)
 class PrunedChain:
-    """A short chain of denoising steps, and what it prunes.
+    """A short denoising chain and its prune mask.
 
     Attributes:
         timesteps: K falling timesteps.
@@ -48,7 +48,7 @@ class PrunedChain:
 
     @classmethod
     def of(cls, timesteps: Sequence[int], mask: np.ndarray | Tensor) -> PrunedChain:
-        """Make it of a mask bool [K, 3L]."""
+        """Build a chain from a mask bool [K, 3L]."""
         rows = ("".join(str(int(pruned)) for pruned in row) for row in mask.tolist())
         return cls(tuple(timesteps), tuple(rows))
 
@@ -81,7 +81,7 @@ class Evolution:
 
 
 class ChainSpace:
-    """Chains of some lengths within a budget.
+    """Search space of chains of several lengths within a budget.
 
     Args:
         weights: cost of each block of a step, [3L], in any unit.
@@ -123,7 +123,7 @@ class ChainSpace:
         self.budget, self.lengths, self.num_train_timesteps = budget, tuple(lengths), num_train_timesteps
 
     def cost(self, chain: PrunedChain) -> float:
-        """Return the cost of its computed blocks, in unpruned steps."""
+        """Return the cost of a chain's computed blocks, in unpruned steps."""
         return self._cost(chain.mask().numpy())
 
     def starts(self, count: int, rng: np.random.Generator) -> Iterator[PrunedChain]:
@@ -135,17 +135,17 @@ class ChainSpace:
 
     @property
     def whole_steps(self) -> int:
-        """How many unpruned steps the budget buys."""
+        """Return how many unpruned steps the budget allows."""
         return int(self.budget + _ROUNDING)
 
     def random(self, rng: np.random.Generator, length: int | None = None) -> PrunedChain:
-        """Return a chain at the timesteps of the rule ``logsnr`` that computes random blocks until none fits."""
+        """Return a chain at the timesteps of the rule ``logsnr``, with random blocks computed until the budget is used up."""
         length = int(rng.choice(self.lengths)) if length is None else length
         mask = self._all_but_first(length)
         return PrunedChain.of(self._timesteps(length), self._filled(mask, rng))
 
     def child(self, parent: PrunedChain, rng: np.random.Generator) -> PrunedChain:
-        """Return a chain that differs from its parent in some cells, in one timestep, or in both."""
+        """Return a mutated copy of a chain: some cells, one timestep, or both."""
         what = rng.integers(3)
         timesteps = parent.timesteps if what == 0 else self._moved(parent.timesteps, rng)
         mask = parent.mask().numpy()
@@ -220,7 +220,7 @@ def evolve(
     on_chain: Callable[[int, int], None] = lambda done, total: None,
     on_generation: Callable[[Mapping[PrunedChain, float]], None] = lambda tried: None,
 ) -> dict[PrunedChain, float]:
-    """Search the chain of least fitness.
+    """Search for the chain with the lowest fitness.
 
     Args:
         space: the chains.

@@ -1,4 +1,4 @@
-"""Searched schedules: the chain of a policy that demonstrations like best among those that cost as much, and what it is worth.
+"""A search for the cache schedule whose actions match demonstrations best at a given cost, and its comparison with rivals.
 
 What is searched is in `recipes.studies.search_schedule.evolution`; here are its fitness, the file that it goes on from,
 and the comparison, on demonstrations that it did not see, with what the same budget buys otherwise.
@@ -57,7 +57,7 @@ class _Scored:
 
 @dataclass(frozen=True)
 class Tried:
-    """The content of a ``tried.json``, which a search that was killed goes on from.
+    """The content of a ``tried.json``, from which an interrupted search resumes.
 
     Attributes:
         made_for: what fitness and chains depend on.
@@ -73,7 +73,7 @@ class Tried:
 
 @dataclass(frozen=True)
 class Judged:
-    """What the answers of one chain are worth; see `OfflineErrors`.
+    """Quality of the actions of one chain; see `OfflineErrors`.
 
     Attributes:
         cost: of its computed blocks, in unpruned steps.
@@ -89,7 +89,7 @@ class Judged:
 
 
 class Judge:
-    """Says of every policy call what the answers of a policy are worth.
+    """Score of a policy's actions on every policy call.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
@@ -116,7 +116,7 @@ class Judge:
         self._wanted = targets["target"][:, first : first + n_action_steps].flatten(1)
 
     def scores(self, chain: PrunedChain | None) -> dict[Fitness, Tensor]:
-        """Return all measures of each policy call, f32 [N]; a chain of None is the policy's own, unpruned."""
+        """Return all measures for each policy call, f32 [N]; None stands for the policy's own unpruned chain."""
         answers = self._answers(chain)
         return {name: measure(answers, self._wanted) for name, measure in FITNESSES.items()}
 
@@ -134,7 +134,7 @@ def chain_schedule(
     reuse: Reuse = "block",
     settings: Mapping[str, Any] | None = None,
 ) -> CacheSchedule:
-    """Return the schedule of a chain, which a benchmark finds by the name of its file."""
+    """Return the cache schedule of a chain; benchmarks find it by its file name."""
     sampler = policy.sampler.variant("ddpm", timesteps=chain.timesteps)
     return CacheSchedule.from_mask(
         chain.mask(),
@@ -158,7 +158,7 @@ def search_schedule(
     made_for: Mapping[str, Any],
     on_chain: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[ChainSpace, dict[PrunedChain, float]]:
-    """Search the chain whose answers demonstrations like best, from where the file says that an earlier search was.
+    """Search for the chain whose actions match demonstrations best, resuming from the file of an earlier search.
 
     Args:
         judge: of the answers.
@@ -203,7 +203,7 @@ def rivals(
     seed: int = 0,
     on_chain: Callable[[], object] = lambda: None,
 ) -> dict[str, list[PrunedChain | None]]:
-    """Return the chain that was found and what the budget buys otherwise.
+    """Return the chain that was found and the alternatives of the same cost.
 
     Args:
         judge: of the search.
@@ -246,7 +246,7 @@ def compare(
     *,
     on_chain: Callable[[], object] = lambda: None,
 ) -> dict[str, Judged]:
-    """Judge chains; several of one name count with their mean.
+    """Judge chains by name; chains that share a name count with their mean.
 
     Args:
         judge: of demonstrations that nothing was searched with.
@@ -276,7 +276,7 @@ def compare(
 
 
 def judged_rows(judged: Mapping[str, Judged]) -> list[dict[str, str]]:
-    """Return the rows of a table."""
+    """Return the rows of the table of judged chains."""
     return [
         {
             "chain": name,

@@ -1,5 +1,4 @@
-"""Simulate benchmarks that stop when they are decided: how often they claim what is not so, and how many episodes they save;
-and, over several tasks, how often intervals hold the truth.
+"""Simulate benchmarks with early stopping: false claims, episodes saved, and the coverage of intervals over several tasks.
 
 python -m recipes.studies.simulate_stopping out=assets/statistics
 """

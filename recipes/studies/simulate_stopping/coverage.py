@@ -1,4 +1,4 @@
-"""Simulated: how often verdicts err and intervals miss, on a grid of success rates and correlations with dense."""
+"""Simulated error rates of verdicts and coverage of intervals, on a grid of success rates and correlations with dense."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STEPS, _SHAPE, _HORIZON = 100, 12.0, 400  # of solved episodes: mean and gamma 
 
 @dataclass(frozen=True)
 class PairRates:
-    """Shares of the pairs that only the method solves, that only dense solves, and that both solve."""
+    """Probabilities of each outcome of a pair: solved by the method alone, by dense alone, or by both."""
 
     won: float
     lost: float
@@ -33,7 +33,7 @@ class PairRates:
 
     @property
     def shares(self) -> tuple[float, float, float, float]:
-        """Of pairs won, lost, solved by both and by none."""
+        """Probabilities that a pair is won, lost, solved by both, and solved by neither."""
         return self.won, self.lost, self.both, max(1 - self.won - self.lost - self.both, 0.0)
 
     def draw(self, n: int, generator: np.random.Generator) -> tuple[NDArray, NDArray]:
@@ -43,7 +43,7 @@ class PairRates:
 
 
 def pair_rates(method: float, dense: float, correlation: float) -> PairRates | None:
-    """Return the pairs of two success rates and their correlation; None where rates so unlike cannot be so correlated.
+    """Return the pair probabilities for two success rates and a correlation; None if no pairs have that correlation.
 
     >>> pair_rates(0.5, 0.5, 0.0)
     PairRates(won=0.25, lost=0.25, both=0.25)
@@ -56,7 +56,7 @@ def pair_rates(method: float, dense: float, correlation: float) -> PairRates | N
 def verdict_errors(
     pairs: PairRates, design: Design, trials: int, generator: np.random.Generator
 ) -> tuple[float, float]:
-    """Return how often a method that is worse by exactly the margin is called non-inferior at some analysis, and inferior.
+    """Return how often a method worse by exactly the margin is called non-inferior at some analysis, and how often inferior.
 
     Args:
         pairs: of the method and dense, with rates that differ by the margin.
@@ -82,7 +82,7 @@ def aggregate_coverage(
     trials: int,
     generator: np.random.Generator,
 ) -> tuple[float, float]:
-    """Return how often the intervals of several tasks together hold the truth: of the difference, and of the ratio of times.
+    """Return the coverage of the intervals over several tasks: of the difference, and of the ratio of times.
 
     Args:
         pairs: of each task.

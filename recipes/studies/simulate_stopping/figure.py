@@ -1,4 +1,4 @@
-"""Draw what stopping when a benchmark is decided saves, and what it costs."""
+"""Figure of what early stopping saves and costs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73")
 
 
 def plot_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
-    """Draw the episodes saved, and the trials decided, against the true difference: a colour per task.
+    """Draw the episodes saved and the share of significant trials against the true difference: one colour per task.
 
     Args:
         results: content of a ``stopping.json``.

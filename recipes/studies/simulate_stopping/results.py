@@ -1,4 +1,4 @@
-"""``stopping.json``: what stopping early gives on tasks like those here, simulated."""
+"""``stopping.json``: simulated savings and errors of early stopping on tasks like those of this repository."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _PAIR_DIFFERENCES = (-0.2, -0.1, 0.0)  # of both from dense: stopped soon, later
 
 @dataclass(frozen=True)
 class TypeOne:
-    """How often non-inferiority is claimed at some analysis where a method is worse by exactly the margin."""
+    """Rate of false non-inferiority claims, at any analysis, for a method that is worse by exactly the margin."""
 
     task: str
     margin: Literal["success", "time, slower", "time, failing more"]
@@ -57,7 +57,7 @@ class TypeOne:
 
 @dataclass(frozen=True)
 class SavedEpisodes:
-    """The episodes saved at a true difference of success rates, which also makes the method slower by ``ratio``."""
+    """Episodes saved at a true difference of success rates, which also makes the method slower by ``ratio``."""
 
     task: str
     difference: float
@@ -67,7 +67,7 @@ class SavedEpisodes:
 
 @dataclass(frozen=True)
 class EqualPair:
-    """How often the intervals of two equal methods exclude that they are, at a true difference of both from dense.
+    """Rate at which the intervals of two equal methods exclude equality, at a true difference of both from dense.
 
     Attributes:
         success, time: of the difference in success, and of the ratio of times.
@@ -96,7 +96,7 @@ class StoppingResults:
 
 
 def simulate_stopping(max_episodes: int, analyses: int, trials: int, seed: int = 0) -> StoppingResults:
-    """Simulate every case.
+    """Run every simulated case.
 
     Args:
         max_episodes, analyses: of the `Design`.
@@ -154,8 +154,7 @@ def save_stopping(results: StoppingResults, path: str | os.PathLike) -> Path:
 
 
 def stopping_rows(results: StoppingResults) -> dict[str, list[dict[str, str]]]:
-    """Return the tables: of false claims at the margins, of episodes saved, of equal methods that seem to differ, of the
-    largest errors on a grid, and of the least coverage over several tasks."""
+    """Return the tables: false claims, episodes saved, equal methods called different, largest errors, and least coverage."""
     claims = [
         {"like": one.task, "margin": one.margin, "non-inferior all the same": f"{one.rate:.1%}"}
         for one in results.type_one

@@ -1,4 +1,4 @@
-"""The largest errors of verdicts and the least coverage over several tasks, on a grid: parts of a ``stopping.json``."""
+"""Largest verdict errors and least coverage over several tasks, on a grid: parts of a ``stopping.json``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _FEWER_TRIALS = 5  # times fewer of these, which are dear
 
 @dataclass(frozen=True)
 class VerdictErrors:
-    """The largest errors over `RATES` and `CORRELATIONS` where a method is worse by exactly the margin of success.
+    """Largest errors over `RATES` and `CORRELATIONS` for a method that is worse by exactly the margin of success.
 
     Attributes:
         max_episodes, analyses: of the design.
@@ -64,7 +64,7 @@ class VerdictErrors:
 
 @dataclass(frozen=True)
 class Covered:
-    """How often, at the least over rates, correlations and times, intervals over several tasks hold the truth.
+    """Least coverage of intervals over several tasks, over rates, correlations and times.
 
     Attributes:
         tasks: how many, and of how many pairs.
@@ -77,7 +77,7 @@ class Covered:
 
 
 def simulate_errors(trials: int, seed: int = 0) -> tuple[VerdictErrors, ...]:
-    """Return the largest errors of verdicts on success under fixed numbers of episodes and under analyses.
+    """Return the largest verdict errors on success, with a fixed number of episodes and with interim analyses.
 
     Args:
         trials: a tenth of the benchmarks of each rate, correlation and design.

@@ -1,4 +1,4 @@
-"""Simulated benchmarks: how often a `Design` claims what is not so, and how many episodes it saves."""
+"""Simulated benchmarks: how often a `Design` makes a false claim, and how many episodes it saves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _Analysis = tuple[
 
 @dataclass(frozen=True)
 class Population:
-    """Episodes of dense and of a method, drawn seed by seed, independent of each other as those of other denoising steps are.
+    """Episodes of dense and of a method, drawn independently seed by seed, like those of two samplers of different steps.
 
     Attributes:
         success: dense's success rate.
@@ -45,24 +45,24 @@ class Population:
 
     @property
     def ratio(self) -> float:
-        """Restricted mean time of the method over dense's."""
+        """Restricted mean time of the method divided by dense's."""
         return self._mean(self.success + self.difference, self.slower) / self._mean(self.success, 1.0)
 
     def _mean(self, success: float, slower: float) -> float:
         return success * self.steps * slower + (1 - success) * self.horizon
 
     def at_time_margin(self, margin: float = DEFAULT_TIME_MARGIN) -> Population:
-        """Return the population whose method is slower by the margin in its solved episodes alone."""
+        """Return the population whose method is slower by exactly the margin, in its solved episodes alone."""
         wanted = (1 + margin) * self._mean(self.success, 1.0) - (1 - self.success) * self.horizon
         return Population(self.success, 0.0, self.steps, wanted / self.success / self.steps, self.horizon)
 
     def failing_at_time_margin(self, margin: float = DEFAULT_TIME_MARGIN) -> Population:
-        """Return the population whose method is slower by the margin since it fails more often."""
+        """Return the population whose method is slower by exactly the margin, because it fails more often."""
         lost = margin * self._mean(self.success, 1.0) / (self.horizon - self.steps)
         return Population(self.success, -lost, self.steps, 1.0, self.horizon)
 
     def draw(self, n: int, generator: np.random.Generator) -> tuple[NDArray, NDArray]:
-        """Return restricted times of the method and of dense, [n] each; an episode at the horizon was not solved."""
+        """Return restricted times of the method and of dense, [n] each; a time at the horizon means failure."""
         pairs = []
         for success, slower in ((self.success + self.difference, self.slower), (self.success, 1.0)):
             steps = generator.gamma(_SHAPE, self.steps * slower / _SHAPE, n)
@@ -73,7 +73,7 @@ class Population:
 
 @dataclass(frozen=True)
 class Savings:
-    """Averages over trials that stop early.
+    """Averages over trials with early stopping.
 
     Attributes:
         saved: share of the cap's episodes that need not run.
@@ -89,7 +89,7 @@ class Savings:
 
 
 def claim_rates(population: Population, design: Design, trials: int, seed: int = 0) -> tuple[float, float]:
-    """Return how often somebody who looks every time sees non-inferiority claimed at some analysis: in success, and in time.
+    """Return how often non-inferiority is claimed at any interim analysis: in success, and in time.
 
     At a margin these are type-I errors.
 
@@ -107,7 +107,7 @@ def claim_rates(population: Population, design: Design, trials: int, seed: int =
 
 
 def savings(population: Population, design: Design, trials: int, seed: int = 0) -> Savings:
-    """Simulate benchmarks that stop when `Design.decides`.
+    """Simulate benchmarks that stop as soon as `Design.decides` says so.
 
     Args:
         population, design, trials, seed: see `claim_rates`.
@@ -122,7 +122,7 @@ def savings(population: Population, design: Design, trials: int, seed: int = 0) 
 
 
 def pair_errors(population: Population, design: Design, trials: int, seed: int = 0) -> tuple[float, float]:
-    """Return how often two equal methods, each stopped by how it compares with dense, seem to differ: in success, and in time.
+    """Return how often two equal methods, each stopped by its own comparison with dense, seem to differ: in success, in time.
 
     Their ordinary 95 % intervals, of the episodes that both played, know nothing of what stopped either.
 

@@ -1,4 +1,4 @@
-"""Engines: how a prune mask becomes skipped work."""
+"""Engines: they turn a prune mask into skipped computation."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""The contract of every engine: one policy call, from its noise and its mask to the actions."""
+"""The interface of every engine: one policy call, from noise and prune mask to actions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ class Overhead(NamedTuple):
 
 
 class Engine(Protocol):
-    """Runs policy calls of one network with one sampler; made by :func:`torchrl_sparse.blocks.engine.make_engine`.
+    """Base of the engines, each of which runs policy calls of one network and sampler; see
+    :func:`torchrl_sparse.blocks.engine.make_engine`.
 
     An engine answers for the weights that its network has when it is asked. It sees optimiser steps,
     ``load_state_dict``, moves, and parameters or modules that were exchanged. Writes through ``parameter.data`` that
@@ -55,7 +56,7 @@ class Engine(Protocol):
         reuse: Reuse = "block",
         guide: Guide | None = None,
     ) -> Tensor:
-        """Return normalised actions f32 [B, H, A], those of :func:`torchrl_sparse.blocks.engine.denoise`.
+        """Return normalised actions f32 [B, H, A], as :func:`torchrl_sparse.blocks.engine.denoise` defines them.
 
         Args:
             noise: f32 [B, K, H, A], standard normal; of the network's type and device. There may be no rows.
@@ -71,7 +72,7 @@ class Engine(Protocol):
         ...
 
     def refresh(self) -> None:
-        """Read the network's weights again in the next policy call."""
+        """Read the network's weights again at the next policy call."""
         ...
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
@@ -79,11 +80,11 @@ class Engine(Protocol):
         ...
 
     def block_macs(self) -> tuple[int, int, int]:
-        """Return the multiply-accumulates that one SA, one CA and one FFN block take here, batch 1."""
+        """Return the multiply-accumulates of one SA, one CA and one FFN block in this engine, batch 1."""
         ...
 
     def overhead_macs(self) -> Overhead:
-        """Return those outside the blocks."""
+        """Return the multiply-accumulates outside the blocks."""
         ...
 
 
@@ -96,7 +97,7 @@ def check_query(
     reuse: str = "block",
     guide: Guide | None = None,
 ) -> None:
-    """Refuse what no engine can run; the arguments are those of :func:`torchrl_sparse.blocks.engine.denoise`.
+    """Refuse arguments that no engine can run; they are those of :func:`torchrl_sparse.blocks.engine.denoise`.
 
     Raises:
         MaskError: an InputError, if the mask is no prune mask for the policy call.
@@ -122,7 +123,7 @@ def check_query(
 
 
 def check_input(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
-    """Raise InputError unless ``tensor`` is dense, of this shape, and of the type and device of ``like``."""
+    """Raise InputError unless ``tensor`` is dense, has this shape, and has the type and device of ``like``."""
     if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.is_nested:
         came = f"layout {tensor.layout}" if isinstance(tensor, Tensor) else type(tensor).__name__
         raise InputError(f"{name}: expected a dense tensor, got {came}")

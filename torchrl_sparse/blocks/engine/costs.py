@@ -1,4 +1,4 @@
-"""What an engine really does: seconds and FLOPs of a block, for planners that budget in them, and FLOPs of a policy call."""
+"""Actual cost of an engine: seconds and FLOPs of each block type, for planners with a budget, and FLOPs of a policy call."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def engine_block_costs(engine: Engine) -> dict[str, BlockCost]:
 
 
 def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
-    """Count the multiply-accumulates of one SA, CA and FFN block where cross-attention reads folded memory.
+    """Count the multiply-accumulates of one SA, CA and FFN block whose cross-attention reads folded memory.
 
     >>> sizes = dict(input_dim=10, output_dim=10, horizon=10, n_obs_steps=2, cond_dim=19)
     >>> folded_block_macs(TransformerForDiffusion(**sizes, n_layer=1))
@@ -55,7 +55,7 @@ def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
 
 
 def folded_overhead_macs(network: TransformerForDiffusion, *, merged_stem: bool) -> Overhead:
-    """Count what an engine that folds memory multiplies outside the blocks.
+    """Count the multiply-accumulates outside the blocks in an engine with folded memory.
 
     A step embeds the sample and predicts its noise. What the condition is encoded and folded for is done once in a policy call,
     but in every step by a condition encoder whose tokens attend to each other.
@@ -82,7 +82,7 @@ def folded_overhead_macs(network: TransformerForDiffusion, *, merged_stem: bool)
 
 
 def executed_flops(engine: Engine, mask: Tensor, num_steps: Tensor | None = None) -> Tensor:
-    """Count the FLOPs (2 * MAC) that ``engine`` really does in queries; norms, softmax, activations and sums are not counted.
+    """Count the FLOPs (2 * MAC) that ``engine`` executes in policy calls, without norms, softmax, activations and sums.
 
     :func:`~torchrl_sparse.blocks.mask.query_flops` has the published count, in which cross-attention multiplies its full
     matrices and every step encodes the condition again.

@@ -46,7 +46,7 @@ def _diffusers_scheduler(sampler: Sampler) -> DDPMScheduler | DDIMScheduler:
 
 
 class EagerBaseline:
-    """Denoises with the modules and the sampler of the published implementation.
+    """Engine that denoises with the modules and the sampler of the published implementation.
 
     Args:
         network: the denoiser, in eval mode.

@@ -1,4 +1,4 @@
-"""The table of engines, and how a policy holds the one that it runs in."""
+"""The table of engines, and the slot in which a policy holds its engine."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sam
 
 
 class EngineSlot:
-    """Holds the engine of a policy: made when it is first needed, and again for another sampler or device.
+    """Engine of a policy, made on first use and again after a change of sampler or device.
 
     Copies and pickles carry the choice, not the engine.
 
@@ -121,11 +121,11 @@ class EngineSlot:
         return engine
 
     def refresh(self) -> None:
-        """Make the engine again in the next policy call, from the weights that the network has then."""
+        """Rebuild the engine at the next policy call from the network's weights at that time."""
         self._made, self._stale = (None, None), True
 
     def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
-        """Say which engine runs and on what; if ``"auto"`` had to pass over others, why."""
+        """Describe the engine and its device; for ``"auto"``, also why faster engines were not used."""
         engine = self.get(network, sampler)
         text = f"{engine.name}: {engine.detail}"
         if self.name != "auto":

@@ -1,4 +1,4 @@
-"""Exact algebra that takes work out of the denoising loop: once for every engine, in float64.
+"""Exact algebra that moves work out of the denoising loop, shared by all engines, in float64.
 
 Each engine lays out, scales and rounds what is returned here as its own loop wants it.
 
@@ -48,7 +48,7 @@ class Affine(NamedTuple):
 
 
 class FoldedLayer(NamedTuple):
-    """A decoder layer; ``qkv``, ``up`` and ``query`` read what is normalised but neither scaled nor shifted.
+    """A decoder layer; ``qkv``, ``up`` and ``query`` read normalised input without gain and shift.
 
     Attributes:
         qkv: of self-attention, weight [3, n_head, head size, d].
@@ -69,7 +69,7 @@ class FoldedLayer(NamedTuple):
 
 
 class FoldedMemory(NamedTuple):
-    """N memory tokens as the cross-attention of all L layers reads them.
+    """N memory tokens, folded into the cross-attention of all L layers.
 
     Attributes:
         vectors: [L, 2, N, n_head, d]; entry 0 of axis 1 holds the keys, entry 1 the values.
@@ -81,7 +81,7 @@ class FoldedMemory(NamedTuple):
 
 
 def after_norm(norm: nn.LayerNorm, layer: Affine) -> Affine:
-    """Fold gain and shift of ``norm`` into the ``layer`` behind it, weight [out, d].
+    """Fold gain and shift of ``norm`` into the ``layer`` that follows it, weight [out, d].
 
     >>> norm, x = nn.LayerNorm(2), torch.tensor([3.0, 1.0], dtype=torch.float64)
     >>> _ = norm.weight.data.fill_(2.0), norm.bias.data.fill_(1.0)
@@ -135,7 +135,7 @@ def _fold_into(layer: FoldedLayer, tokens: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fold_observation_stem(network: TransformerForDiffusion) -> Affine:
-    """Merge the embedding of observations and the first layer of their encoder: bias [To, 4d], as tokens have positions.
+    """Merge the observation embedding with the first encoder layer: bias [To, 4d], since tokens have positions.
 
     Only for a condition encoder that works token by token.
     """
@@ -145,7 +145,7 @@ def fold_observation_stem(network: TransformerForDiffusion) -> Affine:
 
 
 class MemoryEncoder:
-    """Memory tokens of all denoising steps, each encoded once; a snapshot of the network's weights.
+    """Encoder of the memory tokens of all denoising steps, each encoded once; a snapshot of the network's weights.
 
     Args:
         network: the denoiser.
@@ -168,11 +168,11 @@ class MemoryEncoder:
         self._time = time + position
 
     def time_tokens(self) -> Tensor:
-        """Encode the time tokens [K, d]; for a separable encoder."""
+        """Encode the time tokens [K, d]; the encoder must be separable."""
         return self._encoder(self._time)
 
     def observation_tokens(self, cond: Tensor) -> Tensor:
-        """Encode the observation tokens [B, To, d] of ``cond`` [B, To, cond_dim]; for a separable encoder."""
+        """Encode the observation tokens [B, To, d] of ``cond`` [B, To, cond_dim]; the encoder must be separable."""
         return self._encoder(self._observations(cond))
 
     def memory(self, cond: Tensor) -> Tensor:

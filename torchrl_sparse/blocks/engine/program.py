@@ -1,4 +1,4 @@
-"""From a prune mask to a program: the operations that the PyTorch engine executes for one policy call, known before its loop.
+"""Compilation of a prune mask to a program: the operations of one policy call, known before the denoising loop.
 
 The native engine does the same operations, but finds them in the mask as it goes.
 
@@ -31,7 +31,7 @@ COMPUTE, REUSE, COLLAPSE = 0, 1, 2
 
 @dataclass(frozen=True)
 class Program:
-    """The operations that one row of a batch executes.
+    """The operations executed for one row of a batch.
 
     Attributes:
         ops: i32 [n, 3], (operation, first, last) in order of execution.
@@ -47,12 +47,12 @@ class Program:
         return len(self.starts) - 1
 
     def step(self, k: int) -> list[tuple[int, int, int]]:
-        """Return the operations of denoising step ``k``, (operation, first, last) each."""
+        """Return the operations of denoising step ``k``, each as (operation, first, last)."""
         return [tuple(op) for op in self.ops[self.starts[k] : self.starts[k + 1]].tolist()]
 
 
 def build_program(mask: Tensor | np.ndarray) -> Program:
-    """Build the program of one mask.
+    """Compile one mask to a program.
 
     The work is array arithmetic over the computed blocks, so that a new mask costs little next to its policy call.
 

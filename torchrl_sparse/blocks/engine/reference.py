@@ -22,7 +22,7 @@ __all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
 
 
 class FeatureRecorder:
-    """Keeps, detached, what every block added to the residual stream in every denoising step.
+    """Recorder of what every block adds to the residual stream in every denoising step, detached.
 
     The published models need about 25 MB per policy call (K=100, L=8, H=10, d=256, f32).
 
@@ -58,7 +58,7 @@ def denoise(
     guide: Guide | None = None,
     record: Callable[[int, int, Tensor], None] | None = None,
 ) -> Tensor:
-    """Denoise a batch of action chunks, skipping what ``mask`` prunes.
+    """Denoise a batch of action chunks, skipping the blocks that ``mask`` prunes.
 
     For every block ``b`` of every step, per row of the batch: ``d = block_b(x)`` where the mask is False, the
     latest ``d`` of the reuse rule where it is True; ``x = x + d``. Nothing outlives the call. A row of a
@@ -135,7 +135,7 @@ def _block_output(
 
 
 class ComputedRows:
-    """The rows of a batch that compute a block; the mask is read to the host once.
+    """The rows of a batch that compute each block; the mask is copied to the host once.
 
     Args:
         mask: bool [B, K, 3L], True = pruned; None prunes nothing.
@@ -149,7 +149,7 @@ class ComputedRows:
             self._any = self._computed.any(dim=0).tolist()
 
     def at(self, step: int, block: int) -> Tensor | bool:
-        """Return True if every row computes, False if none does, else the i64 indices of those that do."""
+        """Return True if every row computes, False if none does, else the i64 indices of the computing rows."""
         if self._computed is None or self._all[step][block]:
             return True
         if not self._any[step][block]:
@@ -158,7 +158,7 @@ class ComputedRows:
 
 
 class ReferenceEngine:
-    """The definition: eager and differentiable; reads the network's weights again in every policy call.
+    """The reference engine: eager and differentiable; reads the network's weights at every policy call.
 
     Args:
         network: the denoiser.
@@ -204,9 +204,9 @@ class ReferenceEngine:
         return time_blocks(walk, network.n_layer, repeats, like.device)
 
     def block_macs(self) -> tuple[int, int, int]:
-        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`; the published count."""
+        """Return the published count, see :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
         return block_macs(NetworkSizes.of(self._network))
 
     def overhead_macs(self) -> Overhead:
-        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.overhead_macs`; the published count."""
+        """Return the published count, see :meth:`~torchrl_sparse.blocks.engine.base.Engine.overhead_macs`."""
         return Overhead(fixed_macs(NetworkSizes.of(self._network)), memory=0, query=0)

@@ -15,7 +15,7 @@ __all__ = ["time_blocks"]
 def time_blocks(
     walk: Callable[[int], None], num_layers: int, repeats: int, device: torch.device
 ) -> dict[str, float]:
-    """Measure the seconds of a block of each type: the best of ``repeats``, which other work disturbs least.
+    """Measure the seconds of a block of each type: the minimum of ``repeats``, which other processes disturb least.
 
     Args:
         walk: runs the blocks of one type (an index of ``BLOCK_TYPES``) of all layers, so that weights come from

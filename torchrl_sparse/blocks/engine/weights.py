@@ -1,4 +1,4 @@
-"""Noticing that a network's weights have changed, cheaply enough to ask in every policy call.
+"""Detection of changed network weights, cheap enough for every policy call.
 
 A complete watch would read every weight: 36 MB for the published networks, more than a millisecond. Versions, addresses and
 identities of parameters and modules show all that PyTorch records; the first values of each parameter are compared besides,
@@ -27,7 +27,7 @@ _VERSION = attrgetter("_version")
 
 
 class WeightWatch:
-    """Tells the weights of a network apart over time.
+    """Detector of changes in a network's weights.
 
     It sees optimiser steps, ``load_state_dict`` (with ``assign`` too), moves, and parameters or modules that were
     exchanged for others; of writes through ``parameter.data`` those that change one of the first values of a parameter.
@@ -56,22 +56,22 @@ class WeightWatch:
 
     @property
     def network(self) -> nn.Module:
-        """The network, which is not kept alive by being watched."""
+        """The watched network, held by a weak reference."""
         network = self._network()
         if network is None:
             raise ReferenceError("network: expected one that is still in use, it is gone")
         return network
 
     def watches(self, network: nn.Module) -> bool:
-        """Tell whether that is the network, also where its own is gone."""
+        """Tell whether this is the watched network; also works after that is gone."""
         return self._network() is network
 
     def refresh(self) -> None:
-        """Let the next :meth:`state` differ from all before it."""
+        """Make the next :meth:`state` differ from all earlier ones."""
         self._refreshed += 1
 
     def state(self) -> tuple:
-        """Return what compares equal as long as the weights are the same.
+        """Return a value that compares equal as long as the weights are the same.
 
         Raises:
             InputError: naming a weight that has no values, on the meta device, or that is no floating-point number.
@@ -107,13 +107,13 @@ class WeightWatch:
         return samples
 
     def read(self, places: Any) -> Any:
-        """Return the values at ``places``, as something that compares; also if they are no numbers."""
+        """Return the values at ``places`` in a form that compares equal bit by bit, NaN included."""
         return torch.cat(places).view(torch.uint8).cpu().numpy().tobytes()
 
 
 @dataclass(frozen=True)
 class Members:
-    """The parameters and modules of a network at one time, held so that no other object can take their identities."""
+    """The parameters and modules of a network at one time, kept alive so that no other object can reuse their ids."""
 
     holders: list[dict]
     held: list[list]
@@ -141,7 +141,7 @@ def _first_values(weight: Tensor) -> Tensor:
 
 
 def check_weights(network: nn.Module) -> None:
-    """Raise InputError, naming it, if ``network`` has a weight without values, or one that is no floating-point number."""
+    """Raise InputError, naming the weight, if a weight of ``network`` has no values or is not floating-point."""
     for name, parameter in network.named_parameters():
         if not parameter.is_floating_point():
             raise InputError(f"network: expected floating-point weights, got {name!r} of {parameter.dtype}")

@@ -1,4 +1,4 @@
-"""The network of SAG's pruner: from an observation to a logit for every block of every denoising step.
+"""The network of SAG's pruner: from an observation to one logit for every block of every denoising step.
 
 What does not depend on the observation is computed once in evaluation mode, and what remains then runs in the
 compiled code of :mod:`torchrl_sparse.blocks.engine.native.pruner` where that can be had.
@@ -30,7 +30,7 @@ _MAX_CELLS, _MAX_TOKEN, _MAX_WIDTH, _MAX_LAYERS = 1 << 16, 512, 1 << 16, 64
 
 
 class PrunerNetwork(nn.Module):
-    """Predicts logits of every block of every denoising step from an encoded observation.
+    """Predictor of a logit for every block of every denoising step from an encoded observation.
 
     In evaluation mode, what follows from the weights alone is kept until ``train()``, ``eval()``, ``load_state_dict()`` or a
     move: call ``eval()`` after writing to a weight by hand.
@@ -117,7 +117,7 @@ class PrunerNetwork(nn.Module):
         return logits.view(len(cond), len(self.timesteps), self.num_blocks, 2)
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Return f32 [B, K, 3L], by how much pruning is preferred to keeping, at less cost than both logits.
+        """Return pruning logit minus keeping logit, f32 [B, K, 3L], at less cost than both logits.
 
         In evaluation mode and without gradients, compiled code computes it for float32 on the CPU.
         """
@@ -129,7 +129,7 @@ class PrunerNetwork(nn.Module):
         return logits.view(len(cond), len(self.timesteps), self.num_blocks)
 
     def prune_masks(self, cond: Tensor) -> Tensor:
-        """Return bool [B, K, 3L], where pruning is preferred, the first step left out; for networks without a rate as input."""
+        """Return prune masks bool [B, K, 3L], the first step never pruned; for networks without a rate input."""
         if (native := self._compiled(cond)) is not None:
             return native.masks(cond.flatten(1))
         masks = self.prune_logits(cond) > 0
@@ -145,7 +145,7 @@ class PrunerNetwork(nn.Module):
         return self._native
 
     def mlp_weights(self) -> PrunerWeights:
-        """Return the weights of all that depends on the observation, for compiled code."""
+        """Return the weights of the observation-dependent part, for compiled code."""
         _, middle, _, last = self.mlp
         fuse, middle, last = ((layer.weight, layer.bias) for layer in (self.fuse_obs, middle, last))
         obs = self._weight_of_all(), self.obs.bias
@@ -166,7 +166,7 @@ class PrunerNetwork(nn.Module):
         return small and _is_f32_on_cpu(self.obs.weight) and native_available()[0]
 
     def features(self, cond: Tensor, rate: Tensor | None) -> Tensor:
-        """Return the numbers of a policy call, f32 [B, n]."""
+        """Return the input features of a policy call, f32 [B, n]."""
         return cond.flatten(1) if rate is None else torch.cat([cond.flatten(1), rate.to(cond.dtype)], dim=-1)
 
     def _fused(self, cond: Tensor, rate: Tensor | None) -> Tensor:
@@ -175,7 +175,7 @@ class PrunerNetwork(nn.Module):
         return (obs[:, None] + self.cells()).flatten(0, 1)
 
     def cells(self) -> Tensor:
-        """Return the coordinates' part of the first MLP layer's sums, [K * 3L, hidden]; kept in evaluation mode."""
+        """Return the cell coordinates' share of the first MLP layer, [K * 3L, hidden]; cached in evaluation mode."""
         if self.training or torch.is_grad_enabled():
             return self._encode()
         if self._cells is None:
@@ -209,7 +209,7 @@ class PrunerNetwork(nn.Module):
 
     @property
     def macs_per_query(self) -> int:
-        """Multiply-accumulates of one policy call in evaluation mode, where ``z`` is there already."""
+        """Multiply-accumulates of one policy call in evaluation mode, where ``z`` is cached."""
         hidden, obs = self.fuse_obs.out_features, self.obs
         return (
             obs.in_features * obs.out_features

@@ -45,7 +45,7 @@ FORMAT = "torchrl_sparse.sag/1"
 
 
 def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
-    """Return the value, f32 [B, 1, 1], that ``rate`` of each row's logits exceed, those of the first step left out.
+    """Return the threshold, f32 [B, 1, 1], that a share ``rate`` of each row's logits exceeds, without the first step.
 
     Gradients run through it: a shift of all logits changes no mask, and so has no gradient.
 
@@ -65,7 +65,7 @@ def rate_threshold(logits: Tensor, rate: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PrunerInfo:
-    """The policy, sampler and rates that a pruner was trained for.
+    """Policy, sampler and rates that a pruner was trained for.
 
     Attributes:
         policy: fingerprint of the policy.
@@ -102,7 +102,7 @@ class _Config(PrunerInfo):
 
 
 def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
-    """Raise InputError unless ``rate`` is in (0, 1), and in ``rate_range`` where there is one."""
+    """Raise InputError unless ``rate`` is in (0, 1), and in ``rate_range`` if there is one."""
     if not 0 < rate < 1:
         raise InputError(f"rate: expected a prune rate in (0, 1), got {rate}")
     if rate_range is not None:
@@ -112,7 +112,7 @@ def check_rates(rate: float, rate_range: tuple[float, float] | None) -> None:
 
 
 class SAGPruner(Planner):
-    """Predicts the mask of every policy call from its observation; serves only the policy that it was trained for.
+    """Planner that predicts each policy call's mask from its observation; serves only the policy that it was trained for.
 
     Reads ``("diffusion", "cond")`` and, if the rate is an input, ``("diffusion", "prune_rate")`` f32 [*B, 1] where
     it is there; ``rate`` stands in for it where it is not.
@@ -152,7 +152,7 @@ class SAGPruner(Planner):
 
     @property
     def rate(self) -> float:
-        """Prune rate of the policy calls that bring none."""
+        """Prune rate of policy calls that do not set their own."""
         return self._rate
 
     @rate.setter
@@ -162,16 +162,16 @@ class SAGPruner(Planner):
 
     @property
     def flops(self) -> int:  # type: ignore[override]  # planners set theirs; this one's is never assigned
-        """Of what depends on the observation; the rest is computed once and kept."""
+        """FLOPs of the observation-dependent part; the rest is computed once and cached."""
         return 2 * self.network.macs_per_query
 
     @property
     def fingerprint(self) -> str:
-        """A name of the weights and the rate."""
+        """A hash of the weights and the rate."""
         return tensors_fingerprint({**self.state_dict(), "rate": torch.tensor(self.rate)})
 
     def options(self, tensordict: TensorDictBase, rows: int) -> dict[str, Tensor]:
-        """Return the rate of every policy call, if it is an input.
+        """Return the rate of every policy call, if the network takes one.
 
         Raises:
             InputError: if a rate is out of the range that the pruner was trained for.
@@ -213,7 +213,7 @@ class SAGPruner(Planner):
         return masks
 
     def save_pretrained(self, path: str | os.PathLike) -> None:
-        """Write ``config.json``, with the rate that is set now, and ``pruner.safetensors`` into the folder ``path``."""
+        """Write ``config.json``, with the current rate, and ``pruner.safetensors`` into the folder ``path``."""
         path = Path(path)
         write_tensors(path / "pruner.safetensors", self.network.state_dict())
         config = {
@@ -226,7 +226,7 @@ class SAGPruner(Planner):
 
     @classmethod
     def from_pretrained(cls, path: str | os.PathLike) -> SAGPruner:
-        """Read what :meth:`save_pretrained` wrote. Nothing in the files is executed.
+        """Load a pruner written by :meth:`save_pretrained`. Nothing in the files is executed.
 
         Raises:
             FileNotFoundError: if a file is not there.

@@ -1,4 +1,4 @@
-"""Denoising as a function that is differentiable in its gates, to train the methods that learn where to prune.
+"""Denoising as a differentiable function of pruning gates, to train learned planners.
 
 Its values are those of :func:`torchrl_sparse.blocks.engine.reference.denoise` under the hard mask. Its
 gradients are those of the mixture of SAG (arXiv:2601.12894), with the gate ``M`` a real number::
@@ -107,7 +107,7 @@ def step_errors(
     checkpointed: bool = False,
     detached: bool = False,
 ) -> Tensor:
-    """Return the error of each denoising step alone, with gradients cut between the steps.
+    """Return the error of each denoising step by itself, with gradients cut between the steps.
 
     Every step starts from the sample and the buffers that the pruned chain reached, detached, and its result is compared
     with a dense step from the same sample, which costs one more forward pass. No gradient runs through more than one

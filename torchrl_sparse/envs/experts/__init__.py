@@ -1,4 +1,4 @@
-"""Scripted experts, one file a task, and what their operators do besides what they mean; never human."""
+"""Scripted experts, one file per task, and the simulated errors of their operators; no human data."""
 
 import lazy_loader as lazy
 

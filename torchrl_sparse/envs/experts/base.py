@@ -1,4 +1,4 @@
-"""The skeleton of a scripted expert: where the hand is, where it should go, and one clipped step towards it.
+"""Base of scripted experts: read the hand's pose, choose the next waypoint, and take one clipped step towards it.
 
 An expert decides from what a policy can observe too (poses, finger opening, motion), not from clocks or
 remembered phases: its labels are then a function of the state, and it recovers by itself when something goes
@@ -24,7 +24,7 @@ DOWNWARD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 @dataclass(frozen=True)
 class Hand:
-    """State of an arm's hand now.
+    """Current state of an arm's hand.
 
     Attributes:
         position: f64 [3] of the grip site, m, world frame.
@@ -40,18 +40,18 @@ class Hand:
 
     @property
     def yaw(self) -> float:
-        """Turn about the vertical relative to `DOWNWARD`, rad in (-pi, pi]."""
+        """Rotation about the vertical relative to `DOWNWARD`, rad in (-pi, pi]."""
         return float(np.arctan2(-self.rotation[0, 0], self.rotation[1, 0]))
 
     @property
     def tilt(self) -> float:
-        """Angle to pointing straight down, rad."""
+        """Angle from pointing straight down, rad."""
         return float(np.arccos(np.clip(-self.rotation[2, 2], -1.0, 1.0)))
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """The next goal of a hand.
+    """Next goal of a hand.
 
     Attributes:
         position: f64 [3] of the grip site, m.
@@ -91,10 +91,10 @@ class Expert(ABC):
 
     @abstractmethod
     def waypoints(self) -> Sequence[Waypoint]:
-        """Return one waypoint per arm for the present state."""
+        """Return one waypoint per arm for the current state."""
 
     def command(self) -> np.ndarray:
-        """Return f64 [7 * arms] absolute command: position (m), rotation vector (rad), gripper."""
+        """Return the absolute command, f64 [7 * arms]: position (m), rotation vector (rad), gripper."""
         pairs = zip(map(self.hand, range(len(self.sim_env.robots))), self.waypoints(), strict=True)
         return np.concatenate([self._step_towards(hand, waypoint) for hand, waypoint in pairs])
 
@@ -138,7 +138,7 @@ class Expert(ABC):
         slack: float = 0.01,
         turn: float = 0.0,
     ) -> np.ndarray:
-        """Return f64 [3] next point of a funnel into ``goal``: height and bow shrink with the distance left.
+        """Return the next point, f64 [3], of a funnel into ``goal``: height and bow shrink with the remaining distance.
 
         Args:
             hand: where the hand is.
@@ -165,12 +165,12 @@ def at(hand: Hand, goal: np.ndarray, rotation: np.ndarray, *, position: float, a
 
 
 def downward(yaw: float) -> np.ndarray:
-    """Return f64 [3, 3] of a hand that points straight down, turned by ``yaw`` rad about the vertical."""
+    """Return the rotation, f64 [3, 3], of a hand pointing straight down, turned by ``yaw`` rad about the vertical."""
     return Rotation.from_euler("z", yaw).as_matrix() @ DOWNWARD
 
 
 def nearest(angle: float, reference: float, period: float) -> float:
-    """Return the equivalent of ``angle`` modulo ``period`` that is nearest to ``reference``, rad.
+    """Return the angle equal to ``angle`` modulo ``period`` that is nearest to ``reference``, rad.
 
     >>> round(nearest(3.0, 0.0, 3.0), 6)
     0.0
@@ -179,5 +179,5 @@ def nearest(angle: float, reference: float, period: float) -> float:
 
 
 def clipped(vector: np.ndarray, length: float) -> np.ndarray:
-    """Return the vector, shortened to ``length`` where it is longer."""
+    """Return the vector, scaled down to ``length`` if it is longer."""
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-9))

@@ -1,4 +1,4 @@
-"""Pushing two blocks into two squares: walk round behind a block, push it towards its square, then the other one."""
+"""Scripted expert for block pushing: go behind a block, push it towards its square, then push the other one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class BlockPushExpert:
         self._pushing = False
 
     def command(self, state: np.ndarray) -> np.ndarray:
-        """Return the shift of the tip's target, f64 [2] in m, in a state [16] of `BlockPushEnv`."""
+        """Return the shift of the tip's target, f64 [2] in m, for a state [16] of `BlockPushEnv`."""
         state = np.asarray(state, np.float64)
         blocks, tip, squares = state[[[0, 1], [3, 4]]], state[8:10], state[[[10, 11], [13, 14]]]
         working = self._next(blocks, squares)

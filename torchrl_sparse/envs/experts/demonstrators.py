@@ -1,4 +1,4 @@
-"""One scripted demonstration, acted out step by step: what is meant, what is executed, and what is recorded of it.
+"""One scripted demonstration, step by step: intended actions, executed actions, and the recording.
 
 `torchrl_sparse.data.demos` runs the same loop over both kinds; a task says which is its own (`Task.demonstrator`).
 """
@@ -25,7 +25,7 @@ __all__ = ["Demonstrator", "RobosuiteDemonstrator", "StateDemonstrator", "StateE
 
 
 class Demonstrator(Protocol):
-    """Acts out one episode of an environment that was just reset.
+    """Driver of one episode of an environment that was just reset.
 
     Attributes:
         qualities: those that it knows; of the class.
@@ -40,23 +40,23 @@ class Demonstrator(Protocol):
     model_file: str
 
     def record(self, present: TensorDictBase) -> tuple[np.ndarray, Mapping[str, np.ndarray]]:
-        """Return the simulator's state, f64 [S], and the observations by name, each f64 [n], before an action."""
+        """Return the simulator's state, f64 [S], and the named observations, each f64 [n], before an action."""
 
     def label(self, present: TensorDictBase) -> np.ndarray:
-        """Return the action that the expert means in this state, whoever led there, as it is recorded."""
+        """Return the expert's intended action in this state, as recorded, whoever led there."""
 
     def disturb(self, clean: np.ndarray) -> np.ndarray:
-        """Return what is executed, as it is recorded, where the expert means ``clean`` and acts itself."""
+        """Return the executed action, as recorded, when the expert intends ``clean`` and acts itself."""
 
     def command(self, executed: np.ndarray) -> np.ndarray:
-        """Convert a recorded action to the environment's."""
+        """Convert a recorded action to an environment action."""
 
     def recorded(self, command: np.ndarray) -> np.ndarray:
-        """Convert an action of the environment to what is recorded of it."""
+        """Convert an environment action to its recorded form."""
 
 
 class RobosuiteDemonstrator:
-    """Demonstrates a robosuite task with one of the operators of a quality; a `Demonstrator`.
+    """`Demonstrator` of a robosuite task, with an operator drawn for a quality level.
 
     Args:
         task: what is demonstrated.
@@ -101,7 +101,7 @@ class RobosuiteDemonstrator:
 
     @staticmethod
     def env_args(task: RobosuiteTask) -> dict[str, Any]:
-        """Describe, as robomimic does, the environment that demonstrations are made in."""
+        """Describe the environment of the demonstrations, in robomimic's format."""
         return {
             "env_name": task.name,
             "env_version": import_robosuite().__version__,
@@ -119,7 +119,7 @@ class RobosuiteDemonstrator:
 
 
 class StateExpert(Protocol):
-    """A scripted expert that sees what a policy observes; what it draws or plans is hidden from the policy.
+    """Scripted expert that observes what a policy observes; its random choices and plans are hidden from the policy.
 
     Made for one episode from a random generator.
 
@@ -130,11 +130,11 @@ class StateExpert(Protocol):
     noise: float
 
     def command(self, state: np.ndarray) -> np.ndarray:
-        """Return the action, f64 [A], in a state [Ds]."""
+        """Return the action, f64 [A], for a state [Ds]."""
 
 
 class StateDemonstrator:
-    """Demonstrates a task outside robosuite, with noise on what is done and clean labels, as in DART (arXiv:1703.09327).
+    """`Demonstrator` of a task outside robosuite, with noisy execution and clean labels, as in DART (arXiv:1703.09327).
 
     Args:
         task: what is demonstrated.
@@ -182,7 +182,7 @@ class StateDemonstrator:
 
     @staticmethod
     def env_args(task: StateTask) -> dict[str, Any]:
-        """Describe, as robomimic does, the environment that demonstrations are made in."""
+        """Describe the environment of the demonstrations, in robomimic's format."""
         return {"env_name": task.name, "env_kwargs": {}, "type": 2}  # robomimic's EnvType.GYM_TYPE
 
 

@@ -1,4 +1,4 @@
-"""Disturb what an operator means to do: noise, pauses, bumps, slips and missed grasps."""
+"""Disturbances of an operator's intended commands: noise, pauses, bumps, slips and missed grasps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MISS_RISE = 0.04  # m, how far ahead of the hand it then goes
 
 
 class Disturbance:
-    """Turns one episode's clean commands into executed ones.
+    """Converter of one episode's clean commands to executed ones.
 
     Expert labels stay clean while the executed noise widens the states that they are given for, as in DART
     (arXiv:1703.09327); noise shrinks with the commanded step, so grasps and insertions stay possible.
@@ -114,5 +114,5 @@ class Disturbance:
 
 
 def next_noise(noise: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw the standard normal noise of the next step, correlated with that of this one; of the same shape."""
+    """Draw the next step's standard normal noise, correlated with this step's; same shape."""
     return _MEMORY * noise + np.sqrt(1 - _MEMORY**2) * rng.standard_normal(noise.shape)

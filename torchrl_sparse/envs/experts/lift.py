@@ -1,4 +1,4 @@
-"""Lift: close the fingers on the cube and raise it."""
+"""Scripted experts for Lift: close the fingers on the cube and raise it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LAG = 0.17  # s; the hand covers about a sixth of a second's way to its target 
 
 
 class LiftExpert(Expert):
-    """Approaches the cube, of several the named one, from above with the finger axis along its nearest side, and lifts."""
+    """Expert that approaches the cube (or the named one) from above, finger axis along its nearest side, and lifts it."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -31,12 +31,12 @@ class LiftExpert(Expert):
         return [Waypoint(self.above(hand, grasp) + ahead, aligned, OPEN)]
 
     def lead(self) -> np.ndarray:
-        """Return f64 [3], m, to aim ahead of the cube."""
+        """Return the offset at which to aim ahead of the cube, f64 [3], m."""
         return np.zeros(3)
 
 
 class LiftMovingExpert(LiftExpert):
-    """The same for a cube that moves: aims ahead of it by as much as the hand lags behind a moving target."""
+    """`LiftExpert` for a moving cube: it aims ahead by as much as the hand lags behind a moving target."""
 
     def lead(self) -> np.ndarray:
         velocity = self.sim_env.sim.data.get_joint_qvel(self.sim_env.cube.joints[0])[:3]
@@ -44,7 +44,7 @@ class LiftMovingExpert(LiftExpert):
 
 
 class LiftWaysExpert(LiftExpert):
-    """The same behind a ball: first to a point beside it, on one of the ways, at random.
+    """`LiftExpert` that first passes a ball through a point beside it, in a randomly chosen mode.
 
     The operator's two signs, fair coins, choose the way; the rest of what they do is small beside it.
     """

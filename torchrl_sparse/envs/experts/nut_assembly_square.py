@@ -1,4 +1,4 @@
-"""NutAssemblySquare: grasp the nut by its handle, turn it to the peg, and slide it down."""
+"""Scripted expert for NutAssemblySquare: grasp the nut by its handle, turn it to the peg, and slide it down."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _JAMMED = 0.15  # rad of tilt at which a nut around the peg is taken off again
 
 
 class NutAssemblySquareExpert(Expert):
-    """Chooses, of the two grasps across the handle, the one that turns the wrist less in all."""
+    """Expert that chooses, of the two grasps across the handle, the one with less total wrist rotation."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -85,7 +85,7 @@ class NutAssemblySquareExpert(Expert):
 
 
 def grasp_yaw(nut_yaw: float, hand_yaw: float) -> float:
-    """Return the hand's yaw for grasping, rad: the nut's or the opposite; fingers move along the nut's y axis.
+    """Return the hand's yaw for grasping, rad: the nut's or its opposite; fingers move along the nut's y axis.
 
     Where the nuts lie, the forearm is nearly vertical, and yaws far from 0 make the wrist almost singular:
     they cost twice. The hand's present yaw keeps a choice once it is made.

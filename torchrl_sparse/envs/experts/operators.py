@@ -1,4 +1,4 @@
-"""Operators: the skill of a scripted demonstrator, and the style that is drawn for an episode.
+"""Operators: the skill of a scripted demonstrator, and the style drawn for each episode.
 
 ``proficient`` is one consistent skilled operator, ``mixed`` six of three skills: scripted counterparts of the
 proficient-human and multi-human data of robomimic (arXiv:2108.03298). ``recovering`` is the first of them with mishaps in most
@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Operator:
-    """Skill of one operator. Ranges are drawn once an episode, probabilities apply as said.
+    """Skill of one operator. Ranges are sampled once per episode; probabilities apply as stated.
 
     Attributes:
         name: recorded with each demonstration.
@@ -28,7 +28,7 @@ class Operator:
         turn: the same for rotations, rad.
         hover: height over a goal at which it is approached, m.
         slope: metres of height, up to ``hover``, for each metre of horizontal distance left to the goal.
-        bow: sideways offset of a path while the goal is far, m; its sign is guided towardo.
+        bow: sideways offset of a path while the goal is far, m; its sign is drawn too.
         offset: distance of the chosen grasp from the ideal one, m.
         noise: standard deviation of the noise on executed positions, m, far from the goal.
         bump: probability that the hand is pushed away once in an episode.
@@ -51,7 +51,7 @@ class Operator:
     miss: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> Style:
-        """Draw the style of one episode."""
+        """Sample the style of one episode."""
         sides = rng.choice([-1.0, 1.0], size=2)
         return Style(
             reach=rng.uniform(*self.reach),
@@ -65,7 +65,7 @@ class Operator:
 
 @dataclass(frozen=True)
 class Style:
-    """One episode's draw of an `Operator`: the same quantities and units, now signed numbers."""
+    """One episode's sample from an `Operator`: the same quantities and units, now signed numbers."""
 
     reach: float
     turn: float
@@ -110,7 +110,7 @@ OPERATORS: Mapping[str, tuple[Operator, ...]] = {
 
 
 def draw_operator(quality: str, rng: np.random.Generator) -> Operator:
-    """Draw one of the operators of a quality.
+    """Sample one of the operators of a quality level.
 
     Raises:
         InputError: if there is no such quality; the message lists those there are.

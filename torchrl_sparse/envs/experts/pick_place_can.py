@@ -1,4 +1,4 @@
-"""PickPlaceCan: grasp the can, carry it over the walls, put it into its bin and let go."""
+"""Scripted experts for PickPlaceCan: grasp the can, carry it over the walls, put it into its bin and let go."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ _RELEASE = 0.12  # m over the bin's floor, the can's height when let go: half of
 
 
 class PickPlaceCanExpert(Expert):
-    """Grasps the can upright with an unturned hand, a turned one beside a wall, or across its axis where it has toppled."""
+    """Expert that grasps an upright can with an unturned hand, one by a wall with a turned hand, a toppled one
+    across its axis.
+    """
 
     def waypoints(self) -> Sequence[Waypoint]:
         hand = self.hand()
@@ -81,7 +83,7 @@ class PickPlaceCanExpert(Expert):
 
 
 class CanWaysExpert(PickPlaceCanExpert):
-    """The same round a pillar: the can is carried to a point beside it first, on one of the ways, at random.
+    """`PickPlaceCanExpert` that first carries the can to a point beside the pillar, in a randomly chosen mode.
 
     The sign of the operator's bow, a fair coin, chooses the way; nothing shows of it once the can is grasped.
     """

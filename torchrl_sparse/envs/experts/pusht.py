@@ -1,4 +1,4 @@
-"""Pushing the T onto its goal: try many straight pushes in a copy of the simulator, make the best one, try again."""
+"""Scripted expert for Push-T: simulate many straight pushes, execute the best one, repeat."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PushTExpert:
         self._way: list[_Point] = []
 
     def command(self, state: np.ndarray) -> np.ndarray:
-        """Return the agent's target position, f64 [2] in pixels, in a state [20] of `PushTEnv`."""
+        """Return the agent's target position, f64 [2] in pixels, for a state [20] of `PushTEnv`."""
         state = np.asarray(state, np.float64)
         agent = state[18:]
         while self._way and np.linalg.norm(self._way[0].position - agent) < self._way[0].near:
@@ -137,7 +137,7 @@ class PushTExpert:
 
 
 def block_pose(keypoints: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the position f64 [2], pixels, and angle, rad, of the block with these keypoints [9, 2].
+    """Return the block's position f64 [2], pixels, and angle, rad, from its keypoints [9, 2].
 
     >>> from torchrl_sparse.envs.pusht import block_keypoints
     >>> position, angle = block_pose(block_keypoints((100.0, 200.0), 0.7))

@@ -1,4 +1,4 @@
-"""ToolHang: stand the frame in the stand's hole, then hang the wrench on the frame's hook."""
+"""Scripted expert for ToolHang: stand the frame in the stand's hole, then hang the wrench on the frame's hook."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Pose:
     rotation: np.ndarray
 
     def point(self, local: np.ndarray) -> np.ndarray:
-        """Return f64 [3] where a point of the body is in the world, m."""
+        """Return the world position, f64 [3] in m, of a point of the body."""
         return self.position + self.rotation @ local
 
 
 class ToolHangExpert(Expert):
-    """Grasps the frame with a leaning hand, which stands it up by turning from one side of the vertical to the other.
+    """Expert that grasps the frame with a tilted hand and stands it up by tilting to the other side of the vertical.
 
     The tool is grasped from above: with a hand that leans, the forearm would knock the frame over. Both things are
     placed by their own pose in the hand, whatever that is, and the tool relative to the frame as it really stands:
@@ -147,7 +147,7 @@ _HOOK_AXES = np.diag([-1.0, 1.0, 1.0])  # from (outward, sideways, up) to the fr
 
 
 def from_hook(frame: Pose, point: np.ndarray) -> np.ndarray:
-    """Return f64 [3] of a point of the world, m from the hook's corner: outward along the arm, sideways and along the rod."""
+    """Return a world point relative to the hook's corner, f64 [3] in m: outward along the arm, sideways, along the rod."""
     return _HOOK_AXES @ frame.rotation.T @ (point - frame.point(FRAME_HOOK))
 
 
@@ -157,14 +157,14 @@ def in_hole(off: np.ndarray) -> bool:
 
 
 def descent(off: np.ndarray, up: np.ndarray) -> float:
-    """Return the way, m, that a frame with its tip in the hole may go down: none while its rod would land on the rim."""
+    """Return how far, m, a frame with its tip in the hole may descend: none while its rod would land on the rim."""
     misfit = np.abs(off[:2] - off[2] * up[:2] / up[2]).max()  # of the rod's axis, at the height of the rim
     at_rod = _ROD_END[0] < -off[2] < _ROD_END[1]
     return float(np.clip(0.015 - 30.0 * max(0.0, misfit - (_ROD_FIT if at_rod else 0.003)), -0.005, 0.015))
 
 
 def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float, float]) -> bool:
-    """Tell whether the fingers are around a body's grip, and as far apart as it is wide.
+    """Tell whether the fingers are around a body's grip and closed to its width.
 
     Args:
         hand: whose fingers.
@@ -180,7 +180,7 @@ def holds(hand: Hand, body: Pose, grip: np.ndarray, axis: int, size: tuple[float
 
 
 def around(hole: np.ndarray) -> bool:
-    """Tell whether the tool's hole, its centre ``hole`` f64 [3] m from the hook's corner, is around the hook."""
+    """Tell whether the hook is inside the tool's hole, given the hole's centre ``hole`` f64 [3] m from the hook's corner."""
     outward, sideways, up = hole
     around_end = -0.008 < up < _HOOK_TOP + 0.001 and abs(outward) < 0.008
     around_arm = outward < 0.0 and abs(up) < 0.009
@@ -188,13 +188,13 @@ def around(hole: np.ndarray) -> bool:
 
 
 def over_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the next goal of the hole's centre on its way to the hook's upturned end; see `along_hook`."""
+    """Return the next goal of the hole's centre on its path to the hook's upturned end; see `along_hook`."""
     misfit = max(0.0, float(np.hypot(hole[0], hole[1])) - 0.003)
     return np.array([0.0, 0.0, min(0.01 + 10.0 * misfit, 0.05)]), float(_PITCHES[0])
 
 
 def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the next goal of the hole's centre on its way down the hook's end and inward along its arm.
+    """Return the next goal of the hole's centre on its path down the hook's end and inward along its arm.
 
     The hole is 19 mm wide and the hook 20 mm high, so the tool cannot be slid over it level: its axis turns from
     near the upturned end's direction to near the arm's.
@@ -213,7 +213,7 @@ def along_hook(hole: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def hanging(pitch: float) -> np.ndarray:
-    """Return f64 [3, 3] rotation of the tool in the frame's axes: handle outward, ``pitch`` rad below the arm's direction."""
+    """Return the tool's rotation f64 [3, 3] in the frame's axes: handle outward, ``pitch`` rad below the arm's direction."""
     c, s = np.cos(pitch), np.sin(pitch)
     return _HOOK_AXES @ np.array([[c, 0.0, s], [0.0, -1.0, 0.0], [-s, 0.0, c]])
 

@@ -1,4 +1,4 @@
-"""TwoArmTransport: one arm uncovers the hammer and offers it in the middle, the other clears its bin and takes it.
+"""Scripted expert for TwoArmTransport: one arm uncovers and offers the hammer, the other clears its bin and takes it.
 
 The first arm ("giver", robot 0) lifts the lid off the start bin, puts it beside, and holds the hammer out between
 the tables. The second ("taker", robot 1) carries the trash out of the target bin meanwhile, grasps the hammer by
@@ -73,20 +73,20 @@ class Hammer:
 
     @property
     def yaw(self) -> float:
-        """Of a hand whose fingers move across the handle, rad; modulo pi."""
+        """Yaw of a hand whose fingers close across the handle, rad; modulo pi."""
         return float(np.arctan2(self.along[1], self.along[0]))
 
     def point(self, ahead: float) -> np.ndarray:
-        """Return f64 [3] point ``ahead`` m from the handle's middle towards the taker."""
+        """Return the point f64 [3] that is ``ahead`` m from the handle's middle, towards the receiving arm."""
         return self.middle + ahead * self.along
 
     def across(self, hand: Hand, lean: float = 0.0) -> np.ndarray:
-        """Return f64 [3, 3] of a hand that grasps across the handle, turned the nearer way, its palm ``lean`` rad back."""
+        """Return the rotation f64 [3, 3] of a hand grasping across the handle with least turn, its palm ``lean`` rad back."""
         level = downward(nearest(self.yaw, hand.yaw, np.pi))
         return level @ Rotation.from_euler("x", -lean).as_matrix()
 
     def distance(self, hand: Hand) -> float:
-        """Return the distance of the hand to the nearest point of the handle's axis, m."""
+        """Return the hand's distance to the nearest point of the handle's axis, m."""
         ahead = np.clip((hand.position - self.middle) @ self.along, -_HANDLE_HALF, _HANDLE_HALF)
         return float(np.linalg.norm(hand.position - self.point(ahead)))
 
@@ -95,7 +95,7 @@ class Hammer:
 
 
 class TwoArmTransportExpert(Expert):
-    """Both arms decide for themselves; they meet where the state tells that the other one is ready."""
+    """Expert whose two arms decide independently and meet when the state shows that the other arm is ready."""
 
     def waypoints(self) -> Sequence[Waypoint]:
         giver, taker, hammer = self.hand(0), self.hand(1), self._hammer()

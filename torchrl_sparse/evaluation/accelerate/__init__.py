@@ -1,4 +1,4 @@
-"""From a slow policy to the fastest one that is still right: candidates, stages, the choice, and what is handed over."""
+"""Search for the fastest method that is non-inferior to the dense policy: candidates, stages, choice, and output."""
 
 import lazy_loader as lazy
 

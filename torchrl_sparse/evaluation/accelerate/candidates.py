@@ -1,4 +1,4 @@
-"""The candidates of an acceleration: which there are, and how they are calibrated."""
+"""Candidate methods of an acceleration, and their calibration."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TOP_K = 5  # blocks that BAC's bubbling union enlarges; the paper's
 
 @dataclass(frozen=True)
 class Grid:
-    """What is tried. Nothing in it is trained.
+    """Grid of candidate methods, none of which needs training.
 
     Attributes:
         samplers: chains by name, see `torchrl_sparse.networks.diffusion.naming`.
@@ -83,7 +83,7 @@ def calibrate_candidates(
     made_for: dict[str, Any],
     n_action_steps: int = 8,
 ) -> list[str]:
-    """Calibrate all candidates and return the names under which a benchmark finds them, with ``planners=FOLDER``.
+    """Calibrate all candidates and return the names by which a benchmark finds them, with ``planners=FOLDER``.
 
     What is in the folder already, of an earlier call, is not made again.
 
@@ -112,7 +112,7 @@ def calibrate_candidates(
 
 
 def family(policy: DiffusionPolicy, own: Sampler) -> Family:
-    """Return what kind of candidate a policy under a method is, beside the dense policy's ``own`` sampler.
+    """Return the family of a candidate method, compared with the dense policy's ``own`` sampler.
 
     >>> policy = DiffusionPolicy.from_pretrained("assets/lift")
     >>> [family(policy.with_plan(None, Sampler(kind, 3)), policy.sampler) for kind in ("ddpm", "ddim")]

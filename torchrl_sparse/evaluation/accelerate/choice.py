@@ -1,4 +1,4 @@
-"""Which candidates are worth episodes, and which of those that were played is taken."""
+"""Ranking of candidates before episodes are played, and the choice among those that were played."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["choose", "rank", "within_budget"]
 
 
 def within_budget(candidates: Mapping[str, Candidate], budget_ms: float | None) -> list[str]:
-    """Return the methods that are fast enough, without dense.
+    """Return the methods within the time budget, without dense.
 
     Args:
         candidates: dense among them.
@@ -41,7 +41,7 @@ def within_budget(candidates: Mapping[str, Candidate], budget_ms: float | None) 
 
 
 def rank(names: Sequence[str], candidates: Mapping[str, Candidate], budget_ms: float | None) -> list[str]:
-    """Order methods: of every family the most promising, then of every family the second, and so on.
+    """Order methods by promise: first the best of every family, then the second best of every family, and so on.
 
     With a budget, which all of them keep, the one of least error is the most promising. Without one it is the fastest of those
     that are no farther from demonstrations than dense, before the others by error.
@@ -75,7 +75,7 @@ def choose(
     played: Mapping[str, Played],
     budget_ms: float | None,
 ) -> str:
-    """Return the method to take.
+    """Return the chosen method.
 
     Of the methods that are non-inferior to dense in success and in time, or in the score of a graded task: with a
     budget, which all of them keep, the one that is surest; else the fastest. Where none is shown to be, the one whose interval

@@ -1,4 +1,4 @@
-"""What an acceleration hands over: a policy that is ready to use, its card, a film and a report."""
+"""Output of an acceleration: a ready-to-use policy, its card, a film and a report."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ the numbers below.
 
 
 def save_policy(found: Acceleration, policy: DiffusionPolicy, folder: Path, *, n_action_steps: int) -> None:
-    """Write the chosen policy and its card into ``folder``, in one piece: what was there before stays until all is written.
+    """Write the chosen policy and its card into ``folder`` atomically: the old content stays until all is written.
 
     Weights are stored in half precision only where that loses nothing, so that the saved policy answers as the one measured.
 
@@ -81,7 +81,7 @@ def film_chosen(
     n_action_steps: int,
     seed: int,
 ) -> None:
-    """Film the first episode of the chosen method, unless that was done; ``OUT/rollout_METHOD.mp4``.
+    """Film the first episode of the chosen method as ``OUT/rollout_METHOD.mp4``, unless the film exists.
 
     Raises:
         RuntimeError: without a GL library.
@@ -95,7 +95,7 @@ def film_chosen(
 
 
 def write_acceleration_report(found: Acceleration, out: Path) -> Path:
-    """Write ``OUT/report.html``: the verdict, the front, what was played, and the films; return its path."""
+    """Write ``OUT/report.html`` with verdict, Pareto front, played methods and films; return its path."""
     path = out / "report.html"
     faults = write_report(out, path, title=f"{found.task}: {verdict_line(found)}")
     if faults:

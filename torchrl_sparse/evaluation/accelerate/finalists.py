@@ -1,4 +1,4 @@
-"""The benchmark of an acceleration: its finalists against dense, until their verdicts are reached."""
+"""The benchmark of an acceleration: finalists against dense, until their verdicts are reached."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ __all__ = ["Finalists"]
 
 
 class Finalists(DiffusionBenchmark):
-    """Methods that were timed already, together with those that do not play, and whose policy calls are demonstrations'.
+    """Benchmark of methods that were timed before, on the demonstrations' policy calls and with the candidates that do not
+    play.
 
     Args:
         request: what was asked for.
@@ -63,7 +64,7 @@ class Finalists(DiffusionBenchmark):
         return {name: MethodRun(episodes[name], self.timings[name], errors[name]) for name in self.methods}
 
     def draw(self, results: Results, episodes: Episodes) -> None:
-        """Draw nothing: an acceleration's own figure shows all candidates."""
+        """Draw nothing: the acceleration's own figure shows all candidates."""
 
     def machine(self) -> Machine:
         return self._machine

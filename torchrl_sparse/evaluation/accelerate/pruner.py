@@ -1,4 +1,4 @@
-"""A learned candidate: SAG's pruner of the policy's own chain."""
+"""The learned candidate of an acceleration: a SAG pruner of the policy's own sampler."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def train_candidate(
     n_action_steps: int = 8,
     share: float = 0.05,
 ) -> str:
-    """Train the pruner, from where an earlier call was stopped, put it into ``planners``, and return its name there.
+    """Train the pruner, resuming an interrupted training, save it in ``planners``, and return its name there.
 
     Args:
         policy: the trained policy with its own sampler.

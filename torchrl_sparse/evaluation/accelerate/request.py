@@ -1,4 +1,4 @@
-"""What is asked of an acceleration."""
+"""The options of an acceleration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Request"]
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Options of an acceleration.
 
     Attributes:
         task: a name or alias.

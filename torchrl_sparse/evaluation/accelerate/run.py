@@ -1,4 +1,4 @@
-"""From a slow policy to the fastest one that is still right: calibrate, time, rank, play, choose, save.
+"""The stages of an acceleration in order: calibrate, time, rank, play, choose, save.
 
 Every stage leaves a file, which an interrupted run reads instead of making it again::
 
@@ -66,7 +66,7 @@ def accelerate(
     grid: Grid = Grid(),  # noqa: B008, it is frozen
     pruner: PrunerConfig | None = None,
 ) -> tuple[Acceleration, dict[str, DiffusionPolicy]]:
-    """Find the fastest way to run a policy that is still right, and write ``acceleration.json`` and all that led to it.
+    """Find the fastest method that is non-inferior to the dense policy, and write ``acceleration.json`` with all evidence.
 
     Args:
         policy: the trained policy with its own sampler, observing states.

@@ -1,4 +1,4 @@
-"""What the stages of an acceleration leave behind, so that one that was killed goes on where it was.
+"""Files that the stages of an acceleration write, so that an interrupted one resumes.
 
 Each file says what it was made for; under other settings it is refused, or made again where that costs little.
 """
@@ -26,7 +26,7 @@ S = TypeVar("S", bound=_Stage)
 
 @dataclass(frozen=True)
 class Search:
-    """A search for timesteps: the method of least error, its error, and how many chains were tried."""
+    """Result of a timestep search: the method with the least error, its error, and the number of chains tried."""
 
     format: Literal["torchrl_sparse.search/1"]
     made_for: dict[str, Any]
@@ -37,7 +37,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of methods to demonstrations."""
+    """Errors of methods relative to demonstrations."""
 
     format: Literal["torchrl_sparse.errors/1"]
     made_for: dict[str, Any]
@@ -46,7 +46,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Timings:
-    """Latencies of methods, measured together, and where."""
+    """Latencies of methods, measured together, and the machine."""
 
     format: Literal["torchrl_sparse.timings/1"]
     made_for: dict[str, Any]
@@ -57,7 +57,7 @@ class Timings:
 def read_or_make(
     path: Path, kind: type[S], made_for: Mapping[str, Any], make: Callable[[], S], *, remake: bool = False
 ) -> S:
-    """Return what the file holds or, where there is none, make and write it.
+    """Return the content of the file; if there is none, compute and write it.
 
     Args:
         path: of the JSON file.

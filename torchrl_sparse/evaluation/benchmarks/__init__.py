@@ -1,4 +1,4 @@
-"""Benchmarks: from episodes, timed policy calls and errors of every method to results, figures and films."""
+"""Benchmarks: results, figures and films from the episodes, timed policy calls and errors of every method."""
 
 import lazy_loader as lazy
 

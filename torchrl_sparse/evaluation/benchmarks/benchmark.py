@@ -1,4 +1,4 @@
-"""A benchmark in the order in which it runs: play, measure, compare, draw."""
+"""The base of all benchmarks, in the order in which they run: play, measure, compare, draw."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Episodes = Mapping[str, Sequence[EpisodeResult]]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """What every benchmark is told; the names are those of the recipes' options.
+    """Options common to all benchmarks, named as in the recipes.
 
     Attributes:
         task: a name or alias, as it was asked for.
@@ -75,12 +75,12 @@ class BenchmarkOptions:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> BenchmarkOptions:
-        """Take them from a recipe's options, which may have others too."""
+        """Select these options from a recipe's, which may have others too."""
         return cls(**{field.name: options[field.name] for field in fields(cls) if field.name in options})
 
 
 class Benchmark(ABC):
-    """Methods against dense, on the same episodes and the same policy calls. `run` is the order.
+    """Comparison of methods with dense on the same episodes and policy calls; `run` shows the order.
 
     A subclass has the methods: what acts them out, what tells their episodes from others', how they are timed, what is drawn.
 
@@ -108,7 +108,7 @@ class Benchmark(ABC):
         self.settings = {name: getattr(options, name) for name in ("task", "horizon", "n_action_steps")}
 
     def run(self) -> Results:
-        """Play the episodes, or read those that an earlier run left; measure; compare; write; draw."""
+        """Play the episodes or read them from an earlier run's logs; then measure, compare, write and draw."""
         episodes = self.play()
         results = self.results(self.measure(episodes))
         write_json(self.out / self.file, results)
@@ -122,7 +122,7 @@ class Benchmark(ABC):
 
     @abstractmethod
     def measure(self, episodes: Episodes) -> Mapping[str, MethodRun]:
-        """Time the methods and compare their answers with dense's; return both beside their episodes."""
+        """Time the methods and compare their actions with dense's; return the results together with the episodes."""
 
     def results(self, runs: Mapping[str, MethodRun]) -> Results:
         """Compare the methods: the content of ``results.json``."""
@@ -149,14 +149,14 @@ class Benchmark(ABC):
 
     @abstractmethod
     def actor(self, name: str) -> TensorDictModuleBase:
-        """Return what acts out a method."""
+        """Return the actor that plays a method."""
 
     @abstractmethod
     def identity(self, name: str) -> dict[str, Any]:
-        """Return what tells a method's episodes from others', see `EpisodeLog`."""
+        """Return the values that tell a method's episodes from others', see `EpisodeLog`."""
 
     def play_method(self, name: str, count: int) -> list[EpisodeResult]:
-        """Return a method's first ``count`` episodes; those in its log are not run again."""
+        """Return a method's first ``count`` episodes; logged ones are not run again."""
         options = self.options
         return evaluate(
             name,
@@ -172,17 +172,17 @@ class Benchmark(ABC):
         )
 
     def log(self, name: str) -> Path:
-        """Return where a method's episodes are kept."""
+        """Return the log of a method's episodes."""
         return episode_log(self.out, name, self.options.dense_log)
 
     def runtime(self) -> Any:
-        """Return the context in which workers run: one Ray for all methods."""
+        """Return the context in which workers run: one Ray cluster for all methods."""
         return backend_runtime(self.options.backend, self.options.workers)
 
     def machine(self) -> Machine:
-        """Describe what was timed on."""
+        """Describe the machine of the measurements."""
         return describe_machine(self.options.device, self.options.threads)
 
     def made_with(self) -> dict[str, Any] | None:
-        """Return what else the methods depend on, for ``results.json``."""
+        """Return the other settings that the methods depend on, for ``results.json``."""
         return None

@@ -1,4 +1,4 @@
-"""The benchmark of methods in a world that does not wait for them."""
+"""The benchmark of methods under inference delay."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["RealtimeBenchmark"]
 
 
 class RealtimeBenchmark(Benchmark):
-    """A diffusion policy under several methods, each at its own latency and at others.
+    """Benchmark of a diffusion policy under several methods, each at its own and at other latencies.
 
     Each method is timed before it plays, since its own latency is one of those that it plays under. What plays is a method
     at a number of steps of delay.
@@ -60,7 +60,7 @@ class RealtimeBenchmark(Benchmark):
         self.methods, self.latencies, self.model = methods, latencies, model
 
     def play(self) -> dict[str, dict[int, list[EpisodeResult]]]:
-        """Return the episodes by method and steps of delay."""
+        """Return the episodes by method and delay in steps."""
         options, dense = self.options, ChunkExecutor(self.methods[DENSE])
         queries = record_queries(dense, self.make_env, self.seeds[: options.probe_episodes])
         timing = {"repeats": options.latency_repeats, "threads": options.threads}
@@ -80,7 +80,7 @@ class RealtimeBenchmark(Benchmark):
         return {name: RealtimeRun(self.latency[name].p50, played) for name, played in episodes.items()}
 
     def results(self, runs: Mapping[str, RealtimeRun]) -> Realtime:
-        """Compare the methods, each at every delay: the content of ``realtime.json``."""
+        """Compare the methods at every delay: the content of ``realtime.json``."""
         options = self.options
         return build_realtime(
             runs,

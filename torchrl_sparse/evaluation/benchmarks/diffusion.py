@@ -1,4 +1,4 @@
-"""The benchmark of a diffusion policy: its methods, what is measured of them, and the figures."""
+"""The benchmark of a diffusion policy: methods, measurements and figures."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _SURGING = ("uniform", "bac_blockwise", "bac")  # whose errors BAC's third figur
 
 
 class DiffusionBenchmark(Benchmark):
-    """A diffusion policy, dense against other methods, in a world that waits.
+    """Benchmark of a diffusion policy, dense against other methods, without inference delay.
 
     Args:
         options, make_env: see `Benchmark`.
@@ -105,7 +105,7 @@ class DiffusionBenchmark(Benchmark):
         self.film(self.options.videos)
 
     def film(self, names: Sequence[str]) -> None:
-        """Film an episode of each method of these that is measured, where there is a GL library."""
+        """Film one episode of each measured method that is named, if there is a GL library."""
         if left_out := [name for name in names if name not in self.actors]:
             print(f"no video of {', '.join(left_out)}: not among the methods")
         try:
@@ -117,7 +117,7 @@ class DiffusionBenchmark(Benchmark):
 
 
 def default_methods(planners: Path) -> list[str]:
-    """Return the methods that need no file, and every planner that is saved in a folder.
+    """Return the methods that need no file, and every planner saved in a folder.
 
     >>> default_methods(Path("assets/lift"))[5:]
     ['bac_blockwise', 'bac', 'bac_ddpm10', 'bac_m6', 'l2c', 'l2c_noise', 'sag', 'sag_fixed', 'searched']
@@ -133,7 +133,7 @@ def make_methods(
     planners: Path,
     calibration: Callable[[], Calibration],
 ) -> dict[str, DiffusionPolicy]:
-    """Return the policy under each method, and first of all as it is: dense is what all others are compared with.
+    """Return the policy under each method, starting with the unchanged policy, dense, as the reference.
 
     Args:
         names: of methods; the rest as of `make_method`.
@@ -145,7 +145,7 @@ def make_methods(
 def settle_rates(
     methods: Mapping[str, DiffusionPolicy], episodes: Mapping[str, Sequence[EpisodeResult]]
 ) -> None:
-    """Set the rate of each method whose controller moves it to the mean of its episodes, at which it is then timed."""
+    """Set the rate of each method with a rate controller to the mean of its episodes; it is then timed at that rate."""
     for name, method in methods.items():
         rates = MethodSpec.parse(name).rates
         if len(rates) == 2:
@@ -155,7 +155,7 @@ def settle_rates(
 def time_methods(
     methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, repeats: int, threads: int
 ) -> dict[str, Latency]:
-    """Time every method as it is asked, interleaved; what computes the same as another has its latency.
+    """Time every method, interleaved; methods that compute the same share one latency.
 
     Args:
         methods: name -> policy, ``"dense"`` among them.
@@ -180,7 +180,7 @@ def measure_methods(
     repeats: int,
     threads: int,
 ) -> dict[str, MethodRun]:
-    """Measure latency and action error of all methods on the same policy calls, and add them to the episodes.
+    """Measure latency and action error of all methods on the same policy calls, and add both to the episodes.
 
     Args:
         methods: name -> policy, ``"dense"`` among them.
@@ -212,7 +212,7 @@ def draw_methods(
     calibration: Calibration,
     out: Path,
 ) -> None:
-    """Write the figures: success against time, every method's mask, how masks change, and where errors surge.
+    """Write the figures: success against time, every method's mask, mask changes, and error surges.
 
     Args:
         results: content of ``results.json``.

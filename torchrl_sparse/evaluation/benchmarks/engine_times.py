@@ -1,4 +1,4 @@
-"""Every engine against PyTorch eager on the network of one policy, measured; see `results.engine_report`."""
+"""Times of every engine and of eager PyTorch on one policy's network; see `results.engine_report`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def measure_engines(
     compiled: bool = False,
     instruction_sets: bool = False,
 ) -> EngineShape:
-    """Time every engine on every kind of policy call, interleaved, and of a policy with cameras whole calls by stage.
+    """Time every engine on every kind of policy call, interleaved; for a policy with cameras, also whole calls by stage.
 
     Dense is DDPM in all training steps of the policy's sampler, whatever the policy takes itself.
 

@@ -1,4 +1,4 @@
-"""Films of an episode: what the cameras see, what the method prunes, and what each policy call took."""
+"""Films of an episode: camera views, the method's pruning, and the time of each policy call."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ZOOM = 2
 def film_masks(
     name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path, threads: int
 ) -> None:
-    """Film a diffusion policy's episode, with the latest policy call's mask beside it where masks depend on the observation.
+    """Film a diffusion policy's episode, with the latest call's mask beside the image if masks depend on the observation.
 
     Args:
         name: of the method; the film is ``out/rollout_NAME.mp4``.
@@ -61,7 +61,7 @@ def film_masks(
 def film_tokens(
     name: str, actor: ChunkExecutor, make_env: Callable[..., EnvBase], seed: int, out: Path, threads: int
 ) -> None:
-    """Film what a vision-language-action policy sees and keeps in an episode; draw a strip of it, and when motion was fine.
+    """Film the images and kept tokens of a vision-language-action policy's episode; draw a strip of them, and the fine mode.
 
     Args:
         name: of the method; the files are ``out/rollout_NAME.mp4``, ``strip_NAME.png`` and ``control_NAME.png``.
@@ -90,7 +90,7 @@ def film_tokens(
 
 
 def captions(name: str, steps: TensorDictBase) -> list[Caption]:
-    """Return what to write under the picture of each step of an episode [T].
+    """Return the caption of each step of an episode [T].
 
     Args:
         name: of the method.

@@ -1,4 +1,4 @@
-"""One call of a diffusion policy, measured: its parts, its threads, and its tail; see `results.query_report`."""
+"""Measurements of one diffusion policy call: its parts, thread scaling, and tail latency; see `results.query_report`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def measure_call(
     busy: int = 0,
     library: str | Path | None = None,
 ) -> QueryProfile:
-    """Time a policy call in its parts, unpruned policy calls by number of threads, and many calls from Python and in C.
+    """Time the parts of a policy call, unpruned calls by number of threads, and many calls from Python and in C.
 
     Args:
         policy: on the CPU, with the sampler and the plan of the call.

@@ -1,4 +1,4 @@
-"""The episodes of a benchmark: a fixed number of each method, or as many as its verdict takes."""
+"""The episodes of a benchmark: a fixed number per method, or as many as its verdict needs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UNTIL = ("episodes", "conclusive")
 
 
 def make_design(until: str, episodes: int, max_episodes: int) -> Design:
-    """Return when a benchmark analyses its episodes.
+    """Return the interim-analysis design of a benchmark.
 
     Args:
         until: "episodes" for a fixed number, "conclusive" to go on until a method's verdicts are reached.
@@ -45,7 +45,7 @@ def make_design(until: str, episodes: int, max_episodes: int) -> Design:
 
 
 def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> int:
-    """Return the steps after which the environment that `make_env` makes truncates an episode.
+    """Return the steps after which the environment from `make_env` truncates an episode.
 
     Args:
         make_env: called as ``make_env(seeds=seeds)``.
@@ -58,7 +58,7 @@ def episode_horizon(make_env: Callable[..., EnvBase], seeds: Sequence[int]) -> i
 def play_rounds(
     names: Iterable[str], play: Callable[[str, int], list[EpisodeResult]], terms: Terms
 ) -> dict[str, list[EpisodeResult]]:
-    """Play every method until its verdict is reached or the cap is, and dense as far as any of them.
+    """Play every method until its verdict is reached or the cap is, and dense as far as the longest of them.
 
     Nothing but the episodes decides, analysis by analysis, so a benchmark that was killed stops where it would have stopped.
 

@@ -1,4 +1,4 @@
-"""What benchmarks say of a policy and of its answers: their distance to dense's, and what they took."""
+"""Summaries of a policy and of its actions: shape, distance to dense, and FLOPs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["describe_policy", "error_to_dense", "flops_executed"]
 
 
 def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) -> PolicyShape:
-    """Return what ``results.json`` says of the policy.
+    """Return the description of a policy for ``results.json``.
 
     Args:
         policy: the dense policy.
@@ -41,7 +41,7 @@ def describe_policy(policy: DiffusionPolicy | VLAPolicy, n_action_steps: int) ->
 def error_to_dense(
     policy: DiffusionPolicy | VLAPolicy, answers: TensorDictBase, dense_answers: TensorDictBase
 ) -> tuple[float, float]:
-    """Return mean and maximum absolute difference of normalised actions.
+    """Return the mean and maximum absolute difference of normalised actions to dense's.
 
     Args:
         policy: whose normaliser applies.
@@ -53,7 +53,7 @@ def error_to_dense(
 
 
 def flops_executed(policy: DiffusionPolicy, answers: TensorDictBase) -> float:
-    """Return the FLOPs that the planner and the chosen engine really did in a policy call, mean over ``answers`` [Q].
+    """Return the FLOPs that planner and engine executed per policy call, mean over ``answers`` [Q].
 
     Examples:
         >>> import torch

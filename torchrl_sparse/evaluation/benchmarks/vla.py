@@ -1,4 +1,4 @@
-"""A benchmark of a vision-language-action policy: its methods, which may match each other, and the calls they are asked."""
+"""Set-up of a vision-language-action benchmark: its methods, which may match each other's tokens, and their policy calls."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def record_methods(
     n_action_steps: int,
     settings: Settings,
 ) -> dict[str, Recorded]:
-    """Record the policy calls that each method is measured on: those of dense episodes under the method's own controller.
+    """Record the policy calls that each method is measured on: dense episodes under the method's own controller.
 
     The controller asks for calls of its own where motion becomes fine, and grants each its budget; both are replayed with
     it. Methods without one, and those with the same, share their episodes.
@@ -79,7 +79,7 @@ def record_methods(
 
 
 def token_settings(options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the settings of pruners and controllers, see `make_pruner`, of a benchmark's options.
+    """Return the settings of pruners and controllers from a benchmark's options, see `make_pruner`.
 
     `SpecPrune` is as ``calibrate_tokens`` chose it for the policy, where no other fields are written.
 
@@ -110,7 +110,7 @@ def skipped_layers(dense: VLAPolicy, recorded: Recorded, count: int) -> list[int
 
 
 def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) -> None:
-    """Refuse methods whose controller grants more tokens than a model has, before any episode is played.
+    """Refuse methods whose controller sets more tokens than the model has, before any episode is played.
 
     Args:
         texts: of methods; of those that match another's tokens the number is not known yet.
@@ -129,7 +129,7 @@ def check_budgets(texts: Iterable[str], spec: VisualSpec, settings: Settings) ->
 
 
 def filmed_methods(videos: Iterable[str], methods: Sequence[str]) -> dict[str, str]:
-    """Return what to film: video -> method. A video is named as its method, or only as what is before the @.
+    """Return the methods to film: video -> method. A video is named like its method, or like the part before the @.
 
     Raises:
         InputError: if none or several of the methods are meant.
@@ -153,7 +153,7 @@ def matched_number(
     episodes: Mapping[str, Sequence[EpisodeResult]],
     settings: Settings,
 ) -> float | None:
-    """Return a method's number: its own, or the share at which it keeps as many tokens as the method that it matches.
+    """Return a method's number: its own, or the share that keeps as many tokens as the method that it matches.
 
     Args:
         text: the method, see `torchrl_sparse.methods.vla`.
@@ -178,5 +178,5 @@ def matched_number(
 
 
 def matches_last(texts: Iterable[str]) -> list[str]:
-    """Return methods in the order in which they can run: those that match another after all others."""
+    """Return methods in running order: those that match another one come last."""
     return sorted(texts, key=lambda text: parse_token_method(text).like is not None)

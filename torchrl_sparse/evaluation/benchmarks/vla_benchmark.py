@@ -1,4 +1,4 @@
-"""The benchmark of a vision-language-action policy: what is measured on recorded calls is time, distance to dense, depth."""
+"""The benchmark of a vision-language-action policy: success, and on recorded calls time, distance to dense, and token depth."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ __all__ = ["VLABenchmark", "draw_methods", "measure_methods", "replay_all", "tim
 
 
 class VLABenchmark(Benchmark):
-    """A vision-language-action policy, dense against pruned visual tokens.
+    """Benchmark of a vision-language-action policy, dense against pruned visual tokens.
 
     Policy calls are recorded before methods play, since a method that matches another's tokens needs both.
 
@@ -135,7 +135,7 @@ def measure_methods(
     threads: int,
     device: str,
 ) -> dict[str, MethodRun]:
-    """Measure each method's time and its distance to dense, on its own policy calls.
+    """Measure each method's time and its distance to dense on its own policy calls.
 
     Args:
         policies: name -> policy, the dense one among them.
@@ -155,7 +155,7 @@ def measure_methods(
 def draw_methods(
     results: Results, policies: Mapping[str, VLAPolicy], recorded: Mapping[str, Recorded], out: Path
 ) -> None:
-    """Draw success against time, time to success, and how deep each method's tokens go, into the folder ``out``."""
+    """Draw success against time, time to success, and each method's tokens per layer, into the folder ``out``."""
     plot_pareto(results, out / "pareto.png")
     plot_success_within(results, out / "success_within.png")
     depth = {
@@ -173,7 +173,7 @@ def time_methods(
     threads: int,
     device: str,
 ) -> dict[str, Latency]:
-    """Time the policy calls of the first recorded episode in turn, each method its own, interleaved.
+    """Time each method on its own policy calls of the first recorded episode, interleaved.
 
     So the times are those of an episode's mixture of queries: the first, which knows nothing of the scene and may keep more,
     coarse and fine ones.
@@ -195,6 +195,6 @@ def _in_turn(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> Callable[[
 
 
 def replay_all(policy: VLAPolicy, recorded: Recorded) -> TensorDictBase:
-    """Return the policy's answers to all policy calls of all episodes, [Q]: chunks, and how deep each token went."""
+    """Return the policy's outputs for all policy calls of all episodes, [Q]: chunks, and the depth that each token reached."""
     wanted = (keys.CHUNK, keys.TOKEN_DEPTH)
     return torch.cat([replay(policy, queries, policy.pruner).select(*wanted) for queries in recorded])

@@ -1,4 +1,4 @@
-"""Times of a vision-language-action model's parts, and savings of pruning, measured; see `results.vla_report`."""
+"""Times of a vision-language-action model's parts, and the savings of token pruning; see `results.vla_report`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = ["measure_vla", "token_pruners"]
 def token_pruners(
     policy: VLAPolicy, alphas: Iterable[float], shares: Iterable[float], equal_to: str | None = None
 ) -> dict[str, TokenPruner | None]:
-    """Return dense, SpecPrune at every alpha, and FastV and random at every share of the visual tokens.
+    """Return dense, SpecPrune at every alpha, and FastV and random pruning at every share of visual tokens.
 
     Args:
         policy: that they are for.
@@ -78,7 +78,7 @@ def measure_vla(
     repeats: int,
     warmup: int = 2,
 ) -> VLALatency:
-    """Time the parts of the dense policy call and all methods, everything interleaved.
+    """Time the parts of the dense policy call and all methods, all interleaved.
 
     Args:
         case: with a method ``"dense"``.

@@ -1,4 +1,4 @@
-"""The front of an acceleration: what every candidate costs, and how far it is from the demonstrations."""
+"""Figure of an acceleration: latency of every candidate against its error to the demonstrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours that mean the same in every figure: Okabe and Ito's, which stay apart for colour-blind readers."""
+"""Colours of methods, the same in every figure: Okabe and Ito's, which colour-blind readers can tell apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OTHER_COLORS = (
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """Give every method a colour: that of its table, the same one in every figure, or one that is left.
+    """Assign every method a colour: its fixed one from the table, or else an unused one.
 
     A method is looked up without what follows ``@``; of several that differ in that alone, the first has the table's colour.
 

@@ -1,4 +1,4 @@
-"""Success as a function of the time that is allowed: what a slower policy costs, in one picture per task."""
+"""Success as a function of the allowed time: the cost of a slower policy, one picture per task."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["plot_success_within"]
 
 
 def plot_success_within(results: Results, path: str | os.PathLike) -> Path:
-    """Draw the share of episodes solved within each number of steps (log axis), a curve per method.
+    """Draw the share of episodes solved within each number of steps (log axis), one curve per method.
 
     Args:
         results: of a benchmark.

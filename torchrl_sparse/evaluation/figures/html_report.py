@@ -1,4 +1,4 @@
-"""Any set of files of results as one HTML page that needs nothing else.
+"""Self-contained HTML page of any set of results files.
 
 Tables and figures are made from the files alone; pictures and videos that lie beside them are embedded as data URIs. A
 content security policy forbids the page every request, and the template escapes everything that was read from a file.
@@ -63,14 +63,14 @@ class Medium:
 
     @classmethod
     def read(cls, path: Path, caption: str) -> Medium:
-        """Embed a file."""
+        """Read a file as a data URI."""
         data = base64.b64encode(path.read_bytes()).decode("ascii")
         return cls(f"data:{_MEDIA[path.suffix]};base64,{data}", caption, path.suffix == ".mp4")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A file of results: its tables by name, notes and figures, or what is wrong with it."""
+    """One results file: its tables by name, notes and figures, or the error in it."""
 
     name: str
     tables: Mapping[str, Sequence[Row]] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class Run:
 
     @classmethod
     def read(cls, file: Path, name: str) -> Run:
-        """Read a file and draw its figures."""
+        """Read a results file and draw its figures."""
         try:
             return cls._drawn(file, name) if _is_drawn(file) else cls(name, _tables(file))
         except (ValueError, OSError) as error:
@@ -112,7 +112,7 @@ def _is_drawn(file: Path) -> bool:
 
 
 def find_runs(root: str | os.PathLike) -> list[Path]:
-    """Return the files below a folder that the page can show, sorted.
+    """Return the results files below a folder, sorted.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -127,7 +127,7 @@ def find_runs(root: str | os.PathLike) -> list[Path]:
 def write_report(
     root: str | os.PathLike, path: str | os.PathLike, *, title: str = "torchrl_sparse"
 ) -> dict[str, str]:
-    """Write the page on all runs below ``root``.
+    """Write the page of all results below ``root``.
 
     Args:
         root: folder of runs; see `find_runs`.

@@ -1,4 +1,4 @@
-"""Place the labels of a scatter plot so that they do not cover each other, the points or their intervals.
+"""Placement of scatter-plot labels without overlap of labels, points or intervals.
 
 adjustText, tried on the committed results, leaves labels on markers and on each other where a dozen methods crowd.
 """
@@ -30,7 +30,7 @@ def place_labels(
     colors: Mapping[str, str],
     fontsize: float = 10.5,
 ) -> None:
-    """Write each name beside its point, at the nearest of a fan of positions that is free; far ones get a line.
+    """Write each name at the nearest free position around its point; distant labels get a line.
 
     Args:
         figure: drawn once, since only a drawn figure knows where things are.
@@ -93,7 +93,7 @@ def _best_label(
 
 
 def text_box(annotation: Annotation, renderer: RendererBase) -> Bbox:
-    """Return where the words of an annotation are, pixels; its own ``get_window_extent`` includes the line to its point."""
+    """Return the bounding box of an annotation's text, pixels; ``get_window_extent`` would include the line to its point."""
     from matplotlib.text import Text
 
     annotation.update_positions(renderer)

@@ -1,4 +1,4 @@
-"""Bars of latencies: of the engines' variants, and of a vision-language-action model's parts and methods."""
+"""Bar charts of latencies: of engine variants, and of a vision-language-action model's parts and methods."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _REST, _MEASURED, _LIMIT, _ARITHMETIC = "#999999", "#0072B2", "#D55E00", "#009E7
 
 
 def plot_engine_times(name: str, shape: EngineShape, machine: Machine, path: str | os.PathLike) -> Path:
-    """Draw the median time of every variant (log axis), and what reading its weights or multiplying with them would take.
+    """Draw the median time of every variant (log axis), with its limits from weight reads and arithmetic.
 
     Args:
         name: of the shape, for the title.
@@ -69,7 +69,7 @@ def plot_engine_times(name: str, shape: EngineShape, machine: Machine, path: str
 
 
 def plot_vla_times(results: VLALatency, path: str | os.PathLike) -> Path:
-    """Draw what a dense policy call spends its time on and, below, every method's speed-up beside what its FLOPs promise.
+    """Draw the time of each part of a dense policy call and, below, each method's measured and theoretical speed-up.
 
     Args:
         results: what ``vla_latency.json`` holds.
@@ -133,7 +133,7 @@ def _draw_speedups(axes: Axes, methods: Mapping[str, VLAMethod]) -> None:
 def plot_thread_scaling(
     threads_s: Mapping[str, Mapping[str, float]], machine: Machine, path: str | os.PathLike
 ) -> Path:
-    """Draw how many times as fast policy calls are on more threads, and Amdahl's law fitted to each, up to 16.
+    """Draw the speed-up of policy calls on more threads, and Amdahl's law fitted to each, up to 16.
 
     Args:
         threads_s: name of a call -> number of threads, as text, ``"1"`` among them -> seconds.

@@ -1,4 +1,4 @@
-"""Pictures of masks that change along a rollout: the strip, the averages, and the panel beside a video."""
+"""Figures of masks along a rollout: the strip, the averages, and the panel of a video."""
 
 import os
 from pathlib import Path
@@ -49,7 +49,7 @@ def plot_mask_strip(masks: np.ndarray, path: str | os.PathLike, *, name: str, st
 
 
 def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: str) -> Path:
-    """Draw where a planner prunes, and how much that depends on the observation.
+    """Draw where a planner prunes, and how much each cell depends on the observation.
 
     Above: the pruned share of each type of block along the denoising steps. Below: the variance over policy calls of every
     entry of the mask, 0 where it is always the same and 0.25 where it is a toss of a coin.
@@ -86,7 +86,7 @@ def plot_mask_statistics(masks: np.ndarray, path: str | os.PathLike, *, name: st
 
 
 def mask_panel(mask: np.ndarray, height: int) -> np.ndarray:
-    """Make an image of a mask to set beside a camera's: steps from top to bottom, blocks from left to right.
+    """Make an image of a mask for a video: steps from top to bottom, blocks from left to right.
 
     Args:
         mask: bool [K, 3L], True = pruned.

@@ -1,4 +1,4 @@
-"""Success against latency: what a method costs and what it is worth, in one picture."""
+"""Figure of success against latency."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _plain_log_axis(axes: Axes, low: float, high: float) -> None:
 
 
 def plain_log_ticks(low: float, high: float) -> tuple[list[float], list[str]]:
-    """Return ticks at 1, 2, 5 times powers of ten, and between them where that makes too few, and their plain numbers.
+    """Return ticks at 1, 2, 5 times powers of ten, with more in between if these are too few, and their labels.
 
     >>> plain_log_ticks(8, 30)
     ([10.0, 15.0, 20.0, 30.0], ['10', '15', '20', '30'])

@@ -1,4 +1,4 @@
-"""The figures of a benchmark, each written atomically as a PNG about 900 pixels wide.
+"""Figures of a benchmark, each written atomically as a PNG about 900 pixels wide.
 
 Figures are made without pyplot, so that neither a display nor a global state is involved, and matplotlib is
 imported only when one is drawn.
@@ -29,7 +29,7 @@ _FFN = slice(BLOCK_TYPES.index("FFN"), None, _TYPES)  # columns of a mask
 
 
 def block_labels(num_blocks: int) -> list[str]:
-    """Return the names of the columns of a mask.
+    """Return the names of a mask's columns.
 
     >>> block_labels(6)
     ['L0 SA', 'L0 CA', 'L0 FFN', 'L1 SA', 'L1 CA', 'L1 FFN']
@@ -40,7 +40,7 @@ def block_labels(num_blocks: int) -> list[str]:
 def plot_schedule(
     mask: np.ndarray, path: str | os.PathLike, *, name: str, flops_ratio: float | None = None
 ) -> Path:
-    """Draw which block is computed at which denoising step.
+    """Draw which blocks are computed at which denoising steps.
 
     Args:
         mask: bool [K, 3L], True = pruned, steps in execution order.
@@ -80,7 +80,7 @@ def plot_schedule(
 
 
 def type_legend(figure: Figure) -> None:
-    """Explain the colours of a mask under the figure."""
+    """Add a legend of a mask's colours below the figure."""
     from matplotlib.patches import Patch
 
     handles = [
@@ -131,8 +131,7 @@ def plot_similarity(similarity: np.ndarray, path: str | os.PathLike) -> Path:
 def plot_error_surge(
     errors: Mapping[str, np.ndarray], masks: Mapping[str, np.ndarray], path: str | os.PathLike
 ) -> Path:
-    """Draw the error of the blocks' outputs within a policy call under several schedules (figure 3 of BAC,
-    arXiv:2506.13456).
+    """Draw the error of block outputs during a policy call under several schedules (figure 3 of BAC, arXiv:2506.13456).
 
     Args:
         errors: schedule -> [K, 3L] relative error of every block's output to the dense run on the same noise,

@@ -1,4 +1,4 @@
-"""Success against latency in a world that does not wait."""
+"""Figure of success against simulated inference delay."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["plot_realtime"]
 
 
 def plot_realtime(results: Realtime, path: str | os.PathLike) -> Path:
-    """Draw success, with its interval, against latency; a star where each method's own latency puts it.
+    """Draw success, with its interval, against latency; a star marks each method's own latency.
 
     Args:
         results: what ``realtime.json`` holds.

@@ -1,4 +1,4 @@
-"""Pictures of visual-token pruning: which tokens a policy kept, how deep, and how that followed the hand's speed."""
+"""Figures of visual-token pruning: which tokens were kept, through how many layers, and how that followed the hand's speed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SPEED, _FINE, _QUERY = "#0072B2", "#F2C14E", "#D55E00"
 
 
 def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: int = 1) -> np.ndarray:
-    """Draw the cameras side by side, each patch the darker, the earlier its token was dropped; those never dropped as they are.
+    """Draw the cameras side by side, darkening each patch more the earlier its token was dropped; kept patches are unchanged.
 
     Args:
         images: u8 [V, 3, h, w], a policy call's images.
@@ -62,7 +62,7 @@ def draw_tokens(images: np.ndarray, depth: np.ndarray, num_layers: int, scale: i
 
 
 def plot_token_strip(pictures: Sequence[np.ndarray], labels: Sequence[str], path: str | os.PathLike) -> Path:
-    """Line up pictures of `draw_tokens` along a rollout, from left to right, each camera in a row of its own.
+    """Draw pictures of `draw_tokens` along a rollout, from left to right, one row per camera.
 
     Args:
         pictures: u8 [h, V * w, 3], one per policy call that is shown; the V images of each are square.
@@ -96,7 +96,7 @@ def plot_control(
     *,
     kept: np.ndarray | None = None,
 ) -> Path:
-    """Draw when the controller held the motion for fine, over the hand's speed, with the policy calls marked.
+    """Draw the fine-mode phases over the hand's speed, with policy calls marked.
 
     Args:
         speed: [T] m/s at each step.
@@ -134,7 +134,7 @@ def plot_control(
 
 
 def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: str | os.PathLike) -> Path:
-    """Draw the visual tokens in each decoder layer, mean over policy calls, of several methods.
+    """Draw the number of visual tokens in each decoder layer, mean over policy calls, for several methods.
 
     Args:
         depth: method -> [calls, N] layers that each token reached (``("tokens", "depth")``).
@@ -162,7 +162,7 @@ def plot_tokens_per_layer(depth: dict[str, np.ndarray], num_layers: int, path: s
 
 
 def plot_token_budgets(budgets: Sequence[TokenBudget], path: str | os.PathLike) -> Path:
-    """Draw what every number of each method loses over the tokens that it keeps, with the tolerance and the choice.
+    """Draw loss against kept tokens for every budget of each method, with the tolerance and the choice.
 
     One curve or two have their numbers beside them; of more, which would cover each other's, the legend says the chosen.
 

@@ -1,4 +1,4 @@
-"""Videos of rollouts: the camera's frames above a bar that says what the policy was doing."""
+"""Videos of rollouts: camera frames above a status bar of the policy."""
 
 import os
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _SUCCESS = (76, 187, 122)
 
 @dataclass(frozen=True)
 class Caption:
-    """Text of the bar under a frame.
+    """Text of the status bar under a frame.
 
     Attributes:
         method: name of the method.
@@ -47,7 +47,7 @@ def write_video(
     fps: float = 20.0,
     hold: float = 1.0,
 ) -> Path:
-    """Write an H.264 mp4, atomically.
+    """Write an H.264 mp4 file atomically.
 
     Args:
         frames: u8 [h, w, 3] images of one size, at least one.
@@ -85,7 +85,7 @@ def write_video(
 
 
 def add_caption(frame: np.ndarray, caption: Caption) -> np.ndarray:
-    """Put a bar of two lines under the frame: method and step; the latest policy call, with a lamp lit at calls.
+    """Add a two-line bar under the frame: method and step; the latest policy call, with a lamp lit at calls.
 
     Args:
         frame: u8 [h, w, 3].

@@ -1,4 +1,4 @@
-"""Which ways the episodes of each method took, in one picture: whether an accelerator lost some of what people do."""
+"""Figure of the modes that each method's episodes take, to show whether an accelerated policy loses modes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _OTHERS = {BETWEEN: ("went between", "#B2182B"), NO_WAY: ("none", "#D0D0D4")}
 
 
 def count_modes(episodes: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, list[int]]:
-    """Return the ways of each method's episodes; a method whose task tells none is left out."""
+    """Return the modes of each method's episodes; methods whose task has no modes are left out."""
     ways = {name: [e.way for e in played if e.way is not None] for name, played in episodes.items()}
     return {name: told for name, told in ways.items() if told}
 
 
 def plot_ways(ways: Mapping[str, Sequence[int]], path: str | os.PathLike, *, title: str) -> Path:
-    """Draw the shares of episodes that took each way, went between them or showed none: a bar per method, with its entropy.
+    """Draw the shares of episodes in each mode, between modes and without one: a bar per method, with its entropy.
 
     Args:
         ways: method -> the ways of its episodes, see `EpisodeResult.way`; the first is at the top.

@@ -1,4 +1,4 @@
-"""Latency: interleaved measurements, and the cases that engines are timed on."""
+"""Latency: interleaved measurements, and the benchmark cases of engines."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""The cases of a benchmark of the engines: shapes, policy calls of different sparsity, and every way of answering them.
+"""Cases of the engine benchmark: network shapes, policy calls of different sparsity, and all engine variants.
 
 A *call kind* is a sampler and a mask (``"dense"``, ``"random91"``, ``"ddim10"`` ...); a *variant* is one way of answering
 one kind of call, named ``"<runner> <kind>"``. All variants of a case share weights, observations and noise, though
@@ -45,7 +45,7 @@ _DRAWN_SEED = 1
 
 
 def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
-    """Make an untrained network of a published shape, but for ``sizes``, arguments of `TransformerForDiffusion`.
+    """Make an untrained network of a published shape; ``sizes`` override arguments of `TransformerForDiffusion`.
 
     Raises:
         InputError: on an unknown shape.
@@ -59,7 +59,7 @@ def make_network(shape: str, **sizes: int) -> TransformerForDiffusion:
 
 @dataclass(frozen=True)
 class QueryKind:
-    """One kind of policy call.
+    """A kind of policy call, defined by its sparsity.
 
     Attributes:
         sampler: the sampler, K steps.
@@ -70,15 +70,15 @@ class QueryKind:
     mask: Tensor | None = None
 
     def to(self, device: torch.device) -> QueryKind:
-        """Return it with its mask on ``device``."""
+        """Return the same kind with its mask on ``device``."""
         return self if self.mask is None else QueryKind(self.sampler, self.mask.to(device))
 
     def evaluations(self) -> Tensor | None:
-        """Count how often each block is computed by at least one row, i64 [3L]; None: in all of the steps."""
+        """Count the steps in which at least one row computes each block, i64 [3L]; None: all of the steps."""
         return None if self.mask is None else (~self.mask.all(dim=0)).sum(dim=0).cpu()
 
     def row_evaluations(self, batch: int) -> int | Tensor:
-        """Count how often each block is computed, every row by itself, i64 [3L]; one number if all are as often."""
+        """Count the evaluations of each block over all rows, i64 [3L]; one number if all are equal."""
         if self.mask is None:
             return batch * self.sampler.num_inference_steps
         return (~self.mask).sum(dim=(0, 1)).cpu()
@@ -86,7 +86,7 @@ class QueryKind:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way of answering one kind of policy call.
+    """One engine variant on one kind of policy call.
 
     Attributes:
         call: answers it once, with normalised actions [B, H, A].
@@ -104,7 +104,7 @@ class Variant:
 
 
 class EngineCase:
-    """One network, one batch, all kinds of policy calls.
+    """One network at one batch size, with all kinds of policy calls.
 
     Args:
         network: the denoiser, in eval mode, on the device that is to run everything.
@@ -145,12 +145,12 @@ class EngineCase:
         self.queries = {kind: query.to(self.device) for kind, query in queries.items()}
 
     def reference(self, kind: str) -> Tensor:
-        """Return the reference engine's answer to a policy call, [B, H, A]."""
+        """Return the reference engine's actions for a policy call, [B, H, A]."""
         query = self.queries[kind]
         return self._call(partial(ReferenceEngine, self.network, query.sampler), query)()
 
     def variants(self) -> dict[str, Variant]:
-        """Return all ways of answering all kinds of policy calls, by name."""
+        """Return all engine variants on all kinds of policy calls, by name."""
         variants = self._eager_variants()
         variants["reference dense"] = Variant(partial(self.reference, "dense"), "dense", "reference dense")
         for runner, make in self._runners().items():

@@ -1,4 +1,4 @@
-"""The first call of every variant, before any is timed: is it right, what does it take to begin, and how much memory?"""
+"""First call of every variant before timing: correctness, warm-up time, and memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_F32 = 1e-4  # of sums of 100 steps in another order
 
 @dataclass(frozen=True)
 class FirstCall:
-    """What the first call of a variant took.
+    """Time and memory of a variant's first call.
 
     Attributes:
         seconds: with everything that is done once: tables, compilation, captured graphs. Kinds of policy calls that share an
@@ -38,7 +38,7 @@ def first_calls(
     variants: Mapping[str, Variant],
     on_call: Callable[[int, int], None] | None = None,
 ) -> dict[str, FirstCall]:
-    """Call every variant once; one that cannot be compiled here is left out, and a line says so.
+    """Call every variant once; print and leave out variants that cannot be compiled here.
 
     Args:
         case: of the variants; its reference answers each kind of policy call once, whatever the number of its variants.

@@ -1,4 +1,4 @@
-"""Limits of a machine: the rates at which it reads weights and multiplies with them."""
+"""Limits of a machine: its rates of reading weights and of multiplying them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _CPU = torch.device("cpu")
 
 
 def block_weights(network: TransformerForDiffusion) -> tuple[int, int, int]:
-    """Count the weights that one SA, CA and FFN block must read; folded cross-attention reads next to nothing."""
+    """Count the weights that one SA, CA and FFN block must read; folded cross-attention reads almost none."""
     width = network.n_emb
     return 4 * width * width, 0, 8 * width * width
 
 
 def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> float:
-    """Measure the bytes per second at which this thread reads as much as one denoising step's weights, again and again.
+    """Measure the bytes per second at which one thread repeatedly reads as much as one denoising step's weights.
 
     The best of ``repeats``; of a network on a GPU, that is what reads.
     """
@@ -36,7 +36,7 @@ def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> fl
 
 
 def measure_multiply_adds(size: int = 1536, repeats: int = 5, device: torch.device = _CPU) -> float:
-    """Measure the FLOPs (2 * MAC) per second of a large product of f32 matrices in PyTorch, the best of ``repeats``.
+    """Measure the FLOPs (2 * MAC) per second of a large f32 matrix product in PyTorch, best of ``repeats``.
 
     Of the two libraries that PyTorch may have for it the faster one counts: on AMD's CPUs MKL's vectors are half as wide as
     oneDNN's.
@@ -49,7 +49,7 @@ def measure_multiply_adds(size: int = 1536, repeats: int = 5, device: torch.devi
 
 
 def program_seconds(case: EngineCase, repeats: int = 50) -> float:
-    """Measure the median seconds that the program of a new random mask takes to build."""
+    """Measure the median seconds to compile a new random mask to a program."""
     mask = case.queries["random91"].mask[0].cpu().numpy()
     return statistics.median(_timed(lambda: build_program(mask), repeats))
 

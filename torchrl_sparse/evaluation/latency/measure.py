@@ -1,4 +1,4 @@
-"""Latency measured so that it can be compared: one process, interleaved, warmed up, synchronised, threads named.
+"""Comparable latency measurements: one process, interleaved, warmed up, synchronised, with threads stated.
 
 Timing one method to the end before the next compares two states of the machine (clock, caches, neighbours) as much as two
 methods. Here every round calls each candidate once, in an order shuffled per round, so that a slow minute hits all of them.
@@ -91,7 +91,7 @@ def measure_latency(
     seed: int = 0,
     on_round: Callable[[int, int], None] | None = None,
 ) -> dict[str, Latency]:
-    """Time several callables against each other, without gradients.
+    """Time several callables, interleaved and without gradients.
 
     Args:
         callables: name -> function; one call is one policy call.
@@ -136,7 +136,7 @@ def measure_latency(
 
 
 def next_arguments(inputs: Mapping[str, Iterator[Any]], name: str) -> tuple[Any, ...]:
-    """Return what the function ``name`` is called with next: one thing where it has inputs, else nothing.
+    """Return the arguments for the next call of ``name``: one input if it has inputs, else none.
 
     >>> next_arguments({"add": iter([5])}, "add"), next_arguments({}, "add")
     ((5,), ())
@@ -145,7 +145,7 @@ def next_arguments(inputs: Mapping[str, Iterator[Any]], name: str) -> tuple[Any,
 
 
 def describe_machine(device: torch.device | str = "cpu", threads: int | None = None) -> Machine:
-    """Describe what latencies are measured on.
+    """Describe the machine of the measurements.
 
     Args:
         device: where the policy runs.
@@ -182,7 +182,7 @@ def _synchronize(device: torch.device) -> None:
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may run on."""
+    """Return the number of cores that this process may use."""
     # A container often sees all the host's cores but may run on a few of them only.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

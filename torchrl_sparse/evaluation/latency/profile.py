@@ -1,4 +1,4 @@
-"""One call under the glass: what its time goes to, what more threads make of it, and how late the latest of many come."""
+"""Profile of one policy call: its parts, its thread scaling, and its tail latency."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _WEIGHTS = {"native_bf16": "bfloat16", "native_int8": "int8"}
 
 
 def call_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[str, float]:
-    """Measure a policy call and its parts: `query_parts` where it runs as two native calls, else `stage_seconds`.
+    """Measure a policy call and its parts: `query_parts` if it runs as two native calls, else `stage_seconds`.
 
     Raises:
         InputError: if its engine cannot run here, or a policy of states under a static plan runs in another than native.
@@ -60,7 +60,7 @@ def call_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[s
 
 @torch.no_grad()
 def query_parts(policy: DiffusionPolicy, repeats: int, warmup: int = 3) -> dict[str, float]:
-    """Measure the median seconds of a policy call in the native engine, and of what happens in it, interleaved.
+    """Measure the median seconds of a native policy call and of its parts, interleaved.
 
     Args:
         policy: of states, on the CPU, with a planner that ignores the observation.
@@ -131,7 +131,7 @@ def thread_seconds(
     *,
     engine: str = "native",
 ) -> dict[str, dict[int, float]]:
-    """Measure the median seconds of an unpruned policy call of each sampler on each number of threads, all interleaved.
+    """Measure the median seconds of each sampler's unpruned policy call on each number of threads, all interleaved.
 
     Args:
         network: the denoiser, on the CPU.
@@ -157,7 +157,8 @@ def thread_seconds(
 
 
 def serial_share(seconds: dict[int, float]) -> float:
-    """Fit Amdahl's law, ``t(n) = t(1) (s + (1 - s) / n)``, to times on n threads, 1 among them; return s, by least squares.
+    """Return the least-squares serial share s of Amdahl's law, ``t(n) = t(1) (s + (1 - s) / n)``, for times on n threads, 1
+    included.
 
     >>> round(serial_share({1: 1.0, 2: 0.6, 4: 0.4}), 3)
     0.2
@@ -177,7 +178,7 @@ def paced_seconds(
     *,
     inputs: Mapping[str, Iterator[Any]] | None = None,
 ) -> dict[str, list[float]]:
-    """Time many calls of each caller, which begin ``hz`` times a second as a control loop's do; None: one after the other.
+    """Time many calls of each caller, started ``hz`` times a second as in a control loop; None: back to back.
 
     Those in ``inputs`` are called with the next of theirs, made before they begin. Several callers take turns, spread evenly
     over the period. A call that comes late delays the next; each is timed from its own beginning.
@@ -213,14 +214,14 @@ def paced_seconds(
 
 
 def policy_inputs(policy: DiffusionPolicy) -> Iterator[TensorDict]:
-    """Yield one observation again and again, in new TensorDicts, since a policy writes into them."""
+    """Yield the same observation repeatedly in new TensorDicts, since a policy writes into them."""
     query = example_query(policy)
     return (query.copy() for _ in repeat(None))
 
 
 @contextmanager
 def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[], Any]]:
-    """Export the policy and lend the same policy call of the C interface, ``tsp.h``, as a robot calls it.
+    """Export the policy and lend a function that makes the same policy call through the C interface, ``tsp.h``.
 
     Args:
         policy: of states, which `DiffusionPolicy.export` can write; with the weights that its engine rounds to.
@@ -250,7 +251,7 @@ def exported_call(policy: DiffusionPolicy, library: Path) -> Iterator[Callable[[
 
 
 def tail(samples: Sequence[float]) -> dict[str, float]:
-    """Return ``"p50"``, ``"p99"``, ``"p99.9"`` and ``"max"`` of seconds.
+    """Return percentiles ``"p50"``, ``"p99"``, ``"p99.9"`` and ``"max"`` of seconds.
 
     >>> tail([1.0, 1.0, 3.0])["p50"]
     1.0
@@ -261,7 +262,7 @@ def tail(samples: Sequence[float]) -> dict[str, float]:
 
 @contextmanager
 def busy_cores(count: int) -> Iterator[None]:
-    """Keep ``count`` processes computing meanwhile, as other programs of a robot do."""
+    """Keep ``count`` processes busy during the block, to imitate other programs of a robot."""
     busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield

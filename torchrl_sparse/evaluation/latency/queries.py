@@ -1,4 +1,4 @@
-"""Latency of recorded policy calls, and of the planners within them."""
+"""Latency of recorded policy calls, and of their planners."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def time_queries(
     samples: Mapping[str, int] | None = None,
     on_round: Callable[[int, int], None] | None = None,
 ) -> dict[str, Latency]:
-    """Time recorded policy calls [N] under each method, interleaved; see `measure_latency`. They are where the methods are.
+    """Time recorded policy calls [N] under each method, interleaved, on the methods' device; see `measure_latency`.
 
     Every round asks all methods the next query: asked the same again, an engine would know the mask already. Methods that
     carry something from call to call have what they left themselves in the one before. Those in ``samples`` are asked it so
@@ -46,7 +46,7 @@ def time_queries(
 def time_planning(
     methods: Mapping[str, DiffusionPolicy], queries: TensorDictBase, *, threads: int
 ) -> dict[str, Latency]:
-    """Time the planners alone, within recorded policy calls [N]: from their encoding to their denoising, interleaved.
+    """Time only the planners in recorded policy calls [N], from encoding to denoising, interleaved.
 
     In a loop of its own a planner is faster: nothing then drives its weights out of the caches, as the denoiser's do.
     """

@@ -1,4 +1,4 @@
-"""Whole calls of a diffusion policy, stage by stage: what cameras and planners cost beside the denoiser."""
+"""Times of the stages of a diffusion policy call: cameras and planner beside the denoiser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CAMERAS, _IMAGE = ("image", "wrist_image"), 84
 
 
 def untrained_policy(shape: str, *, engine: EngineName = "auto") -> DiffusionPolicy:
-    """Make an untrained policy of a published shape, see `make_network`; of the shape ``"image"`` with two cameras.
+    """Make an untrained policy of a published shape, see `make_network`; the shape ``"image"`` has two cameras.
 
     Raises:
         InputError: on an unknown shape.
@@ -44,7 +44,7 @@ def image_policy(
     sampler: Sampler | None = None,
     engine: EngineName = "auto",
 ) -> DiffusionPolicy:
-    """Put the published encoder of two cameras, untrained, before a denoiser whose condition is their features and a state.
+    """Put the published two-camera encoder, untrained, before a denoiser conditioned on its features and a state.
 
     Args:
         network: the denoiser, on the device that is to run everything.
@@ -72,7 +72,7 @@ def _identity(network: TransformerForDiffusion, state_dim: int) -> Normalizer:
 
 
 def example_query(policy: DiffusionPolicy, batch: int = 1) -> TensorDict:
-    """Return observations [batch] of a policy: states of zeros, noise for images, and the seeds of its noise.
+    """Return example observations [batch] of a policy: zero states, noise images, and noise seeds.
 
     A policy that begins from its last chunk finds one that is a step old, as in the midst of an episode.
     """
@@ -95,7 +95,7 @@ def example_query(policy: DiffusionPolicy, batch: int = 1) -> TensorDict:
 def stage_seconds(
     policy: DiffusionPolicy, query: TensorDictBase, repeats: int, warmup: int = 1
 ) -> dict[str, float]:
-    """Measure the median seconds of a whole call, and of what happens in it, interleaved.
+    """Measure the median seconds of a whole policy call and of its stages, interleaved.
 
     Returns:
         ``"query"``, the whole of it; ``"encode"``, of which, with cameras, ``"pixels"`` (crop and units of all images) and, by

@@ -1,4 +1,4 @@
-"""The cases of a latency benchmark of vision-language-action models: shapes, calls, parts of a call, and pruning's own work.
+"""Cases of the latency benchmark of vision-language-action models: shapes, calls, parts, and pruning overhead.
 
 Images are noise, and of `SHAPES` the weights too: they change which tokens go, not what arithmetic costs. Every method answers
 the second call of an episode, in which a tenth of all patches has changed, with what it remembers of the first. Parts and
@@ -62,7 +62,7 @@ _CHANGED = 0.1
 def make_policy(
     shape: str, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> VLAPolicy:
-    """Make an untrained policy of one of `SHAPES`.
+    """Make an untrained policy with one of `SHAPES`.
 
     Args:
         dtype, device: of the network's weights.
@@ -80,7 +80,7 @@ def make_policy(
 
 
 class VLACase:
-    """One network and every way of answering the same policy call, batch 1.
+    """One network with several pruners on the same policy call, batch 1.
 
     Args:
         policy: whose network, normaliser and tokenizer all methods share.
@@ -106,16 +106,16 @@ class VLACase:
             self.queries[name] = remembered.update(second)
 
     def answer(self, name: str) -> TensorDictBase:
-        """Return a method's answer to its policy call."""
+        """Return a method's output for its policy call."""
         return self.policies[name](self.queries[name].clone(recurse=False))
 
     def sequence(self) -> LayerState:
-        """Return the decoder's input, [1, S], of a dense policy call."""
+        """Return the decoder's input, [1, S], in a dense policy call."""
         policy, query = self._dense
         return _recorded(policy, _FirstLayer(), query).scored[0][0]
 
     def parts(self) -> dict[str, Callable[[], Any]]:
-        """Return the parts of a dense policy call, but for reading and laying out its inputs: name -> call."""
+        """Return the parts of a dense policy call, without reading and assembling inputs: name -> call."""
         network, sequence = self.network, self.sequence()
         images = torch.cat([self._dense[1][camera] for camera in network.config.cameras])
         features = network.vision(images)
@@ -128,11 +128,11 @@ class VLACase:
         }
 
     def record(self, name: str) -> _Recorder:
-        """Record what a method's pruner works on in its policy call."""
+        """Record the pruner's inputs in a method's policy call."""
         return _recorded(self.policies[name], self.policies[name].pruner, self.queries[name])
 
     def helpers(self, name: str) -> dict[str, Callable[[], Any]]:
-        """Return a pruner's own work in its query: name -> call. ``choosing`` is all of it, ``comparing`` included."""
+        """Return a pruner's own work in its policy call: name -> call. ``choosing`` is all of it, ``comparing`` included."""
         recorder = self.record(name)
         calls = {"choosing": recorder.choose}
         if set(FRAME_KEYS) <= set(recorder.in_keys):

@@ -1,4 +1,4 @@
-"""The matrix products of a decoder alone, beside a large one: is a policy call at the machine's arithmetic limit?
+"""Matrix products of a decoder alone, beside a large one, to tell whether policy calls reach the machine's arithmetic limit.
 
 The products are those of a dense call, one layer's after the other's on their own weights, so that what is fetched from memory
 is what a call fetches. The large one, square, is what the machine does at best: by oneDNN where PyTorch has it, see
@@ -25,7 +25,7 @@ _SIDE = 2048
 
 @dataclass(frozen=True)
 class ProductCall:
-    """Products to time: the call, and its FLOPs, 2 * MAC."""
+    """Matrix products to time: the call, and its FLOPs, 2 * MAC."""
 
     call: Callable[[], Any]
     flops: float

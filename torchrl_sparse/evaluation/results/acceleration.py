@@ -1,4 +1,4 @@
-"""``acceleration.json``: every way to run one policy faster, measured, and the one that was chosen."""
+"""``acceleration.json``: every candidate method for one policy, measured, and the chosen one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _JUDGED, _TIMED = ("vs dense, points", "verdict"), ("time vs dense", "time verdi
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to run the policy, measured without a simulator.
+    """One candidate method, measured without a simulator.
 
     Attributes:
         family: a chain that draws noise in its steps ("stochastic") or does not ("deterministic"), the policy's own chain with
@@ -62,7 +62,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Played:
-    """What episodes said of one method, beside dense on the same seeds; see `MethodEntry`."""
+    """Results of one method's episodes beside dense on the same seeds; see `MethodEntry`."""
 
     success: Success
     paired_vs_dense: Difference
@@ -71,29 +71,29 @@ class Played:
 
     @classmethod
     def of(cls, entry: MethodEntry) -> Played:
-        """Take it from a benchmark's entry."""
+        """Build it from a benchmark's entry."""
         return cls(entry.success, entry.paired_vs_dense, entry.time_vs_dense, entry.score)
 
     @property
     def judged(self) -> Difference:
-        """What it is judged by: success, or the score of a task that is graded."""
+        """The comparison that is judged: success, or the score of a graded task."""
         return self.score.vs_dense if self.score else self.paired_vs_dense
 
     @property
     def did_nothing(self) -> bool:
-        """Whether it solved no episode, or scored nothing in any."""
+        """Whether the method solved no episode, or scored nothing in any."""
         return not (self.score.mean if self.score else self.success.k)
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
-        """What it is judged in -> the verdict: success and time, or the score."""
+        """Verdict by outcome: success and time, or the score."""
         if self.score:
             return {"the score": self.judged.verdict}
         return {"success": self.judged.verdict, "time": self.time_vs_dense.verdict}
 
     @property
     def is_right(self) -> bool:
-        """Whether it is non-inferior to dense in all that it is judged in."""
+        """Whether the method is non-inferior to dense in every judged outcome."""
         return {*self.verdicts.values()} == {"non-inferior"}
 
 
@@ -133,7 +133,7 @@ class Acceleration:
             require(name in {DENSE, *self.ranking}, "played", "methods of the ranking", name)
 
     def speedup(self, name: str) -> float:
-        """Return the ratio of dense's median latency to that of a method."""
+        """Return dense's median latency divided by a method's."""
         return self.candidates[DENSE].latency_s.p50 / self.candidates[name].latency_s.p50
 
 
@@ -148,7 +148,7 @@ def load_acceleration(path: str | os.PathLike) -> Acceleration:
 
 
 def acceleration_rows(acceleration: Acceleration) -> list[dict[str, str]]:
-    """Return the rows of its table: the dense policy, the ranking in order, and what is over the budget."""
+    """Return the rows of the table: the dense policy, the ranked candidates, and those over the budget."""
     ranking = acceleration.ranking
     over = [name for name in acceleration.candidates if name not in {DENSE, *ranking}]
     over.sort(key=lambda name: acceleration.candidates[name].latency_s.p95)
@@ -156,7 +156,7 @@ def acceleration_rows(acceleration: Acceleration) -> list[dict[str, str]]:
 
 
 def acceleration_note(acceleration: Acceleration) -> str:
-    """Return the lines that explain the table."""
+    """Return the explanation of the table."""
     machine, budget = acceleration.machine, acceleration.budget_ms
     allowed, first = (
         "faster than dense",
@@ -175,7 +175,7 @@ def acceleration_note(acceleration: Acceleration) -> str:
 
 
 def verdict_line(acceleration: Acceleration) -> str:
-    """Say in a sentence or two what was chosen and how sure that is."""
+    """Return one or two sentences on the chosen method and the evidence for it."""
     name, played = acceleration.chosen, acceleration.played
     latency = acceleration.candidates[name].latency_s
     chosen = (

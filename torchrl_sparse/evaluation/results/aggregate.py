@@ -1,4 +1,4 @@
-"""``aggregate.json``: methods over several tasks, each task of the same weight, and its table."""
+"""``aggregate.json``: methods over several equally weighted tasks, and its table."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class AggregateEntry:
-    """A method over all tasks: mean difference of success rates, geometric mean of the ratios of times, its pairs, and the
-    p-values of both verdicts."""
+    """One method over all tasks: mean success difference, geometric mean time ratio, pairs, and both verdicts' p-values."""
 
     paired_vs_dense: Difference
     time_vs_dense: TimeDifference
@@ -46,7 +45,7 @@ class AggregateEntry:
 
 @dataclass(frozen=True)
 class AggregateResults:
-    """The content of an ``aggregate.json``: the tasks, the split of their seeds, and the methods that all of them tried."""
+    """The content of an ``aggregate.json``: the tasks, their seed split, and the methods common to all tasks."""
 
     aggregate: Literal[2]
     tasks: tuple[str, ...]
@@ -55,7 +54,7 @@ class AggregateResults:
 
 
 def aggregate_results(paths: Sequence[str | os.PathLike]) -> AggregateResults:
-    """Put the results of several tasks together; see `torchrl_sparse.evaluation.statistics.aggregate`.
+    """Combine the results of several tasks; see `torchrl_sparse.evaluation.statistics.aggregate`.
 
     Args:
         paths: of a ``results.json`` of each task, with ``episodes/`` beside it.
@@ -133,7 +132,7 @@ def counted_episodes(path: Path, results: Results, name: str, n: int) -> list[Ep
 
 
 def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
-    """Return the rows of the table, one per method: column -> text; † where a verdict does not survive Holm's correction."""
+    """Return the table, one row per method: column -> text; † marks verdicts that fail Holm's correction."""
     p_values = {name: entry.p_values for name, entry in results.methods.items()}
     lasting = surviving(p_values, num_verdicts(results))
     return [
@@ -151,7 +150,7 @@ def aggregate_rows(results: AggregateResults) -> list[dict[str, str]]:
 
 
 def num_verdicts(results: AggregateResults) -> int:
-    """Return the verdicts of the table: on success and on time, of every method."""
+    """Return the number of verdicts in the table: success and time for every method."""
     return 2 * len(results.methods)
 
 

@@ -1,4 +1,4 @@
-"""From what was measured of a benchmark to the content of its ``results.json``."""
+"""Assembly of a ``results.json`` from a benchmark's measurements."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = ["MethodRun", "Terms", "build_results", "compare_episodes", "compare_p
 
 @dataclass(frozen=True)
 class MethodRun:
-    """Everything measured of one method.
+    """All measurements of one method.
 
     Attributes:
         episodes: its episodes, the same seeds as every other method's, in any order; where benchmarks stop when they are
@@ -62,7 +62,7 @@ class MethodRun:
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of a comparison, agreed on before its episodes ran.
+    """Terms of a comparison, fixed before its episodes ran.
 
     Attributes:
         design: when the episodes are looked at.
@@ -81,15 +81,15 @@ class Terms:
     graded: bool = False
 
     def statistics(self, pairs: EpisodePairs) -> tuple[float, float]:
-        """Return by how many standard errors success and time are better than their margins."""
+        """Return by how many standard errors success and time beat their margins."""
         return pairs.statistics(self.episode_horizon, self.margin, self.time_margin)
 
     def score_statistic(self, pairs: EpisodePairs) -> float:
-        """Return by how many standard errors the mean score is better than its margin."""
+        """Return by how many standard errors the mean score beats its margin."""
         return pairs.score_statistic(self.margin)
 
     def decided(self, pairs: EpisodePairs) -> bool:
-        """Tell whether the verdict of a method on these episodes, at an analysis of the design, is reached."""
+        """Tell whether a method's verdict is reached on these episodes, at an analysis of the design."""
         deciding = (self.score_statistic(pairs),) if self.graded else self.statistics(pairs)
         return self.design.decides(len(pairs.method), *deciding)
 
@@ -106,7 +106,7 @@ def build_results(
     pairs: Sequence[Sequence[str]] = (),
     settings: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Make the content of ``results.json`` from what was measured.
+    """Build the content of ``results.json`` from the measurements.
 
     Args:
         runs: method name -> its run; ``"dense"``, which all are compared with, must be there.
@@ -206,7 +206,7 @@ def compare_pair(
     others: Sequence[EpisodeResult],
     terms: Terms,
 ) -> PairedEntry:
-    """Compare two methods, neither of which need be dense, by the protocol of all comparisons with dense.
+    """Compare two methods, of which neither need be dense, with the protocol of all comparisons with dense.
 
     Args:
         method, against: their names.
@@ -232,7 +232,7 @@ def compare_pair(
 def compare_episodes(
     name: str, episodes: Sequence[EpisodeResult], dense: Sequence[EpisodeResult], terms: Terms
 ) -> dict[str, Any]:
-    """Return the fields of a `MethodEntry` that follow from a method's episodes and dense's alone.
+    """Return the `MethodEntry` fields that follow from the episodes of a method and of dense alone.
 
     Args:
         name: of the method.

@@ -1,4 +1,4 @@
-"""How many verdicts a ``results.json`` gives, and which of them hold together."""
+"""Number of verdicts in a ``results.json``, and those that survive the correction for multiple comparisons."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["num_comparisons", "survivors", "surviving"]
 
 
 def num_comparisons(results: Results) -> int:
-    """Return the verdicts of the table: on success and on time, or on the score alone, of every method but dense."""
+    """Return the number of verdicts: on success and time, or on the score alone, for every method but dense."""
     return (1 if results.graded else 2) * (len(results.methods) - 1)
 
 

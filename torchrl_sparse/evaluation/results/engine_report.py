@@ -1,4 +1,4 @@
-"""``engine.json`` and its table: how fast each engine answers each kind of policy call."""
+"""``engine.json`` and its table: the time of each engine for each kind of policy call."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ COLUMNS = ("variant", "p50, ms", "p10 – p90", "× eager", "× own dense", "max
 
 @dataclass(frozen=True)
 class EngineRow:
-    """One variant: a way of answering one kind of policy call. Seconds.
+    """One engine variant on one kind of policy call. Seconds.
 
     Attributes:
         p50_s, p10_s, p90_s: percentiles of ``n`` timed calls.
@@ -70,7 +70,7 @@ class EngineRow:
 
 @dataclass(frozen=True)
 class EngineShape:
-    """All variants of a network and a batch.
+    """All variants of one network at one batch size.
 
     Attributes:
         threads: that were used.
@@ -110,7 +110,7 @@ def shape_results(
     threads: int,
     first: Mapping[str, FirstCall] | None = None,
 ) -> EngineShape:
-    """Put together what was measured of one case, and measure what the machine can do at best.
+    """Combine the measurements of one case with the machine's measured limits.
 
     Args:
         case: what was run.
@@ -185,7 +185,7 @@ def load_engine_results(path: str | os.PathLike) -> EngineResults:
 
 
 def format_engine_table(name: str, shape: EngineShape) -> str:
-    """Return the rows of one shape as a table in Markdown, between the lines that explain it."""
+    """Return one shape's rows as a Markdown table with explanations above and below."""
     head = (
         f"{name}: batch {shape.batch}, threads {shape.threads}, "
         f"weights read at {shape.bandwidth_gb_per_s:.1f} GB/s, "
@@ -205,7 +205,7 @@ def format_engine_table(name: str, shape: EngineShape) -> str:
 
 
 def image_part_rows(parts_s: Mapping[str, Mapping[str, float]]) -> list[dict[str, str]]:
-    """Return one row of text per part of a whole policy call of images: its time and its share by sampler."""
+    """Return one row of text per part of an image policy's call: its time and its share by sampler."""
     rows = []
     for part in next(iter(parts_s.values())):
         row = {"part": part}
@@ -217,7 +217,7 @@ def image_part_rows(parts_s: Mapping[str, Mapping[str, float]]) -> list[dict[str
 
 
 def engine_rows(shape: EngineShape) -> list[dict[str, str]]:
-    """Return one row of text per variant: the table's columns, and what its memory and its arithmetic take alone."""
+    """Return one row of text per variant: the table's columns, and its limits from memory and arithmetic."""
     return [_engine_row(variant, row) for variant, row in shape.rows.items()]
 
 

@@ -1,4 +1,4 @@
-"""The parts of files of results: rates, differences, percentiles, each checked on reading."""
+"""Parts of results files: rates, differences, percentiles, each checked on reading."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PolicyShape:
-    """The dense policy: parameters, denoising steps, actions of a chunk, observations that it reads, actions executed, and the
-    cameras of a diffusion policy that has some."""
+    """Shape of the dense policy: parameters, denoising steps, chunk length, observation and executed steps, and
+    cameras if any.
+    """
 
     params: int
     num_inference_steps: int
@@ -44,7 +45,7 @@ class PolicyShape:
 
 @dataclass(frozen=True)
 class Success:
-    """Episodes solved, with Wilson's 95 % interval of the rate.
+    """Number of solved episodes, with Wilson's 95 % interval of the rate.
 
     >>> Success.of([True, False]).rate
     0.5
@@ -65,14 +66,14 @@ class Success:
 
     @classmethod
     def of(cls, outcomes: Sequence[bool]) -> Success:
-        """Count the successes of episodes."""
+        """Count the successful episodes."""
         k, n = sum(outcomes), len(outcomes)
         return cls(k, n, k / n, wilson_interval(k, n))
 
 
 @dataclass(frozen=True)
 class Score:
-    """Mean score of episodes, of a task that is graded, with Student's 95 % interval, and beside dense's.
+    """Mean score of a graded task's episodes, with Student's 95 % interval, and the difference to dense.
 
     Attributes:
         vs_dense: mean paired difference; see `Difference`.
@@ -92,7 +93,7 @@ class Score:
 
 @dataclass(frozen=True)
 class PValues:
-    """One-sided p-values of both verdicts, of being non-inferior or inferior, whichever is nearer; for Holm's correction."""
+    """One-sided p-values of both verdicts, for Holm's correction: of non-inferiority or inferiority, whichever is nearer."""
 
     success: float
     time: float
@@ -120,7 +121,7 @@ class Percentiles:
 
     @classmethod
     def of(cls, latency: Latency) -> Percentiles:
-        """Keep what a file holds of a measurement."""
+        """Build it from a latency measurement."""
         return cls(latency.p50, latency.p95, latency.n)
 
 
@@ -146,7 +147,7 @@ class Flops:
 
 @dataclass(frozen=True)
 class EpisodeCost:
-    """What an episode costs, mean over episodes. A method that saves of a policy call may lose it again in longer episodes.
+    """Mean cost of an episode. A method that saves per policy call may lose the savings in longer episodes.
 
     Attributes:
         queries: calls of the policy.
@@ -195,7 +196,7 @@ class PairedEntry:
 
     @property
     def judged(self) -> Difference:
-        """What the verdict is on: the score, where a task is graded, else success."""
+        """The comparison that is judged: the score of a graded task, else success."""
         return self.score or self.success
 
     def __post_init__(self) -> None:
@@ -204,7 +205,7 @@ class PairedEntry:
 
 @dataclass(frozen=True)
 class ActionError:
-    """Absolute difference of an action entry to the dense policy's, on the same observations and the same noise."""
+    """Absolute difference of action entries to the dense policy's, for the same observations and noise."""
 
     mean: float
     max: float

@@ -1,4 +1,4 @@
-"""``query.json``: what a policy call's time goes to, what more threads make of it, and how late the latest of many come."""
+"""``query.json``: the parts of a policy call, its thread scaling, and its tail latency."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class QueryProfile:
 
 
 def format_query_profile(found: QueryProfile) -> str:
-    """Return three tables in Markdown, each below the line that says what it is."""
+    """Return three tables in Markdown, each below a line that describes it."""
     tables = query_rows(found)
     parts = found.parts_s
     whole = (

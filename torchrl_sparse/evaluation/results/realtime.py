@@ -1,4 +1,4 @@
-"""Success against latency in a world that does not wait: ``realtime.json`` and its table.
+"""``realtime.json`` and its table: success against simulated inference delay.
 
 A latency acts by the number of steps that the world makes in it, so points are kept by that.
 """
@@ -51,7 +51,7 @@ SCHEMA = 2
 
 @dataclass(frozen=True)
 class RealtimePoint:
-    """A method under one latency.
+    """One method at one latency.
 
     Attributes:
         delay_steps: that the world makes in the latency.
@@ -78,7 +78,7 @@ class RealtimePoint:
 
 @dataclass(frozen=True)
 class RealtimeMethod:
-    """A method: the median of its own latency, measured, and its points by latency."""
+    """One method: its measured median latency, and its results by simulated latency."""
 
     own_latency_s: float
     points: tuple[RealtimePoint, ...]
@@ -101,13 +101,13 @@ class Realtime:
 
 @dataclass(frozen=True)
 class RealtimeRun:
-    """One method: its own latency in seconds, and its episodes, the same seeds everywhere, by steps of delay."""
+    """One method: its own latency in seconds, and its episodes, on the same seeds everywhere, by delay in steps."""
 
     own_latency: float
     episodes: Mapping[int, Sequence[EpisodeResult]]
 
     def own_delay(self, control_freq: float) -> int:
-        """Count the steps that the world makes in a policy call."""
+        """Count the environment steps that pass during a policy call."""
         return int(delay_steps(torch.tensor(self.own_latency), control_freq))
 
 
@@ -122,7 +122,7 @@ def build_realtime(
     machine: Machine,
     terms: Terms,
 ) -> Realtime:
-    """Make the content of ``realtime.json``.
+    """Build the content of ``realtime.json``.
 
     Raises:
         InputError: if the dense policy is missing, methods differ in their delays (their own apart), or seeds differ.
@@ -174,7 +174,7 @@ def load_realtime(path: str | os.PathLike) -> Realtime:
 
 
 def num_late_comparisons(results: Realtime) -> int:
-    """Return the verdicts of the table, on success and on time of every point but dense's."""
+    """Return the number of verdicts in the table: on success and time, for every point but dense's."""
     points = [point for name, method in results.methods.items() for point in method.points if name != DENSE]
     return 2 * len(points)
 
@@ -216,12 +216,12 @@ def _row(name: str, results: Realtime, point: RealtimePoint, lasting: Collection
 
 
 def format_realtime(results: Realtime) -> str:
-    """Return the table, as Markdown that also lines up in a terminal, and what it was made with."""
+    """Return the table, as Markdown that also lines up in a terminal, and its settings."""
     return f"{markdown_table(realtime_rows(results))}\n\n{realtime_note(results)}"
 
 
 def realtime_note(results: Realtime) -> str:
-    """Return the lines that explain the table."""
+    """Return the explanation of the table."""
     machine = results.machine
     every = f"a policy call every {results.n_action_steps} steps, or as soon as the last one is answered"
     return (

@@ -1,4 +1,4 @@
-"""The table of a ``results.json``, and the lines that explain it."""
+"""The table of a ``results.json`` and its explanation."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = [
 
 
 def format_table(results: Results) -> str:
-    """Return the table of a benchmark, as Markdown that also lines up in a terminal, and the lines that explain it."""
+    """Return a benchmark's table, as Markdown that also lines up in a terminal, and its explanation."""
     table = f"{markdown_table(results_rows(results))}\n\n{results_note(results)}"
     if not results.pairs:
         return table
@@ -43,7 +43,7 @@ def format_table(results: Results) -> str:
 
 
 def results_rows(results: Results) -> list[dict[str, str]]:
-    """Return the rows of the table, one per method: column -> text."""
+    """Return the table, one row per method: column -> text."""
     lasting = survivors(results)
     rows = [_table_row(name, method, lasting) for name, method in results.methods.items()]
     if results.dense_did_nothing:
@@ -110,7 +110,7 @@ def _tokens_text(tokens: TokensKept) -> str:
 
 
 def comparison_rows(pairs: Sequence[PairedEntry]) -> list[dict[str, str]]:
-    """Return the rows of the table of a file's pairs, with times where success and time decide: column -> text."""
+    """Return the rows of the table of pairs, with times where success and time are judged: column -> text."""
     return [_pair_row(pair) for pair in pairs]
 
 
@@ -135,7 +135,7 @@ _STOPPED = ", and as of a fixed number of episodes."
 
 
 def results_note(results: Results) -> str:
-    """Return the lines that explain the table."""
+    """Return the explanation of the table."""
     machine, policy, dense = results.machine, results.policy, results.dense
     n, margin = _num_pairs(results), dense.paired_vs_dense.margin
     compared, scored = "difference to dense with Tango's", results.graded

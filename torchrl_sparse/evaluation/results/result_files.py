@@ -1,4 +1,4 @@
-"""Rows of text from a file of results that nothing is drawn of: what a report shows of it."""
+"""Tables, as text, of results files that have no figures, for the report."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Row = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a file.
+    """One table of a results file.
 
     Attributes:
         task: that it is about.
@@ -43,12 +43,12 @@ class Table:
     comparisons: int = 0
 
     def name(self, row: Row) -> str:
-        """Return what a row is about: a method, a variant, a part."""
+        """Return the subject of a row: a method, a variant, a part."""
         return row[self.columns[0]]
 
 
 def read_tables(path: Path) -> dict[str, Table]:
-    """Read all tables of a file whose name begins with a key of `READERS`, by name."""
+    """Read all tables, by name, of a file whose name begins with a key of `READERS`."""
     return next(read for kind, read in READERS.items() if path.name.startswith(kind))(path)
 
 
@@ -80,7 +80,7 @@ def _aggregate(path: Path) -> dict[str, Table]:
 
 
 def make_table(task: str, rows: Sequence[Row], shown: int | None = None) -> Table:
-    """Make a table that shows its first columns, all unless it is said how many."""
+    """Make a table that shows its first columns; all by default."""
     return Table(task, tuple(rows[0])[:shown], rows)
 
 

@@ -1,4 +1,4 @@
-"""``results.json``: the only source of every table and figure.
+"""``results.json``: the single source of every table and figure.
 
 The dataclasses are the schema, and `load_results` refuses everything else. Seconds are those of a policy call; FLOPs are 2 *
 MAC of a call, of the denoiser alone or of a whole vision-language-action model.
@@ -52,7 +52,7 @@ DENSE = "dense"
 
 @dataclass(frozen=True, kw_only=True)
 class MethodEntry:
-    """Everything about one method.
+    """All results of one method.
 
     Attributes:
         success: of its episodes.
@@ -97,7 +97,7 @@ class MethodEntry:
 
     @property
     def judged(self) -> Difference:
-        """What it is judged by: the difference of success to dense's, or of the score where there is one."""
+        """The comparison that is judged: the score's difference to dense's on graded tasks, else success's."""
         return self.score.vs_dense if self.score else self.paired_vs_dense
 
     def __post_init__(self) -> None:
@@ -112,7 +112,7 @@ class MethodEntry:
 
 @dataclass(frozen=True)
 class Stopping:
-    """Of a benchmark that went on until verdicts were reached: see `torchrl_sparse.evaluation.statistics.sequential.Design`."""
+    """Interim analyses of a benchmark with early stopping: see `torchrl_sparse.evaluation.statistics.sequential.Design`."""
 
     max_episodes: int
     analyses: int
@@ -120,7 +120,7 @@ class Stopping:
 
 @dataclass(frozen=True)
 class Results:
-    """The content of a ``results.json``: where it was measured, on what, and all methods, the dense policy among them.
+    """The content of a ``results.json``: machine, policy, and all methods including dense.
 
     Attributes:
         task: name of the task.
@@ -165,12 +165,12 @@ class Results:
 
     @property
     def graded(self) -> bool:
-        """Whether the task is graded, so that verdicts are those of scores."""
+        """Whether the task is graded, so that scores are judged."""
         return self.dense.score is not None
 
     @property
     def dense_did_nothing(self) -> bool:
-        """Whether dense solved no episode, or scored nothing in any, so that no verdict means anything."""
+        """Whether dense solved no episode, or scored nothing in any, so that no verdict is meaningful."""
         return not (self.dense.score.mean if self.dense.score else self.dense.success.k)
 
     @property
@@ -199,5 +199,5 @@ def load_results(path: str | os.PathLike) -> Results:
 
 
 def save_results(results: Results, path: str | os.PathLike) -> Path:
-    """Write a ``results.json`` in one piece or not at all; return the path."""
+    """Write a ``results.json`` atomically and return its path."""
     return write_json(path, results)

@@ -1,4 +1,4 @@
-"""What a benchmark prints on a terminal: six columns, two lines that explain them, and which method to use."""
+"""A benchmark's terminal output: six columns, two lines of explanation, and the recommended method."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _CHANCE = "dense_noise"  # dense with other noise is no method to use
 
 
 def print_results(results: Results, style: TableStyle, out: Path) -> None:
-    """Print the table of a benchmark: short, with an advice, or all columns; and the folder with all that it left."""
+    """Print a benchmark's table, short with advice or with all columns, and its output folder."""
     table = format_table(results) if style == "full" else short_table(results)
     print(f"\n{table}\n\nFiles are in {out}")
 
 
 def short_table(results: Results) -> str:
-    """Return six columns, two lines that explain them, and the advice."""
+    """Return six columns, two lines of explanation, and the advice."""
     lasting = survivors(results)
     rows = [_row(name, method, lasting, results) for name, method in results.methods.items()]
     machine, judged = results.machine, results.dense.judged
@@ -75,7 +75,7 @@ def _row(name: str, method: MethodEntry, lasting: Collection[str], results: Resu
 
 
 def advice(results: Results) -> str:
-    """Say which method to use: the fastest that is shown to be as good as dense, or what is missing to show it.
+    """Recommend the fastest method that is shown to be as good as dense, or say which evidence is missing.
 
     Shown is what survives Holm's correction: the fastest of many is chosen.
     """

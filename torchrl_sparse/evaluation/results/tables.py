@@ -1,4 +1,4 @@
-"""Rows of text as a table."""
+"""Formatting of text rows as tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEFT = frozenset(
 
 
 def markdown_table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Return a table in Markdown that also lines up in a terminal.
+    """Return a Markdown table that also lines up in a terminal.
 
     Args:
         rows: column -> text, at least one; the first says which columns there are.
@@ -38,7 +38,7 @@ def markdown_table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def select_columns(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> list[dict[str, str]]:
-    """Return the rows with these columns alone, in this order.
+    """Return the rows with only these columns, in this order.
 
     Raises:
         InputError: if a row lacks one of them.

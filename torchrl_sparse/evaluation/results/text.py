@@ -1,4 +1,4 @@
-"""Numbers as the tables print them."""
+"""Formatting of numbers for tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NO_VERDICT = "dense solved none"
 
 
 def count_text(success: Success) -> str:
-    """Return solved episodes with the interval of their rate.
+    """Format solved episodes with the interval of their rate.
 
     >>> count_text(Success(3, 4, 0.75, (0.3006, 0.9544)))
     '3/4 [30, 95] %'
@@ -39,12 +39,12 @@ def count_text(success: Success) -> str:
 
 
 def difference_text(difference: Difference) -> str:
-    """Return a difference of success rates with its interval, in points."""
+    """Format a difference of success rates with its interval, in points."""
     return points_text(difference.diff, difference.ci95)
 
 
 def mean_text(mean: float, interval: Interval) -> str:
-    """Return a mean score with its interval.
+    """Format a mean score with its interval.
 
     >>> mean_text(0.7049, (0.6502, 0.7606))
     '0.705 [0.650, 0.761]'
@@ -53,7 +53,7 @@ def mean_text(mean: float, interval: Interval) -> str:
 
 
 def points_text(diff: float, interval: Interval) -> str:
-    """Return a difference of rates with its interval, in points.
+    """Format a difference of rates with its interval, in points.
 
     >>> points_text(-0.03, (-0.053, 0.014))
     '-3.0 [-5.3, +1.4]'
@@ -63,7 +63,7 @@ def points_text(diff: float, interval: Interval) -> str:
 
 
 def p_text(p: float | None) -> str:
-    """Return a p-value to two digits; nothing where there is none.
+    """Format a p-value with two digits; empty for None.
 
     >>> p_text(0.0703125), p_text(1.0), p_text(3e-7), p_text(None)
     ('0.070', '1.00', '<0.001', '')
@@ -74,7 +74,7 @@ def p_text(p: float | None) -> str:
 
 
 def ratio_text(difference: TimeDifference) -> str:
-    """Return a ratio of times with its interval.
+    """Format a ratio of times with its interval.
 
     >>> ratio_text(TimeDifference(1.06, (0.951, 1.182), 0.1, "inconclusive"))
     '1.06 [0.95, 1.18]'
@@ -84,7 +84,7 @@ def ratio_text(difference: TimeDifference) -> str:
 
 
 def verdict_text(difference: Difference | TimeDifference, survives: bool = True) -> str:
-    """Return a verdict, whether the method is worse whatever the margin, and † unless it survives the other comparisons.
+    """Format a verdict: also whether the method is worse whatever the margin, and † unless it survives Holm's correction.
 
     >>> verdict_text(Difference(-0.03, (-0.045, -0.015), 0.05, "non-inferior"), survives=False)
     'non-inferior†, worse'
@@ -96,7 +96,7 @@ def verdict_text(difference: Difference | TimeDifference, survives: bool = True)
 
 
 def milliseconds_text(seconds: float) -> str:
-    """Return a duration to three digits, in milliseconds.
+    """Format a duration with three digits, in milliseconds.
 
     >>> milliseconds_text(0.00838), milliseconds_text(1.2345)
     ('8.38', '1234')
@@ -106,7 +106,7 @@ def milliseconds_text(seconds: float) -> str:
 
 
 def threads_text(threads: int) -> str:
-    """Return a number of threads in words.
+    """Format a number of threads as words.
 
     >>> threads_text(1), threads_text(2)
     ('1 thread', '2 threads')

@@ -1,4 +1,4 @@
-"""Benchmarks in Weights & Biases: numbers under fixed names; tables, pictures and videos as media."""
+"""Logging of benchmarks to Weights & Biases: numbers under fixed names; tables, pictures and videos as media."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["log_benchmark", "tested_method", "trial_metrics"]
 
 
 def tested_method(results: Results) -> str:
-    """Return the name of the method that a sweep's trial is about: the last one."""
+    """Return the name of the method that a sweep trial tests: the last one."""
     return list(results.methods)[-1]
 
 
 def trial_metrics(results: Results) -> dict[str, float]:
-    """Return ``"<method>/<number>"`` for every method, and ``"tested/<number>"`` for the last one, whatever its name."""
+    """Return ``"<method>/<number>"`` for every method, and ``"tested/<number>"`` for the last one, under any name."""
     named = {**results.methods, "tested": results.methods[tested_method(results)]}
     return {
         f"{name}/{key}": value for name, method in named.items() for key, value in _numbers(method).items()
@@ -40,7 +40,7 @@ def _numbers(method: MethodEntry) -> dict[str, float]:
 
 
 def log_benchmark(results: Results, folder: Path, config: Mapping[str, Any]) -> None:
-    """Log a finished benchmark as one run, the same as before if it is logged again; see `wandb_arguments`.
+    """Log a finished benchmark as one run; logging it again updates the same run; see `wandb_arguments`.
 
     Args:
         results: of the benchmark.

@@ -1,4 +1,4 @@
-"""``vla_latency.json`` and its tables: where a vision-language-action model spends its time, and what pruning saves."""
+"""``vla_latency.json`` and its tables: the times of a vision-language-action model's parts, and the savings of pruning."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class VLAShape:
-    """The model: its name, weights, the tokens of a policy call and those of them that are visual, and its configuration."""
+    """The model: name, weights, tokens and visual tokens of a policy call, and configuration."""
 
     name: str
     dtype: str
@@ -41,7 +41,7 @@ class VLAShape:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the dense query: seconds, and its share. The part ``"rest"``, what the others leave, was not timed itself."""
+    """One part of the dense policy call: seconds and share. The part ``"rest"`` is the untimed remainder."""
 
     p50_s: float
     share: float
@@ -52,7 +52,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Helper:
-    """Work of a pruner beside the network: seconds, and the share of its method's policy call."""
+    """Pruner's own work beside the network: seconds, and its share of the method's policy call."""
 
     p50_s: float
     share: float
@@ -91,7 +91,7 @@ class VLAMethod:
 
 @dataclass(frozen=True)
 class Product:
-    """Matrix products alone: seconds, FLOPs (2 * MAC), and these by those."""
+    """Matrix products alone: seconds, FLOPs (2 * MAC), and FLOPs per second."""
 
     p50_s: float
     flops: float
@@ -121,7 +121,7 @@ def load_vla_results(path: str | os.PathLike) -> VLALatency:
 
 
 def format_vla_table(results: VLALatency) -> str:
-    """Return the parts of a dense policy call and the methods, as two tables in Markdown."""
+    """Return the parts of a dense policy call and the methods as two Markdown tables."""
     shape, machine = results.shape, results.machine
     about = (
         f"{shape.name}: {shape.parameters:,} parameters, {shape.dtype}, {shape.tokens} tokens, "
@@ -132,7 +132,7 @@ def format_vla_table(results: VLALatency) -> str:
 
 
 def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
-    """Return the rows of the table of parts: column -> text."""
+    """Return the rows of the parts table: column -> text."""
     return [
         {
             "part of a dense policy call": name,
@@ -144,7 +144,7 @@ def vla_part_rows(results: VLALatency) -> list[dict[str, str]]:
 
 
 def vla_product_rows(results: VLALatency) -> list[dict[str, str]]:
-    """Return the rows of the table of matrix products: column -> text; none where they were not timed."""
+    """Return the rows of the matrix-product table: column -> text; none if products were not timed."""
     products = results.products or {}
     best = max((product.flops_per_s for product in products.values()), default=0.0)
     return [
@@ -160,7 +160,7 @@ def vla_product_rows(results: VLALatency) -> list[dict[str, str]]:
 
 
 def vla_method_rows(results: VLALatency) -> list[dict[str, str]]:
-    """Return the rows of the table of methods: column -> text."""
+    """Return the rows of the methods table: column -> text."""
     return [_method_row(name, method) for name, method in results.methods.items()]
 
 

@@ -1,4 +1,4 @@
-"""The TorchRL collector that runs episodes in this process, in several, or on a Ray cluster, and which of its workers died."""
+"""The TorchRL collector that runs episodes in this process, in several, or on a Ray cluster, and reports dead workers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def running_collector(
     max_steps: int | None,
     policy_device: torch.device | str | None,
 ) -> Iterator[BaseCollector]:
-    """Run a collector without end while the block lasts, and deal the seeds among its environments; see `rollout_episodes`.
+    """Run an endless collector during the block and distribute the seeds over its environments; see `rollout_episodes`.
 
     Its batches are [environments, steps], of one environment [steps]: of this process, else of the worker that was ready first.
 

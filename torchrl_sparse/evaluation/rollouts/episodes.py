@@ -1,4 +1,4 @@
-"""The result of an evaluated episode, sums over several, and the log that survives a killed evaluation."""
+"""Results of evaluated episodes, their totals, and a log that survives a killed evaluation."""
 
 import gzip
 import json
@@ -65,7 +65,7 @@ class EpisodeResult:
 
 @dataclass(frozen=True)
 class Totals:
-    """Cost of several episodes: per policy call where a call is what costs, per episode where the episode does.
+    """Mean costs of several episodes: per policy call or per episode, whichever applies.
 
     Attributes:
         flops_per_query: FLOPs (2 * MAC).
@@ -82,7 +82,7 @@ class Totals:
 
 @dataclass(frozen=True)
 class TokensKept:
-    """Visual tokens in a decoder layer, mean over layers and queries: of all calls, of those in fine mode, and of the others.
+    """Visual tokens in a decoder layer, mean over layers and policy calls: all calls, those in fine mode, and the others.
 
     The last two are None where there was no such call, as without a controller.
     """
@@ -93,7 +93,7 @@ class TokensKept:
 
 
 def totals(episodes: Sequence[EpisodeResult]) -> Totals:
-    """Average episodes, every policy call counting the same.
+    """Average the costs of episodes, weighting every policy call equally.
 
     Raises:
         InputError: if there are no episodes or no call.
@@ -115,7 +115,7 @@ def totals(episodes: Sequence[EpisodeResult]) -> Totals:
 
 
 def tokens_kept(episodes: Sequence[EpisodeResult]) -> TokensKept | None:
-    """Average the visual tokens of episodes, every policy call counting the same; None for a policy without them.
+    """Average the visual tokens of episodes, weighting every policy call equally; None for a policy without visual tokens.
 
     >>> tokens_kept([EpisodeResult(0, True, 8, 2, 10.0, 0.5, kept=(90.0, 30.0), fine=(True, False))])
     TokensKept(kept_mean=60.0, kept_fine=90.0, kept_coarse=30.0)
@@ -197,7 +197,7 @@ class EpisodeLog:
             os.truncate(self.path, len(whole))
 
     def append(self, episode: EpisodeResult) -> None:
-        """Write one episode through to the disk.
+        """Append one episode and flush it to disk.
 
         Raises:
             InputError: if its seed is already in the log.
@@ -208,7 +208,7 @@ class EpisodeLog:
         self.episodes[episode.seed] = episode
 
     def missing(self, seeds: Iterable[int]) -> list[int]:
-        """Return the seeds that have no episode yet, in their order."""
+        """Return the seeds without an episode, in order."""
         return [seed for seed in seeds if seed not in self.episodes]
 
     def _write(self, data: Mapping[str, Any]) -> None:
@@ -236,7 +236,7 @@ def _told(episode: EpisodeResult) -> dict[str, Any]:
 
 
 def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
-    """Yield the episodes of a log, which stays as it is; of ``PATH.gz`` where there is no ``PATH``.
+    """Yield the episodes of a log without changing it; reads ``PATH.gz`` if there is no ``PATH``.
 
     Raises:
         FileNotFoundError: if there is neither.
@@ -250,7 +250,7 @@ def read_episodes(path: str | os.PathLike) -> Iterator[EpisodeResult]:
 
 
 def read_identity(path: str | os.PathLike) -> dict[str, Any]:
-    """Return what the episodes of a log belong to, see `EpisodeLog`; errors are those of `read_episodes`."""
+    """Return the identity that a log's episodes share, see `EpisodeLog`; errors are those of `read_episodes`."""
     path = _log_path(path)
     return parse_json(next(_lines(path), b""), _Header, f"{path}:1").identity
 

@@ -1,4 +1,4 @@
-"""The evaluation of one method: its episodes, with a log that is resumed and a bar that shows how far it is."""
+"""Evaluation of one method: its episodes, with a resumable log and a progress bar."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def success_rate(episodes: Sequence[EpisodeResult]) -> float:
 
 
 def episode_log(out: str | os.PathLike, name: str, dense_log: str | os.PathLike | None = None) -> Path:
-    """Return the path of a method's log in the folder ``out``; ``dense_log`` takes the place of that of ``"dense"``.
+    """Return the path of a method's log in the folder ``out``; for ``"dense"``, ``dense_log`` if it is given.
 
     >>> episode_log("outputs/lift", "bac").as_posix()
     'outputs/lift/episodes/bac.jsonl'

@@ -63,7 +63,7 @@ def rollout_episodes(
     on_episode: Callable[[EpisodeResult, int, int], None] | None = None,
     policy_device: torch.device | str | None = None,
 ) -> list[EpisodeResult]:
-    """Run one episode per seed in a TorchRL ``Collector``, or several of them in processes.
+    """Run one episode per seed in a TorchRL ``Collector``, in this process or in several.
 
     Several environments of one collector are a ``SerialEnv``. Seeds are dealt to the environments in turn. An environment that
     has done its own keeps stepping until the last one is finished (its surplus episodes are dropped). With ``workers`` > 1 a

@@ -1,4 +1,4 @@
-"""Episodes of two methods, seed by seed: what they solved, and how long they took."""
+"""Paired episodes of two methods: successes and times, seed by seed."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ class EpisodePairs:
 
     @property
     def solved(self) -> tuple[list[bool], list[bool]]:
-        """Successes of both."""
+        """Successes of both methods."""
         return [episode.success for episode in self.method], [episode.success for episode in self.other]
 
     def times(self, horizon: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the restricted times of both; see `restricted_times`."""
+        """Return the restricted times of both methods; see `restricted_times`."""
         return _times(self.method, horizon), _times(self.other, horizon)
 
     def success_difference(self, margin: float, confidence: float = 0.95) -> Difference:
-        """Compare what both solved; see `paired_difference`."""
+        """Compare the successes of both methods; see `paired_difference`."""
         return paired_difference(*self.solved, margin, confidence)
 
     def time_ratio(self, horizon: int, margin: float, confidence: float = 0.95) -> TimeDifference:
-        """Compare how long both took; see `torchrl_sparse.evaluation.statistics.durations.time_ratio`."""
+        """Compare the times of both methods; see `torchrl_sparse.evaluation.statistics.durations.time_ratio`."""
         return time_ratio(*self.times(horizon), horizon, margin, confidence)
 
     def score_difference(self, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
-        """Compare the scores of both; see `difference_interval`."""
+        """Compare the scores of both methods; see `difference_interval`."""
         return difference_interval(_scores(self.method), _scores(self.other), confidence)
 
     def statistics(self, horizon: int, margin: float, time_margin: float) -> tuple[float, float]:
-        """Return by how many standard errors successes and times are better than their margins."""
+        """Return by how many standard errors success and time beat their margins."""
         times = time_z(*self.times(horizon), horizon, 1 + time_margin)
         return tango_z(*discordant_pairs(*self.solved), -margin), times
 
     def score_statistic(self, margin: float) -> float:
-        """Return by how many standard errors the scores are better than their margin."""
+        """Return by how many standard errors the score beats its margin."""
         return difference_z(_scores(self.method), _scores(self.other), -margin)
 
 
@@ -72,7 +72,7 @@ def pair_episodes(
     other: str,
     others: Sequence[EpisodeResult],
 ) -> EpisodePairs:
-    """Put the episodes of two methods beside each other.
+    """Pair the episodes of two methods by seed.
 
     Args:
         name, other: of the methods, for errors.
@@ -96,7 +96,7 @@ def pair_by_design(
     others: Sequence[EpisodeResult],
     design: Design,
 ) -> EpisodePairs:
-    """Put a method's episodes beside those of another on the same seeds.
+    """Pair a method's episodes with another's on the same seeds.
 
     Args:
         name, other: of the methods, for errors.

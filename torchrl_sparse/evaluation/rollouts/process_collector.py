@@ -1,4 +1,4 @@
-"""A TorchRL collector of several processes that starts in time or not at all, and says which of them died."""
+"""A multi-process TorchRL collector with a start-up timeout that reports which process died."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _REAPING = 2.0  # seconds until a process whose pipe is broken has an exit code
 def in_processes(
     make: Sequence[Callable[[], EnvBase]], actor: TensorDictModuleBase, **options: Any
 ) -> Iterator[BaseCollector]:
-    """Collect in as many processes as there are functions to make their environments, while the block lasts.
+    """Collect during the block in one process per environment factory.
 
     Args:
         make: for each process, makes its environment.
@@ -127,7 +127,7 @@ class _ProcessCollector(MultiAsyncCollector):
 
 @contextmanager
 def time_limit(seconds: float, give_up: Callable[[], None]) -> Iterator[None]:
-    """Call ``give_up`` in a thread if the block, which then should end, has not ended after so many seconds."""
+    """Call ``give_up`` in a thread, to end the block, if it has not ended after ``seconds``."""
     timer = threading.Timer(seconds, give_up)
     timer.daemon = True
     timer.start()

@@ -1,4 +1,4 @@
-"""The methods of a vision-language-action benchmark on recorded queries: matched in tokens, asked one after the other."""
+"""Methods of a vision-language-action benchmark on recorded policy calls: matched in tokens, run one after another."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _HALVINGS = 10
 def method_identity(
     text: MethodSpec | str, number: float | None, policy: VLAPolicy, settings: Settings
 ) -> dict[str, Any]:
-    """Return what tells the episodes of one method from others', as JSON values for an `EpisodeLog`.
+    """Return the JSON values that tell one method's episodes from others', for an `EpisodeLog`.
 
     Args:
         text: the method, see `torchrl_sparse.methods.vla`.
@@ -59,7 +59,7 @@ def matching_share(
     *,
     most: float = 1.0,
 ) -> float:
-    """Find the share at which a pruner keeps ``kept`` visual tokens in a decoder layer, mean over layers and all policy calls.
+    """Find the share at which a pruner keeps ``kept`` visual tokens per decoder layer, mean over layers and policy calls.
 
     Args:
         make: called with a share in (0, 1]; more of it keeps more.
@@ -89,7 +89,7 @@ def matching_share(
 
 @torch.no_grad()
 def prepared_queries(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-    """Return an episode's calls, each [], with what the policy remembers of the one before: each can be asked by itself."""
+    """Return an episode's policy calls, each [], with the carried keys of the previous call, so each can be run by itself."""
     remembered = [key for key in policy.out_keys if key in policy.in_keys]
     left = replay(policy, queries, policy.pruner).select(*remembered)[:-1]
     first, *others = (query.exclude(*remembered) for query in queries)
@@ -97,7 +97,7 @@ def prepared_queries(policy: VLAPolicy, queries: Sequence[TensorDictBase]) -> li
 
 
 def seen_images(policy: VLAPolicy, step: TensorDictBase) -> Tensor:
-    """Return the images of one step, u8 [V, 3, h, w], cropped as for the network."""
+    """Return the images of one step as the network gets them, cropped, u8 [V, 3, h, w]."""
     config = policy.network.config
     images = torch.stack([keys.read(step, camera) for camera in config.cameras])
     return center_crop(images, config.crop_area)

@@ -1,4 +1,4 @@
-"""Intervals and verdicts for paired episodes, and errors to the dense answers."""
+"""Intervals and verdicts for paired episodes, and errors relative to dense actions."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""A method against dense over several tasks, each of the same weight.
+"""Comparison of a method with dense over several equally weighted tasks.
 
 The mean over tasks of a paired number has the variance ``V = Σ w² s² / n``, of each task's sample variance s² and pairs n, with
 the weight w, one over the number of tasks. As of single tasks, what was seen does not show the failure that has not been seen
@@ -40,7 +40,7 @@ __all__ = ["Aggregate", "Mean", "TaskPairs", "aggregate_tasks"]
 
 @dataclass(frozen=True)
 class TaskPairs:
-    """A method and dense on the same seeds of a task, in the same order.
+    """A method and dense on the same seeds of one task, in the same order.
 
     Attributes:
         solved: whether the method solved each episode, and whether dense did; [n] each, n at least 2.
@@ -71,13 +71,13 @@ class Mean:
 
     @property
     def p_value(self) -> float:
-        """One-sided, of being on the other side of the margin: the largest that the design of any task gives."""
+        """One-sided p-value of being on the other side of the margin: the largest over the tasks' designs."""
         return max(design.p_value(z, n) for design, n, z in self.tasks)
 
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A method against dense over several tasks.
+    """Comparison of a method with dense over several tasks.
 
     Attributes:
         success: the difference of success rates.
@@ -95,7 +95,7 @@ class Aggregate:
 def aggregate_tasks(
     tasks: Mapping[str, TaskPairs], margin: float = DEFAULT_MARGIN, time_margin: float = DEFAULT_TIME_MARGIN
 ) -> Aggregate:
-    """Put the tasks of a method together.
+    """Combine a method's comparisons with dense over its tasks.
 
     Args:
         tasks: task -> its pairs.

@@ -1,4 +1,4 @@
-"""An interval by resampling: of a ratio of medians over the rounds of a measurement."""
+"""Bootstrap interval of a ratio of medians, resampled over measurement rounds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LIMITS = (2.5, 97.5)
 
 
 def median_ratio_interval(numerator: ArrayLike, denominator: ArrayLike) -> tuple[float, float]:
-    """Return the 95 % percentile interval of the ratio of two medians, rounds being drawn with replacement.
+    """Return the 95 % percentile interval of the ratio of two medians, by resampling rounds with replacement.
 
     A round timed both, one right after the other: drawn together, what slowed the machine in it slows both.
 

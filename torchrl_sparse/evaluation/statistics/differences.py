@@ -1,4 +1,4 @@
-"""What is told of two methods on the same seeds, checked whenever it is made or read: a difference, or a ratio of times."""
+"""Paired comparison of two methods, as a difference or a ratio of times, validated on construction and on reading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Verdict = Literal["non-inferior", "inferior", "inconclusive"]
 
 @dataclass(frozen=True)
 class Difference:
-    """Success or score of a method minus that of another on the same seeds, with its interval and the verdict.
+    """Difference in success or score between two methods on the same seeds, with its interval and verdict.
 
     ``ci95`` has the confidence that was asked for where it was made; in files it is 95 %.
     The dense policy's own is 0 without width and "non-inferior": a policy equals itself by definition, nothing is estimated.
@@ -37,13 +37,13 @@ class Difference:
 
     @property
     def worse(self) -> bool:
-        """Whether the whole interval lies below zero, wherever the margin is."""
+        """Whether the whole interval lies below zero, regardless of the margin."""
         return self.ci95[1] < 0
 
 
 @dataclass(frozen=True)
 class TimeDifference:
-    """Restricted mean time of a method over that of another on the same seeds, with its interval and the verdict.
+    """Ratio of two methods' restricted mean times on the same seeds, with its interval and verdict.
 
     The dense policy's own is 1 without width and "non-inferior", as of `Difference`.
     """
@@ -60,7 +60,7 @@ class TimeDifference:
 
     @property
     def worse(self) -> bool:
-        """Whether the whole interval lies above one, wherever the margin is."""
+        """Whether the whole interval lies above one, regardless of the margin."""
         return self.ci95[0] > 1
 
 

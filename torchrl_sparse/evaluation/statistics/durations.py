@@ -1,4 +1,4 @@
-"""Time to success: what a slower method costs even where it solves as many episodes.
+"""Time to success: the cost of a slower method even if it solves as many episodes.
 
 An episode that is not solved took the whole horizon: the *restricted mean time* is the mean of these times, and two methods
 that ran on the same seeds are compared by the ratio of theirs. Its interval inverts a paired test, as Fieller's does (E. C.
@@ -43,7 +43,7 @@ _PER_OCTAVE, _OCTAVES = 6, 5  # of the allowed times that a curve shows
 
 
 def restricted_times(success: Sequence[bool], length: Sequence[int], horizon: int) -> NDArray[np.float64]:
-    """Return the steps to success of each episode, the horizon where there is none.
+    """Return the steps to success of each episode, or the horizon for failures.
 
     Args:
         success: whether each episode was solved.
@@ -114,7 +114,7 @@ def _fieller(a: float, b: float, c: float) -> tuple[float, float]:
 
 
 def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> float:
-    """Return how many standard errors the method is faster than ``ratio`` times the other; negative where it is slower.
+    """Return by how many standard errors the method is faster than ``ratio`` times the other; negative if slower.
 
     The two-sided interval of `time_ratio` excludes ``ratio`` where this is beyond its normal quantile.
 
@@ -137,7 +137,7 @@ def time_z(method: ArrayLike, other: ArrayLike, horizon: int, ratio: float) -> f
 
 
 def one_seed(method: ArrayLike, other: ArrayLike, horizon: int) -> float:
-    """Return what a seed costs the mean time that one method solves in the mean time and the other not at all, steps."""
+    """Return the effect of one discordant seed on the mean time, in steps."""
     method, other = checked_pairs(method, other)
     solved = np.concatenate([method[method < horizon], other[other < horizon]])
     lost = horizon - float(solved.mean()) if len(solved) else float(horizon)
@@ -145,7 +145,7 @@ def one_seed(method: ArrayLike, other: ArrayLike, horizon: int) -> float:
 
 
 def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -> Verdict:
-    """Judge an interval of a ratio of times: all of it below ``1 + margin``, all above, or neither.
+    """Judge a time-ratio interval: non-inferior if all below ``1 + margin``, inferior if all above, else inconclusive.
 
     >>> time_verdict((0.97, 1.06)), time_verdict((1.2, 1.4)), time_verdict((0.95, 1.15))
     ('non-inferior', 'inferior', 'inconclusive')
@@ -159,7 +159,7 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
 
 
 def allowed_steps(horizon: int, early_cut: int | None = None) -> list[int]:
-    """Return the allowed times at which `success_within` is told: five octaves below the horizon, and the early cut.
+    """Return the step limits for `success_within`: five octaves below the horizon, and the early cut.
 
     They follow from horizon and cut alone, so that nobody chooses them by the result.
 
@@ -171,7 +171,7 @@ def allowed_steps(horizon: int, early_cut: int | None = None) -> list[int]:
 
 
 def success_within(success: Sequence[bool], times: ArrayLike, steps: Sequence[int]) -> Mapping[int, float]:
-    """Return the share of episodes that are solved within each number of steps.
+    """Return the share of episodes solved within each number of steps.
 
     >>> success_within([True, True, False], [31, 80, 400], [30, 40, 400])
     {30: 0.0, 40: 0.3333333333333333, 400: 0.6666666666666666}
@@ -181,7 +181,7 @@ def success_within(success: Sequence[bool], times: ArrayLike, steps: Sequence[in
 
 
 def correlation(method: ArrayLike, other: ArrayLike) -> float | None:
-    """Return Pearson's correlation of two methods' times over the seeds; None where one of them never differs.
+    """Return Pearson's correlation of two methods' times over the seeds; None if either is constant.
 
     Pairing shortens an interval only as far as this is above zero. Methods that draw the same noise at every denoising step
     share much of it with dense; those with other steps cannot.

@@ -1,4 +1,4 @@
-"""Errors of a sparse policy call to the dense one, on the same observation and the same noise."""
+"""Errors of a sparse policy call relative to the dense one, for the same observation and noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _AT_ONCE = 8  # policy calls whose features are held at once: 25 MB each, of the
 
 
 def action_error(chunks: Tensor, dense_chunks: Tensor) -> tuple[float, float]:
-    """Return the mean and maximum absolute difference of action entries, in the units of the chunks.
+    """Return the mean and maximum absolute difference of action entries, in the chunks' units.
 
     Args:
         chunks: of the method, [..., H, A].

@@ -1,4 +1,4 @@
-"""Intervals and verdicts for success rates, alone and paired with the dense policy.
+"""Intervals and verdicts for success rates, single or paired with the dense policy.
 
 Episodes are Bernoulli trials. A rate gets Wilson's interval (E. B. Wilson, JASA 22, 1927). Two methods that
 ran on the same
@@ -125,7 +125,7 @@ def _pair_variance(won: ArrayLike, lost: ArrayLike, n: int, delta: float) -> NDA
 
 
 def mcnemar_p(won: int, lost: int) -> float:
-    """Return the exact two-sided p-value of McNemar's test: how likely discordant pairs are split as unevenly by a fair coin.
+    """Return the exact two-sided p-value of McNemar's test: the chance that a fair coin splits discordant pairs as unevenly.
 
     Given their number, the pairs that only one solved are Binomial(won + lost, 1/2) where both methods are as good (Q. McNemar,
     Psychometrika 12, 1947). Twice the smaller tail, at most 1; as the coin is fair, the sum over all splits that are as
@@ -140,7 +140,7 @@ def mcnemar_p(won: int, lost: int) -> float:
 
 
 def verdict(ci: tuple[float, float], margin: float = DEFAULT_MARGIN) -> Verdict:
-    """Judge an interval of a paired difference by a non-inferiority margin.
+    """Judge the interval of a paired difference against a non-inferiority margin.
 
     ``"non-inferior"`` if the whole interval lies above ``-margin``, ``"inferior"`` if all of it lies below,
     else ``"inconclusive"``: the episodes do not suffice to tell.
@@ -162,7 +162,7 @@ def paired_difference(
     margin: float = DEFAULT_MARGIN,
     confidence: float = 0.95,
 ) -> Difference:
-    """Compare two methods on the same seeds; entry *i* of both sequences belongs to the same seed.
+    """Compare two methods on the same seeds; entry *i* of both sequences has the same seed.
 
     Args:
         method, other: whether each solved an episode.
@@ -182,7 +182,7 @@ def paired_difference(
 
 
 def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int, int, int]:
-    """Return the pairs that only the method solved, that only the other solved, and all.
+    """Return the number of pairs that only the method solved, that only the other solved, and in all.
 
     Raises:
         InputError: if the lengths differ or are zero.
@@ -195,7 +195,7 @@ def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int
 
 
 def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Return both as f64 [n], or raise InputError if they are no pairs."""
+    """Return both inputs as f64 [n], or raise InputError if their lengths do not match."""
     method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
     if method.shape != other.shape or method.ndim != 1 or not len(method):
         raise InputError(
@@ -205,7 +205,7 @@ def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray
 
 
 def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) -> int:
-    """Return the fewest pairs that can show non-inferiority at all: those that suffice when no pair is discordant.
+    """Return the least number of pairs that can show non-inferiority: enough if no pair is discordant.
 
     >>> episodes_needed(0.05)
     73
@@ -218,6 +218,6 @@ def episodes_needed(margin: float = DEFAULT_MARGIN, confidence: float = 0.95) ->
 
 
 def check_level(confidence: float) -> None:
-    """Raise InputError unless a level lies strictly between 0 and 1."""
+    """Raise InputError unless a level is strictly between 0 and 1."""
     if not 0 < confidence < 1:
         raise InputError(f"confidence: expected a number strictly between 0 and 1, got {confidence}")

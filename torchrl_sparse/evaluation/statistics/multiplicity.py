@@ -1,4 +1,4 @@
-"""Many comparisons in one table: which of their verdicts hold together."""
+"""Correction for multiple comparisons in one table."""
 
 from __future__ import annotations
 

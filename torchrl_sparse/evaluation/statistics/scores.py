@@ -1,4 +1,4 @@
-"""Means of scores, and of their differences, with Student's intervals: for graded tasks.
+"""Mean scores and their differences, with Student's intervals, for graded tasks.
 
 Numbers that are all the same show no spread, which does not say that there is none. Scores lie in [0, 1]; the interval then is
 Tango's of as many pairs of which none differs, ``±z²/(n + z²)``.
@@ -19,7 +19,7 @@ __all__ = ["difference_interval", "difference_z", "mean_interval"]
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, tuple[float, float]]:
-    """Return the mean of ``values``, at least two, and Student's interval of it.
+    """Return the mean of ``values``, at least two, and its Student interval.
 
     Raises:
         InputError: if there are fewer than two values, or they are no list of numbers.
@@ -40,7 +40,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, t
 def difference_interval(
     method: ArrayLike, other: ArrayLike, confidence: float = 0.95
 ) -> tuple[float, tuple[float, float]]:
-    """Return the mean score of a method minus that of another, and its interval: that of the paired t-test.
+    """Return the mean score difference of two methods and its interval, as in the paired t-test.
 
     Args:
         method, other: scores on the same seeds, [n], n at least 2.
@@ -73,7 +73,7 @@ def _standard_error(values: NDArray) -> float:
 
 
 def difference_z(method: ArrayLike, other: ArrayLike, bound: float) -> float:
-    """Return by how many standard errors the difference of scores lies above ``bound``; 0 of a single pair, which says nothing.
+    """Return by how many standard errors the score difference lies above ``bound``; 0 for a single pair.
 
     Student's statistic as the normal one that is as unlikely, so that `difference_interval` excludes ``bound`` where this is
     beyond the normal quantile.

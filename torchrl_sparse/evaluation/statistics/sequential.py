@@ -1,4 +1,4 @@
-"""When to stop: episodes go on until the verdict is reached, and looking at them again and again costs no error.
+"""Sequential designs: episodes continue until the verdict is reached, with the error rate controlled over interim analyses.
 
 A `Design` analyses the episodes after equal numbers of them, up to a cap. An analysis uses the ordinary intervals at a higher
 level, ``2 Φ(c) - 1`` with the critical value ``c = C t^(1/4 - 1/2)`` of Wang and Tsiatis' family (Biometrics 43, 1987), t being
@@ -36,7 +36,7 @@ _LARGEST_Z = 8.0  # beyond, a p-value is below 1e-15, and the nodes of the integ
 
 @dataclass(frozen=True)
 class Design:
-    """After how many episodes to analyse them, and at which level.
+    """Sequential design: the numbers of episodes at the analyses, and the level of each.
 
     Attributes:
         max_episodes: the cap.
@@ -63,13 +63,13 @@ class Design:
 
     @cached_property
     def ends(self) -> tuple[int, ...]:
-        """Episodes at each analysis."""
+        """Number of episodes at each analysis."""
         return tuple(
             self.max_episodes * analysis // self.analyses for analysis in range(1, self.analyses + 1)
         )
 
     def critical(self, episodes: int) -> float:
-        """Return the standard errors beyond which an analysis decides.
+        """Return the number of standard errors beyond which an analysis is significant.
 
         Raises:
             InputError: if there is no analysis after so many episodes.
@@ -79,13 +79,13 @@ class Design:
         return _constant(self._times) * self._time(episodes) ** (_SHAPE - 0.5)
 
     def confidence(self, episodes: int) -> float:
-        """Return the two-sided level of the intervals at an analysis; those of all analyses hold together with 95 %."""
+        """Return the two-sided level of an analysis' intervals; over all analyses they hold together with 95 %."""
         if self.analyses == 1:
             return 1 - _ERROR
         return 1 - 2 * float(ndtr(-self.critical(episodes)))
 
     def decides(self, episodes: int, *statistics: float) -> bool:
-        """Tell whether a method's verdict is reached at an analysis: non-inferior in every statistic, or inferior in one.
+        """Tell whether a method's verdict is reached at an analysis: non-inferior in every statistic, or inferior in any.
 
         Args:
             episodes: at the analysis.
@@ -95,7 +95,7 @@ class Design:
         return min(statistics) > critical or min(statistics) < -critical
 
     def p_value(self, z: float, episodes: int) -> float:
-        """Return the one-sided p-value of a statistic at an analysis: the error at which its limit would just be reached.
+        """Return the one-sided p-value of a statistic at an analysis: the error level whose limit it just reaches.
 
         >>> round(Design(400).p_value(1.96, 400), 4), round(Design(400, 20).p_value(1.96, 400), 3)
         (0.025, 0.052)

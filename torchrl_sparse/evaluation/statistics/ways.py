@@ -1,4 +1,4 @@
-"""What episodes tell beside success: which of several ways of a task they took, and how many of its parts they did."""
+"""Outcomes of episodes beside success: the mode taken on a multimodal task, and the number of subtasks done."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["count_levels", "way_entropy"]
 
 
 def way_entropy(ways: Iterable[int]) -> float:
-    """Return the entropy, in bits, of the ways that episodes took; 0 if all took the same one, 2 if four are as frequent.
+    """Return the entropy, in bits, of the modes that episodes took; 0 for a single mode, 2 for four equally frequent ones.
 
     It is that of the frequencies, so a few episodes have less than the policy that they come from: of four equal ways and 20
     episodes it is 1.9 in the mean.
@@ -33,7 +33,7 @@ def way_entropy(ways: Iterable[int]) -> float:
 
 
 def count_levels(told: Sequence[int], most: int = 0) -> dict[str, int]:
-    """Return of how many episodes at least one part was done, two, … up to ``most`` or the most of any episode.
+    """Count the episodes with at least one subtask done, two, … up to ``most`` or the maximum of any episode.
 
     >>> count_levels([2, 2, 1, 0])
     {'p1': 3, 'p2': 2}

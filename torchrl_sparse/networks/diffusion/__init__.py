@@ -1,4 +1,4 @@
-"""The denoiser of Diffusion Policy, the encoder of its cameras, its sampler and its noise."""
+"""Diffusion Policy's denoiser, camera encoder, sampler and noise."""
 
 import lazy_loader as lazy
 

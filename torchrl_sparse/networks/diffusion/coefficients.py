@@ -1,4 +1,4 @@
-"""A sampler as eight numbers for each denoising step, so that a loop needs no scheduler.
+"""A sampler as eight coefficients per denoising step, so that a loop needs no scheduler.
 
 With ``clip`` to [-1, 1], or another range, and the clean predictions of the two steps before, every sampler is one update::
 
@@ -29,7 +29,7 @@ __all__ = ["Guide", "StepCoefficients", "squared_cosine", "step_coefficients"]
 
 
 class Guide(NamedTuple):
-    """Actions that a call's clean predictions are guided toward in every step, so that the others are denoised to fit them.
+    """Actions toward which each step's clean predictions are guided, so that the other actions are denoised to fit them.
 
     Attributes:
         actions: normalised, f32 [B, H, A].
@@ -40,13 +40,13 @@ class Guide(NamedTuple):
     pull: Tensor
 
     def rows(self, rows: Tensor) -> Guide:
-        """Return the guide of those rows, bool [B] or i64 [n], alone."""
+        """Return the guide for the given rows, bool [B] or i64 [n]."""
         return Guide(self.actions[rows], self.pull[rows])
 
 
 @dataclass(frozen=True)
 class StepCoefficients:
-    """The update of every denoising step; each field but ``clip`` is f32 [K], in execution order.
+    """Coefficients of every denoising step; each field but ``clip`` is f32 [K], in execution order.
 
     Attributes:
         noise_scale: sqrt(1 - abar_t).
@@ -70,7 +70,7 @@ class StepCoefficients:
 
     @property
     def history(self) -> int:
-        """How many earlier clean predictions the steps read, 0 to 2."""
+        """Number of earlier clean predictions that the steps read, 0 to 2."""
         return 2 if self.earlier_weight.any() else 1 if self.previous_weight.any() else 0
 
     def reads_noise(self, step: int) -> bool:
@@ -114,7 +114,7 @@ class StepCoefficients:
 
 
 def squared_cosine(steps: int) -> Tensor:
-    """Return the share of signal after each training step, f32 [steps]: arXiv:2102.09672 Eq. 17, its betas at most 0.999.
+    """Return the signal share after each training step, f32 [steps]: arXiv:2102.09672 Eq. 17, betas capped at 0.999.
 
     Diffusers has the same to the last bit, and takes two seconds to import.
     """
@@ -133,7 +133,7 @@ def step_coefficients(
     eta: float = 0.0,
     clip: float = 1.0,
 ) -> StepCoefficients:
-    """Tabulate the steps of a sampler.
+    """Tabulate the coefficients of a sampler's steps.
 
     Args:
         kind: of the sampler, one of `torchrl_sparse.networks.diffusion.sampler.KINDS`.

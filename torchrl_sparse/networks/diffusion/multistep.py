@@ -1,4 +1,4 @@
-"""Weights of the solvers that remember clean predictions, as diffusers defines them, in float64.
+"""Weights of multistep solvers, which reuse earlier clean predictions, as diffusers defines them, in float64.
 
 With ``alpha = sqrt(abar)``, ``sigma = sqrt(1 - abar)``, ``lambda = log(alpha / sigma)``, s the timestep of a step, t the
 one that it leads to, ``h = lambda_t - lambda_s`` and ``q = h / h of the step before``, a step of second order goes along

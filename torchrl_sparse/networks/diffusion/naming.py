@@ -1,4 +1,4 @@
-"""How samplers are written, in methods, in saved schedules and pruners, and in options: one grammar.
+"""Grammar of sampler names in methods, saved schedules and pruners, and options.
 
 ::
 
@@ -35,7 +35,7 @@ _NAME = re.compile(rf"({_KIND})(?:({_STEPS})?(?:_({_SPACING}))?|({_TIMESTEPS}))(
 
 @dataclass(frozen=True)
 class SamplerName:
-    """A sampler as it is written, taken apart.
+    """Parsed sampler name.
 
     Attributes:
         kind: one of :data:`KINDS`.
@@ -59,7 +59,7 @@ class SamplerName:
 
     @classmethod
     def parse(cls, text: str) -> SamplerName:
-        """Raise InputError unless ``text`` is written as the module says."""
+        """Parse ``text``; raise InputError unless it follows the module's grammar."""
         match = _NAME.fullmatch(text) if isinstance(text, str) else None
         if match is None:
             raise InputError(

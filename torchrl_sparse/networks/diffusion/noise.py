@@ -1,4 +1,4 @@
-"""All randomness of a policy call follows from one integer, so that two methods can be run on the same noise."""
+"""Seeded noise: one integer fixes all randomness of a policy call, so methods can be compared on the same noise."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def sample_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
 
 
 def check_whole(name: Any, tensor: Tensor) -> None:
-    """Raise InputError unless ``tensor`` holds whole numbers: of a fraction, a generator would take another seed."""
+    """Raise InputError unless ``tensor`` holds integers, since a generator would truncate fractions to another seed."""
     if tensor.dtype not in _WHOLE:
         raise InputError(f"{name}: expected whole numbers, got {tensor.dtype}")
 

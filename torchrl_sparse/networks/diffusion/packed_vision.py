@@ -1,4 +1,4 @@
-"""The cameras' encoder as a CPU computes it fastest: the same layers on weights that oneDNN has laid out once.
+"""The camera encoder for fast CPU inference: the same layers with weights packed once for oneDNN.
 
 A few frames are little work for 22 million weights, and PyTorch lays each convolution's weights out again in every call. Here
 that is done when the encoder is packed, and activations stay in the order that those weights are for (channels last). They can
@@ -29,7 +29,7 @@ def can_pack_vision(vision: VisionEncoder) -> bool:
 
 @torch.no_grad()
 def pack_vision(vision: VisionEncoder, frames: int, *, bf16: bool = False) -> VisionEncoder:
-    """Return a copy of ``vision``, of the weights of the moment, whose features differ from its own by rounding alone.
+    """Return a copy of ``vision`` with its current weights packed; features differ only by rounding.
 
     Args:
         vision: one that `can_pack_vision`.

@@ -1,4 +1,4 @@
-"""Noise that C++ and Python draw alike, to the last bit: a counter-based generator, and normal numbers by plain arithmetic.
+"""Noise that C++ and Python draw identically, to the last bit: a counter-based generator and plain arithmetic.
 
 The i-th number of a seed is ``Phi^-1((w + 1/2) / 2^32)`` in f64, rounded to f32, where w is word ``i mod 4`` of Philox-4x32
 with ten rounds (Salmon et al., SC 2011) under the counter ``i div 4`` and the seed as the key, lower half first. Phi^-1 is
@@ -38,7 +38,7 @@ _LN2, _SQRT_HALF, _LOG_TERMS = 0.6931471805599453, 0.7071067811865476, 10
 
 
 def philox_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> Tensor:
-    """Draw the noise of B policy calls, f32 [B, num_steps, H, A]: entry k of a seed is the same whatever ``num_steps``.
+    """Draw the noise of B policy calls, f32 [B, num_steps, H, A]: entry k of a seed does not depend on ``num_steps``.
 
     Args:
         seed: i64 [B].
@@ -58,7 +58,7 @@ def philox_noise(seed: Tensor, num_steps: int, chunk_shape: tuple[int, int]) -> 
 
 
 def philox_words(key: Tensor, counter: Tensor) -> Tensor:
-    """Return four words i64 [*shape, 4] in [0, 2^32), of keys and counters i64 that are broadcast to one ``shape``.
+    """Return four words i64 [*shape, 4] in [0, 2^32), for keys and counters i64 that broadcast to ``shape``.
 
     >>> [hex(word) for word in philox_words(torch.tensor(0), torch.tensor(0)).tolist()]
     ['0x6627e8d5', '0xe169c58d', '0xbc57ac4c', '0x9b00dbd8']

@@ -1,4 +1,4 @@
-"""Samplers: diffusers' own with every noise tensor handed in from outside, and the predicted clean sample always clipped.
+"""Samplers: diffusers' own, with all noise passed in and the predicted clean sample always clipped.
 
 Diffusion Policy (arXiv:2303.04137) trains with 100 steps, the squared-cosine beta schedule (arXiv:2102.09672), noise prediction
 and samples clipped to [-1, 1]. The same network is sampled by
@@ -52,7 +52,7 @@ _MAX_CLIP = 1e6
 
 
 class Sampler:
-    """The denoising steps of one policy call, in execution order, and the noising of training.
+    """Denoising steps of one policy call, in execution order, and the noising used in training.
 
     The schedulers of diffusers draw their own noise; here the caller passes it, so that two methods can share all
     noise of a call. A sampler cannot be changed: engines keep tables of its steps.
@@ -163,7 +163,7 @@ class Sampler:
     def from_name(
         cls, name: str, num_inference_steps: int | None = None, num_train_timesteps: int = 100
     ) -> Sampler:
-        """Make the sampler of that name, see :mod:`~torchrl_sparse.networks.diffusion.naming`.
+        """Make a sampler from its name, see :mod:`~torchrl_sparse.networks.diffusion.naming`.
 
         Args:
             name: what :attr:`name` says, or with its number of steps, e.g. ``"ddpm10"``.
@@ -181,7 +181,7 @@ class Sampler:
         return cls(parts.kind, written or asked, num_train_timesteps, **options)
 
     def variant(self, kind: str = "ddpm", num_inference_steps: int | None = None, **options: Any) -> Sampler:
-        """Return another sampler of the same network: what it was trained with stays, see :attr:`trained`.
+        """Return another sampler for the same network, with the training settings :attr:`trained` unchanged.
 
         Arguments and errors are those of the constructor.
 
@@ -191,7 +191,7 @@ class Sampler:
         return Sampler(kind, num_inference_steps, **self.trained | options)
 
     def variant_named(self, name: str, num_inference_steps: int | None = None) -> Sampler:
-        """Return the :meth:`variant` that is called so; arguments and errors are those of :meth:`from_name`.
+        """Return the :meth:`variant` with that name; arguments and errors are those of :meth:`from_name`.
 
         >>> Sampler("ddpm", 50, 50).variant_named("ddim10").num_train_timesteps
         50
@@ -201,11 +201,11 @@ class Sampler:
 
     @property
     def trained(self) -> dict[str, Any]:
-        """The arguments that follow from how the network was trained: ``num_train_timesteps``, ``clip_sample_range``."""
+        """Arguments fixed by the network's training: ``num_train_timesteps``, ``clip_sample_range``."""
         return {"num_train_timesteps": self.num_train_timesteps, "clip_sample_range": self.clip_sample_range}
 
     def last_steps(self, number: int) -> Sampler:
-        """Return the sampler of the last steps alone, 1 to K; each has the coefficients that it has here.
+        """Return a sampler of the last ``number`` steps alone, 1 to K, with unchanged coefficients.
 
         Those of solvers that remember earlier steps begin again: their first step is of first order.
 
@@ -220,12 +220,12 @@ class Sampler:
 
     @property
     def name(self) -> str:
-        """Its name without the number of steps: ``"ddpm"``, ``"ddpm_logsnr"``, ``"ddim_90_50_10"``."""
+        """Name without the number of steps: ``"ddpm"``, ``"ddpm_logsnr"``, ``"ddim_90_50_10"``."""
         return str(SamplerName(self.kind, None, self._chosen, self.spacing, self.eta))
 
     @property
     def config(self) -> dict[str, Any]:
-        """The constructor's arguments: ``Sampler(**sampler.config)`` is an equal sampler."""
+        """Constructor arguments: ``Sampler(**sampler.config)`` is an equal sampler."""
         config = {
             "kind": self.kind,
             "num_inference_steps": self.num_inference_steps,
@@ -277,7 +277,7 @@ class Sampler:
     def remember(
         self, cleans: Sequence[Tensor], eps: Tensor, k: int, sample: Tensor, guide: Guide | None = None
     ) -> tuple[Tensor, ...]:
-        """Return the clean predictions that the step after ``k`` reads, the latest first; empty where none does.
+        """Return the clean predictions that the step after ``k`` reads, latest first; empty if it reads none.
 
         Arguments: :meth:`step`.
         """
@@ -286,7 +286,7 @@ class Sampler:
         return (self.coefficients.clean(k, sample, eps, guide), *cleans)[: self.coefficients.history]
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training; factors are made in f32.
+        """Return noisy actions ``sqrt(abar_t) clean + sqrt(1 - abar_t) noise`` for training; factors are computed in f32.
 
         Args:
             clean: normalised actions [B, H, A].

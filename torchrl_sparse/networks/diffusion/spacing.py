@@ -1,4 +1,4 @@
-"""Which timesteps a sampler takes when it is only told how many.
+"""Rules that choose a sampler's timesteps from their number.
 
 ``"leading"``, ``"trailing"`` and ``"linspace"`` are diffusers' (arXiv:2305.08891, Table 2), whose solvers leave out
 timestep 0 where DDPM and DDIM end on it. ``"logsnr"`` is the rule that needs no search::
@@ -99,7 +99,7 @@ def _first_clear(alphas_cumprod: Tensor) -> int:
 
 
 def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timesteps: int) -> list[int]:
-    """Return chosen timesteps as plain numbers; ValueError unless they are ``num_steps`` whole numbers that fall.
+    """Return chosen timesteps as ints; ValueError unless they are ``num_steps`` decreasing integers.
 
     >>> check_timesteps((82, 14), 2, 100)
     [82, 14]
@@ -115,7 +115,7 @@ def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timestep
 
 
 def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
-    """Return whether each timestep is below the last, from under ``num_train_timesteps`` down to at least 0.
+    """Return whether timesteps decrease strictly, from below ``num_train_timesteps`` down to at least 0.
 
     >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)
     (True, False, False)
@@ -124,7 +124,7 @@ def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
 
 
 def falls_evenly(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
-    """Return whether each of K timesteps lies T // K above the next, and the last no more above the clean sample.
+    """Return whether K timesteps are T // K apart, the last one at most that far above the clean sample.
 
     Whatever the spacing, diffusers' DDIM leads T // K down; elsewhere it asks the network about another timestep than that.
 

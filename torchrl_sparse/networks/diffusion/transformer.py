@@ -1,4 +1,4 @@
-"""The denoising transformer of Diffusion Policy (arXiv:2303.04137, "DP-T"), opened up block by block.
+"""The denoising transformer of Diffusion Policy (arXiv:2303.04137, "DP-T"), with its blocks callable one by one.
 
 The network predicts the noise of an action chunk from the noisy chunk, the diffusion timestep and the last
 observations. Its trunk is a pre-norm decoder; every layer holds three *blocks*, in this order::
@@ -32,7 +32,7 @@ MAX_LAYERS = 256
 
 
 class SinusoidalPosEmb(nn.Module):
-    """Embeds a timestep t as ``[sin(t f_i) | cos(t f_i)]`` with ``f_i = 10000 ** (-i / (dim / 2 - 1))``.
+    """Embedding of a timestep t as ``[sin(t f_i) | cos(t f_i)]`` with ``f_i = 10000 ** (-i / (dim / 2 - 1))``.
 
     Args:
         dim: size of the embedding, even and at least 4.
@@ -133,7 +133,7 @@ class TransformerForDiffusion(nn.Module):
         self.made_shapes = {name: tuple(weight.shape) for name, weight in self.named_parameters()}
 
     def present_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that its weights have now, which others may have put there; see ``made_shapes``."""
+        """Return the current shapes of the weights, which may have been replaced; see ``made_shapes``."""
         return {name: tuple(attrgetter(name)(self).shape) for name in self.made_shapes}
 
     def _build(self) -> None:
@@ -203,7 +203,7 @@ class TransformerForDiffusion(nn.Module):
         return self.encoder(self.drop(tokens + self.cond_pos_emb))
 
     def block(self, index: int, x: Tensor, memory: Tensor) -> Tensor:
-        """Compute what block ``index`` adds to the residual stream, [B, H, n_emb]; it is *not* added here.
+        """Compute the output of block ``index``, [B, H, n_emb], which is *not* yet added to the residual stream.
 
         Args:
             index: ``3 * layer + {0: SA, 1: CA, 2: FFN}``.
@@ -233,7 +233,7 @@ class TransformerForDiffusion(nn.Module):
         return layer.dropout3(layer.linear2(y))
 
     def head_out(self, x: Tensor) -> Tensor:
-        """Project the residual stream [B, H, n_emb], normalised, to noise [B, H, output_dim]."""
+        """Normalise the residual stream [B, H, n_emb] and project it to noise [B, H, output_dim]."""
         return self.head(self.ln_f(x))
 
     def forward(self, sample: Tensor, timestep: int | Tensor, cond: Tensor) -> Tensor:

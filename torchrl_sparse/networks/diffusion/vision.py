@@ -1,4 +1,4 @@
-"""Camera images as features: the encoder of Diffusion Policy's image policies (arXiv:2303.04137, section III.C.2).
+"""Camera encoder of Diffusion Policy's image policies (arXiv:2303.04137, section III.C.2).
 
 Each camera has a network of its own, trained with the policy: a random crop (the centre outside of training), a
 ResNet-18 (arXiv:1512.03385) whose batch norms are group norms of 16 channels, since averaged weights and
@@ -38,7 +38,7 @@ def crop_centre(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def crop_random(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """Crop a ``size`` (height, width) part of each of the images [N, 3, h, w], each at a place of its own.
+    """Crop a ``size`` (height, width) part of each image [N, 3, h, w], each at its own random place.
 
     Places are drawn from torch's global generator.
 
@@ -54,7 +54,7 @@ def crop_random(images: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def spatial_softmax(maps: Tensor) -> Tensor:
-    """Find where each map looks: the mean place [N, K, 2] under its softmax, (x, y) in [-1, 1], x to the right.
+    """Return the expected position [N, K, 2] under each map's softmax, (x, y) in [-1, 1], x to the right.
 
     Args:
         maps: [N, K, h, w].
@@ -70,7 +70,7 @@ def spatial_softmax(maps: Tensor) -> Tensor:
 
 
 class CameraEncoder(nn.Module):
-    """Features [N, 64] of one camera's images.
+    """Encoder of one camera's images to features [N, 64].
 
     Args:
         crop_size: height and width of what the network sees, pixels.
@@ -102,13 +102,13 @@ class CameraEncoder(nn.Module):
         return self.linear(points.flatten(1)).relu()
 
     def pixels(self, images: Tensor) -> Tensor:
-        """Return what the network sees of images u8 [N, 3, h, w]: a crop of each, in [-1, 1]."""
+        """Return the network's input for images u8 [N, 3, h, w]: one crop of each, scaled to [-1, 1]."""
         crop = crop_random if self.training else crop_centre
         return crop(images, self.crop_size).to(self.linear.weight.dtype) / 255 * 2 - 1
 
 
 class VisionEncoder(nn.Module):
-    """Features of several cameras, one `CameraEncoder` each.
+    """Encoder of several cameras, one `CameraEncoder` each.
 
     Args:
         cameras: names of the images, ``("history", name)`` in a TensorDict; their features come in this order.

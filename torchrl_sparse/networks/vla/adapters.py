@@ -1,4 +1,4 @@
-"""Low-rank adapters (LoRA, arXiv:2106.09685) of the decoder: a language model stays as it is, beside what is learned.
+"""Low-rank adapters (LoRA, arXiv:2106.09685) of the decoder: the language model's own weights stay unchanged.
 
 A product with W becomes one with W + up @ down, of which ``down`` [rank, in] and ``up`` [out, rank] alone are trained; ``up``
 begins as zeros, so that nothing changes at first. To use a policy, `fold_adapters` adds them up: it then costs what any does.
@@ -22,7 +22,7 @@ _MAX_RANK = 1 << 12
 
 
 class AdaptedLinear(nn.Module):
-    """A linear layer without bias, whose weight is not trained, and what is.
+    """A linear layer without bias: a frozen weight and a trained low-rank update.
 
     Args:
         linear: the layer.
@@ -48,14 +48,14 @@ class AdaptedLinear(nn.Module):
 
     @torch.no_grad()
     def folded(self) -> nn.Linear:
-        """Return one linear layer that does the same."""
+        """Return an equivalent plain linear layer."""
         linear = nn.Linear(self.weight.shape[1], self.weight.shape[0], bias=False, device="meta")
         linear.weight = nn.Parameter(self.weight + self.up @ self.down)
         return linear
 
 
 def add_adapters(network: VLANetwork, rank: int) -> VLANetwork:
-    """Adapt the linear layers of all decoder layers, in place, and freeze the rest of the decoder.
+    """Add adapters to the linear layers of all decoder layers, in place, and freeze the rest of the decoder.
 
     Raises:
         InputError: if ``rank`` is no positive number, or far too large.
@@ -68,14 +68,14 @@ def add_adapters(network: VLANetwork, rank: int) -> VLANetwork:
 
 
 def fold_adapters(network: VLANetwork) -> VLANetwork:
-    """Add the adapters to the weights that they adapt, in place."""
+    """Merge the adapters into the weights that they adapt, in place."""
     for parent, name, adapted in _layers(network, AdaptedLinear):
         setattr(parent, name, adapted.folded())
     return network
 
 
 def is_frozen(name: str) -> bool:
-    """Tell whether a tensor of an adapted network's state is the language model's, by its name.
+    """Tell by its name whether a tensor of an adapted network belongs to the frozen language model.
 
     >>> [is_frozen(f"decoder.llama.layers.0.mlp.up_proj.{name}") for name in ("weight", "up")], is_frozen("head.fc1.weight")
     ([True, False], False)

@@ -1,4 +1,4 @@
-"""The parts of `transformers` that vision-language-action networks are made of, each imported when it is first used.
+"""Components from `transformers` for vision-language-action networks, each imported on first use.
 
 So every module of this package imports without the extra ``vla``; making a network does not.
 """

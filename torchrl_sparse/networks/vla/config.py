@@ -1,4 +1,4 @@
-"""The sizes of a vision-language-action model: everything that fixes its architecture, and nothing else."""
+"""Sizes of a vision-language-action model: everything that fixes its architecture, and nothing else."""
 
 from __future__ import annotations
 
@@ -146,21 +146,23 @@ class VLAConfig:
 
     @classmethod
     def tiny(cls, **changes: Any) -> VLAConfig:
-        """Return sizes for tests, which run in milliseconds; ``changes`` are other attributes."""
+        """Return sizes for tests that run in milliseconds; ``changes`` override attributes."""
         tower = TransformerSize(16, 2, 2, 32)
         sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(32, 4, 2, 64), "vocab_size": 320}
         return cls(**{**sizes, "image_size": 28, "chunk_size": 2, **changes})
 
     @classmethod
     def small(cls, **changes: Any) -> VLAConfig:
-        """Return sizes that a CPU core trains: 3 million parameters, 2 x 36 visual tokens; ``changes`` are other attributes."""
+        """Return sizes that a CPU core can train: 3 million parameters, 2 x 36 visual tokens; ``changes`` override
+        attributes.
+        """
         tower = TransformerSize(96, 4, 4, 384)
         sizes = {"dino": tower, "siglip": tower, "llm": TransformerSize(128, 8, 4, 384), "vocab_size": 512}
         return cls(**{**sizes, "image_size": 84, **changes})
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of patches of an image."""
+        """Rows and columns of image patches."""
         return (self.image_size // self.patch_size,) * 2
 
     @property
@@ -170,21 +172,21 @@ class VLAConfig:
 
     @property
     def num_slots(self) -> int:
-        """Action tokens of the decoder: one for each number of a chunk."""
+        """Action tokens of the decoder, one for each number of a chunk."""
         return self.chunk_size * self.action_dim
 
     @property
     def kv_dim(self) -> int:
-        """Width of the decoder's keys, and of its values."""
+        """Width of the decoder's keys and values."""
         return self.llm.dim // self.llm.heads * (self.kv_heads or self.llm.heads)
 
     @property
     def visual_spec(self) -> VisualSpec:
-        """The sizes that decide which visual tokens there are."""
+        """Sizes that determine the visual tokens."""
         return VisualSpec(self.llm.layers, self.cameras, self.grid, self.image_size, self.llm.dim)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON values, which `from_dict` reads."""
+        """Return the fields as JSON values for `from_dict`."""
         added = {name for name, meant in _ADDED.items() if getattr(self, name) == meant}
         fields = {name: value for name, value in dataclasses.asdict(self).items() if name not in added}
         fields["cameras"] = [list(key) if isinstance(key, tuple) else key for key in self.cameras]
@@ -192,7 +194,7 @@ class VLAConfig:
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> VLAConfig:
-        """Return the sizes whose `to_dict` gave ``fields``.
+        """Return the sizes that `to_dict` wrote.
 
         Raises:
             InputError: if a field is missing, unknown or wrong.

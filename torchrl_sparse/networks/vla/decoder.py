@@ -1,4 +1,4 @@
-"""A Llama decoder with bidirectional attention, whose visual tokens may be dropped before and between its layers.
+"""A Llama decoder with bidirectional attention that can drop visual tokens before and between its layers.
 
 OpenVLA-OFT (arXiv:2502.19645) predicts all actions in one pass and therefore attends to every token in both directions. Stock
 Llama attends causally; here nothing is masked but padding. Attention is always PyTorch's fused kernel; where `LayerHooks` ask
@@ -24,7 +24,7 @@ _PER_TOKEN = ("hidden", "positions", "kind", "task")
 
 @dataclass
 class Decoded:
-    """The decoder's output, and on how many tokens its layers ran.
+    """The decoder's output, and the number of tokens in each layer.
 
     Attributes:
         hidden: [B, S, d] after the final norm; a row's alive tokens are its first ones.
@@ -70,7 +70,7 @@ class BidirectionalLlama(nn.Module):
         return self.llama.embed_tokens(ids)
 
     def forward(self, state: LayerState, hooks: LayerHooks | None = None) -> Decoded:
-        """Run all layers on ``state.hidden``; what ``state.alive`` leaves out takes no part.
+        """Run all layers on ``state.hidden``, without the tokens that ``state.alive`` excludes.
 
         Args:
             state: the whole sequence.
@@ -110,7 +110,7 @@ class BidirectionalLlama(nn.Module):
 
 
 def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
-    """Gather the ``alive`` tokens, bool [B, S], at the front of each row, in order, and cut off what no row needs.
+    """Move the ``alive`` tokens, bool [B, S], to the front of each row, in order, and truncate to the longest row.
 
     Returns:
         The shorter sequence, and what its attention may see: bool [B, 1, 1, S'], or None for everything. A sequence that is
@@ -131,7 +131,7 @@ def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
 
 
 def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Tensor:
-    """Return the attention of some rows to all tokens, mean over heads: f32 [B, R, S], R the most rows that a sample has.
+    """Return the attention of selected rows to all tokens, mean over heads: f32 [B, R, S], R the most rows of a sample.
 
     Args:
         query, key: [B, heads, S, head_dim].

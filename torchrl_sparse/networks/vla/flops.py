@@ -1,4 +1,4 @@
-"""Floating-point operations of a vision-language-action model: 2 * MAC of all matrix products, from its sizes.
+"""FLOPs of a vision-language-action model from its sizes: 2 * MAC of all matrix products.
 
 Counted are linear layers, patch embeddings and both products of attention (each of the S tokens with each, since nothing is
 causal); not counted are norms, activations, softmax, additions and the lookup of embeddings. The decoder has no vocabulary
@@ -38,12 +38,12 @@ def decoder_flops(config: VLAConfig, tokens: Tensor) -> Tensor:
 
 
 def score_flops(config: VLAConfig, pairs: Tensor) -> Tensor:
-    """Return the FLOPs of scoring ``pairs`` (row, token) pairs, counted over all scored layers."""
+    """Return the FLOPs of scoring ``pairs`` (row, token) pairs, summed over all scored layers."""
     return 2.0 * config.llm.dim * pairs.double()
 
 
 def fixed_flops(config: VLAConfig) -> dict[str, float]:
-    """Return the FLOPs of everything whose work no token pruning changes, by component.
+    """Return the FLOPs that token pruning does not change, by component.
 
     Examples:
         >>> {name: round(value / 1e12, 3) for name, value in fixed_flops(VLAConfig()).items()}
@@ -63,7 +63,7 @@ def fixed_flops(config: VLAConfig) -> dict[str, float]:
 
 
 def query_flops(config: VLAConfig, tokens: Tensor, scored: Tensor) -> Tensor:
-    """Return the FLOPs f32 [B] of whole policy calls, the scores that hooks ask for included.
+    """Return the FLOPs f32 [B] of whole policy calls, including the attention scores that hooks request.
 
     Args:
         config: sizes.

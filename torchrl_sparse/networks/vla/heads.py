@@ -1,4 +1,4 @@
-"""The additions of OpenVLA-OFT to OpenVLA (arXiv:2502.19645): a proprioception token and an L1 regression head for chunks."""
+"""OpenVLA-OFT's additions to OpenVLA (arXiv:2502.19645): a proprioception token and an L1 regression head for chunks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["L1ActionHead", "ProprioProjector"]
 
 
 class ProprioProjector(nn.Module):
-    """Projects the normalised state to one token of the decoder."""
+    """Projector of the normalised state to one decoder token."""
 
     def __init__(self, config: VLAConfig):
         super().__init__()
@@ -24,7 +24,7 @@ class ProprioProjector(nn.Module):
 
 
 class L1ActionHead(nn.Module):
-    """Regresses normalised actions from the decoder's read-outs, with one residual network for all actions of the chunk.
+    """Regressor of normalised actions from decoder outputs: one residual network for all actions of the chunk.
 
     The A read-outs of an action are concatenated.
     """
@@ -42,7 +42,7 @@ class L1ActionHead(nn.Module):
         self.fc2 = nn.Linear(width, config.action_dim)
 
     def forward(self, readout: Tensor) -> Tensor:
-        """Return the actions [B, H, A] of read-outs [B, H * A, llm.dim]."""
+        """Return the actions [B, H, A] for decoder outputs [B, H * A, llm.dim]."""
         x = readout.reshape(len(readout), self.chunk_size, -1)
         x = functional.relu(self.fc1(self.layer_norm1(x)))
         for block in self.blocks:

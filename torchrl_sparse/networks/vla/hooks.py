@@ -1,4 +1,4 @@
-"""The interface between a vision-language-action model's decoder and a method that reads or prunes its tokens.
+"""The interface between a vision-language-action model's decoder and methods that read or prune its tokens.
 
 The decoder calls one `LayerHooks` object around every layer::
 
@@ -29,7 +29,7 @@ __all__ = ["LayerHooks", "LayerState", "TokenKind", "VisualSpec"]
 
 
 class TokenKind(IntEnum):
-    """Kinds of tokens in the decoder's sequence, in its order (methods of OpenVLA-OFT, arXiv:2502.19645)."""
+    """Token types of the decoder's sequence, in order (methods of OpenVLA-OFT, arXiv:2502.19645)."""
 
     BOS = 0
     PRIMARY = 1
@@ -42,7 +42,7 @@ class TokenKind(IntEnum):
 
 @dataclass(frozen=True)
 class VisualSpec:
-    """The sizes of a model that decide which visual tokens there are.
+    """Sizes of a model that determine its visual tokens.
 
     Attributes:
         num_layers: decoder layers L.
@@ -81,7 +81,7 @@ class VisualSpec:
 
 @dataclass
 class LayerState:
-    """The decoder's sequence around one layer; S is its present length, N the number of visual tokens before any pruning.
+    """The decoder's sequence around one layer; S is its current length, N the number of visual tokens before any pruning.
 
     `LayerHooks.score_rows` is given the input of the layer, `LayerHooks.after_layer` its output.
 
@@ -124,43 +124,43 @@ class LayerState:
 
     @property
     def visual_alive(self) -> Tensor:
-        """bool [B, N]: visual tokens that are still there."""
+        """bool [B, N]: visual tokens that have not been dropped."""
         ids = torch.where(self.is_visual, self.visual_ids, self.num_visual)
         alive = ids.new_zeros(ids.shape[0], self.num_visual + 1, dtype=torch.bool)
         return alive.scatter(1, ids, True)[:, :-1]
 
     @property
     def visual_features(self) -> Tensor:
-        """[B, N, d]: the residual stream at each visual token; 0 for those that are gone."""
+        """[B, N, d]: the residual stream at each visual token; 0 for dropped ones."""
         ids = torch.where(self.is_visual, self.visual_ids, self.num_visual)[..., None]
         width = self.hidden.shape[-1]
         features = self.hidden.new_zeros(len(ids), self.num_visual + 1, width)
         return features.scatter(1, ids.expand(-1, -1, width), self.hidden)[:, :-1]
 
     def keep_visual(self, keep: Tensor) -> Tensor:
-        """Return the answer of `LayerHooks.after_layer`, bool [B, S], that keeps the visual tokens in ``keep``, bool [B, N]."""
+        """Return a keep mask for `LayerHooks.after_layer`, bool [B, S], from visual tokens ``keep``, bool [B, N]."""
         ids = self.visual_ids.clamp(0, self.num_visual - 1)
         return keep.gather(1, ids) | ~self.is_visual
 
 
 class LayerHooks:
-    """Base of the objects that the decoder calls around its layers; this one changes nothing, which is the dense model."""
+    """Base of objects that the decoder calls around its layers; the base changes nothing, so the model stays dense."""
 
     def layers_scored(self, num_layers: int) -> set[int]:
-        """Return the decoder layers that compute ``state.scores``; each costs a softmax of the chosen rows over all tokens."""
+        """Return the decoder layers that compute ``state.scores``; each costs a softmax of the scored rows over all tokens."""
         return set()
 
     def layers_skipped(self, num_layers: int) -> set[int]:
-        """Return the decoder layers that are not run at all, as the identity; `after_layer` is not called for them."""
+        """Return the decoder layers replaced by the identity; `after_layer` is not called for them."""
         return set()
 
     def before_layers(self, state: LayerState) -> None:
-        """Take note of the sequence before the first layer, whose ``hidden`` are the embeddings."""
+        """Inspect the sequence before the first layer; ``hidden`` holds the embeddings."""
 
     def score_rows(self, state: LayerState) -> Tensor:
-        """Return the tokens whose attention is the score in this layer, bool [B, S]; here the instruction's words."""
+        """Return the tokens whose attention is scored in this layer, bool [B, S]; by default the instruction's words."""
         return state.task
 
     def after_layer(self, index: int, state: LayerState) -> Tensor | None:
-        """Return the tokens that stay, bool [B, S], or None to keep all. Only visual tokens can be dropped."""
+        """Return the tokens to keep, bool [B, S], or None to keep all. Only visual tokens can be dropped."""
         return None

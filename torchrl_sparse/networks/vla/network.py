@@ -1,4 +1,4 @@
-"""The network of OpenVLA-OFT (arXiv:2502.19645): images, state and prompt in, a normalised action chunk out, in one pass.
+"""The network of OpenVLA-OFT (arXiv:2502.19645): images, state and prompt to a normalised action chunk, in one pass.
 
 Sequence: ``BOS | primary patches | wrist patches | proprio | prompt | action slots | stop``. The embedding of a slot is zero,
 only its position tells it from the others. As in next-token prediction, a slot is read out from the token *before* it: the
@@ -26,7 +26,7 @@ __all__ = ["VLANetwork", "make_network", "network_of"]
 
 
 class VLANetwork(nn.Module):
-    """Images, state and prompts to a chunk of normalised actions.
+    """Network from images, state and prompts to a chunk of normalised actions.
 
     Args:
         config: its sizes.
@@ -115,7 +115,7 @@ class VLANetwork(nn.Module):
         return kinds.repeat_interleave(repeats)
 
     def readout(self, decoded: Decoded) -> Tensor:
-        """Return the hidden states that actions are read from, [B, H * A, d].
+        """Return the hidden states from which actions are regressed, [B, H * A, d].
 
         A row ends with last prompt token, slots, stop; all of these but the last two are read.
         """
@@ -128,7 +128,7 @@ class VLANetwork(nn.Module):
 def make_network(
     config: VLAConfig, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> VLANetwork:
-    """Make an untrained network with its weights as ``dtype`` on ``device``: the published size takes no room elsewhere.
+    """Make an untrained network with weights of ``dtype`` directly on ``device``, without a copy elsewhere.
 
     >>> make_network(VLAConfig.tiny(), dtype=torch.bfloat16).head.fc2.weight.dtype
     torch.bfloat16
@@ -138,7 +138,7 @@ def make_network(
 
 
 def network_of(config: VLAConfig, weights: Mapping[str, Tensor]) -> VLANetwork:
-    """Make a network, in evaluation mode, whose weights are these very tensors: none is drawn first, and none copied.
+    """Make a network in evaluation mode that uses these tensors as its weights, without initialising or copying any.
 
     Args:
         config: its sizes.

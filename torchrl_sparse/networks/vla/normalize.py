@@ -19,7 +19,7 @@ _RARE = 100
 
 
 class QuantileNormalizer(nn.Module):
-    """Maps the range between the 1 % and the 99 % quantile to [-1, 1], per dimension.
+    """Normaliser that maps the range from the 1 % to the 99 % quantile to [-1, 1], per dimension.
 
     Both are clipped to [-1, 1]. Gripper dimensions have no range: the policy says how open the gripper shall be, from 0
     (closed) to 1, the environment takes -1 (open) or 1 (close). What varies by less than 1e-4 is centred and not stretched, as
@@ -60,7 +60,7 @@ class QuantileNormalizer(nn.Module):
 
     @classmethod
     def identity(cls, state_dim: int, action_dim: int) -> QuantileNormalizer:
-        """Return a normaliser that leaves actions as they are, and states between -1 and 1."""
+        """Return a normaliser that leaves actions, and states between -1 and 1, unchanged."""
         state, action = torch.ones(state_dim), torch.ones(action_dim)
         return cls(-state, state, -action, action, torch.zeros(action_dim, dtype=torch.bool))
 
@@ -95,7 +95,7 @@ class QuantileNormalizer(nn.Module):
         return torch.where(self.gripper, (1 - action) / 2, unit.clamp(-1, 1))
 
     def unnormalize_action(self, action: Tensor) -> Tensor:
-        """Map actions [..., A] of the policy to environment units; grippers become -1 or 1, 0 exactly between."""
+        """Map actions [..., A] from the policy's to environment units; grippers become -1 or 1, 0 exactly between."""
         real = (action + 1) / 2 * (self.action_high - self.action_low + _EPS) + self.action_low
         return torch.where(self.gripper, (1 - 2 * action).sign(), real)
 

@@ -43,7 +43,7 @@ class Prompts:
 
 
 class InstructionTokenizer(Protocol):
-    """Turns instructions into prompts. ``vocab_size`` is the number of ids that it may use."""
+    """Tokenizer from instructions to prompts. ``vocab_size`` is the number of ids that it may use."""
 
     vocab_size: int
 
@@ -51,11 +51,11 @@ class InstructionTokenizer(Protocol):
         """Return the prompts of a batch of instructions."""
 
     def to_config(self) -> dict[str, Any]:
-        """Return JSON values that `tokenizer_from_config` reads."""
+        """Return JSON values for `tokenizer_from_config`."""
 
 
 class WordTokenizer:
-    """A small tokenizer: one id for each known word, the bytes of any other; spaces between words are not encoded.
+    """Small tokenizer: one id per known word, bytes for any other word; spaces between words are not encoded.
 
     Args:
         words: the known words; those of the prompt are known anyway.
@@ -87,12 +87,12 @@ class WordTokenizer:
         return ids
 
     def to_config(self) -> dict[str, Any]:
-        """Return JSON values that `tokenizer_from_config` reads."""
+        """Return JSON values for `tokenizer_from_config`."""
         return {"kind": "words", "words": self.words}
 
 
 class LlamaTokenizer:
-    """The tokenizer of a language model, by default the published one, from the text of its ``tokenizer.json``: data only.
+    """Tokenizer of a language model, by default the published one, from the text of its ``tokenizer.json``: data only.
 
     Args:
         definition: the text.
@@ -151,13 +151,13 @@ class LlamaTokenizer:
         return _pad(rows, spans)
 
     def to_config(self) -> dict[str, Any]:
-        """Return JSON values that `tokenizer_from_config` reads."""
+        """Return JSON values for `tokenizer_from_config`."""
         config = {"kind": "llama", "definition": json.loads(self.definition)}
         return config if self.closing == _EMPTY_WORD_ID else {**config, "closing": self.closing}
 
 
 def tokenizer_from_config(config: Any) -> InstructionTokenizer:
-    """Make the tokenizer whose ``to_config`` gave ``config``.
+    """Make a tokenizer from the ``config`` of its ``to_config``.
 
     Raises:
         InputError: if it is none.

@@ -1,4 +1,4 @@
-"""From images to visual tokens: the patch features of two towers, concatenated and projected (Prismatic, arXiv:2402.07865)."""
+"""Vision towers: patch features of two encoders, concatenated and projected to visual tokens (Prismatic, arXiv:2402.07865)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def center_crop(images: Tensor, area: float) -> Tensor:
-    """Crop each image to its central ``area`` (a share) and scale it back, bilinearly and rounded, to the full size.
+    """Crop each image to its central ``area`` (a share) and resize it to the full size, bilinearly, with rounding.
 
     Args:
         images: u8 [B, 3, h, w].
@@ -36,7 +36,7 @@ def center_crop(images: Tensor, area: float) -> Tensor:
 
 
 class VisionTowers(nn.Module):
-    """Computes patch features of DINOv2 (with registers) and SigLIP, each of its second-to-last layer and without a final norm.
+    """Patch encoder of DINOv2 (with registers) and SigLIP, each from its second-to-last layer without a final norm.
 
     The last layer is not built, since nothing reads it.
     """
@@ -84,7 +84,7 @@ class VisionTowers(nn.Module):
 
 
 class FusedProjector(nn.Module):
-    """Projects patch features to the decoder's width: three linear layers with GELU between them."""
+    """Projector of patch features to the decoder's width: three linear layers with GELU between them."""
 
     def __init__(self, config: VLAConfig):
         super().__init__()

@@ -1,4 +1,4 @@
-"""The engine that runs compiled C++ on a CPU."""
+"""The native engine: compiled C++ on a CPU."""
 
 import lazy_loader as lazy
 

@@ -57,7 +57,7 @@ def pack_panels(weight: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def quantise(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Round each column of a matrix to 8 bits by itself: ``weight`` [columns, rows] is about ``scale[:, None] * integers``.
+    """Round each column of a matrix to 8 bits separately: ``weight`` [columns, rows] is about ``scale[:, None] * integers``.
 
     Returns:
         integers, -127 to 127, in the type of ``weight``, and scale [columns].
@@ -83,7 +83,7 @@ def padded(tensor: Tensor, multiple: int, dim: int) -> Tensor:
 
 
 class Arena:
-    """Memory for constants, in large pages where the system has them: streamed weights then cost few address look-ups."""
+    """Memory for constants, in huge pages where the system has them, so that streaming weights causes few TLB misses."""
 
     _BLOCK = 32 << 20
 
@@ -92,7 +92,7 @@ class Arena:
         self._used = self._size = 0
 
     def keep(self, tensor: Tensor) -> int:
-        """Copy ``tensor`` and return the address of the copy, on a cache line."""
+        """Copy ``tensor`` and return the address of the copy, aligned to a cache line."""
         tensor = tensor.contiguous().view(-1).view(torch.uint8)
         if self._used + tensor.numel() > self._size:
             self._size = max(self._BLOCK, tensor.numel())
@@ -107,11 +107,11 @@ class Arena:
         return self.keep(tensor.float())
 
     def columns(self, tensor: Tensor) -> int:
-        """Copy ``tensor`` [..., d] as f32, with whole panels of columns, and return the address of the copy."""
+        """Copy ``tensor`` [..., d] as f32, padded to whole panels of columns, and return the address of the copy."""
         return self.floats(padded(tensor, PANEL, dim=-1))
 
     def matrix(self, weight: Tensor, bias: Tensor, dtype: torch.dtype = torch.float32) -> Matrix:
-        """Pack a layer's ``weight`` [columns, rows] and ``bias`` [columns], or [n, columns] for n rows of a product."""
+        """Pack a layer's ``weight`` [columns, rows] and ``bias``: [columns], or [n, columns] for a product of n rows."""
         columns, rows = weight.shape
         bias = functional.pad(bias, (0, -columns % PANEL))
         integers = {}

@@ -37,7 +37,7 @@ MAX_THREADS = CONSTANTS["MAX_THREADS"]  # of a team, see team.h
 
 
 class NativeEngine:
-    """Runs policy calls in compiled code. Not differentiable.
+    """Engine that runs policy calls in compiled code. Not differentiable.
 
     The weights are packed when the first engine of a network is made, and again when the network's have changed (see
     :class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`); all engines of the network share them. A row of a batch is
@@ -154,7 +154,7 @@ class NativeEngine:
         return actions
 
     def condition(self, state: Tensor, scales: Units) -> Tensor | None:
-        """Return condition f32 [B, To, D] of states in the units of the environment, as PyTorch rounds it.
+        """Return the condition f32 [B, To, D] of states in environment units, rounded as PyTorch does.
 
         Args:
             state: f32 [B, To, D].
@@ -170,7 +170,7 @@ class NativeEngine:
         return cond if finite else None
 
     def ready(self, noise: Tensor, cond: Tensor) -> PackedNetwork:
-        """Return what :meth:`answer` reads of the network, as its weights are now.
+        """Return what :meth:`answer` needs from the network, with its current weights.
 
         Raises:
             InputError: if a policy call does not fit them, or naming a weight that cannot be packed.
@@ -189,7 +189,7 @@ class NativeEngine:
         chunks: Tensor,
         reuse: Reuse = "block",
     ) -> None:
-        """Write chunks in the units of the environment, as PyTorch rounds them, in one call.
+        """Write chunks in environment units, rounded as PyTorch does, in one native call.
 
         Args:
             packed: see :meth:`ready`.
@@ -217,7 +217,7 @@ class NativeEngine:
         return min(torch.get_num_threads(), max(rows, -(-self._network.n_emb // PANEL)), MAX_THREADS)
 
     def refresh(self) -> None:
-        """Pack the weights again in the next policy call."""
+        """Pack the weights again at the next policy call."""
         self._shared.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The memory that Python shares with compiled code, read from ``layout.h``, which C++ includes."""
+"""Memory layout shared by Python and C++, read from ``layout.h``, which C++ includes."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Header(ctypes.Structure):
 
 
 def layout_hash() -> int:
-    """Hash names, types, values and places as compiled code does (``structs.h``): FNV-1a of 64 bits."""
+    """Hash the names, types, values and offsets of the layout as compiled code does (``structs.h``): FNV-1a, 64 bits."""
     parts: list[str | int] = []
     for name, value in CONSTANTS.items():
         parts += name, value

@@ -1,4 +1,4 @@
-"""The compiled library of ``native.cpp``: where it is, and which of its instruction sets this CPU has.
+"""The compiled library of ``native.cpp``: where it is, and which of its instruction sets this CPU supports.
 
 It is built when the package is installed, as a plain shared library that knows nothing of Python or PyTorch, and is
 called through ctypes, which releases the interpreter's lock.
@@ -41,7 +41,7 @@ _SIGNATURES = {
 
 @lru_cache(maxsize=1)
 def library() -> ctypes.CDLL | str:
-    """Return the compiled library, or why there is none; then it also warns, once in a process."""
+    """Return the compiled library, or the reason why there is none; then also warn, once per process."""
     found = _load(Path(__file__).parent)
     if isinstance(found, str):
         warnings.warn(f"torchrl_sparse runs without its native engine: {found}", stacklevel=2)
@@ -50,7 +50,7 @@ def library() -> ctypes.CDLL | str:
 
 @lru_cache(maxsize=1)
 def loaded() -> ctypes.CDLL:
-    """Return the compiled library, which has to be there; RuntimeError, saying why, where it is not."""
+    """Return the compiled library; RuntimeError with the reason if there is none."""
     found = library()
     if isinstance(found, str):
         raise RuntimeError(f"native engine: {found}")
@@ -83,7 +83,7 @@ def _declare(found: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def native_available() -> tuple[bool, str]:
-    """Return whether the library was built, and the instruction sets that it can use here or what is missing.
+    """Return whether the library was built, and the instruction sets usable here or the reason why not.
 
     Examples:
         >>> available, reason = native_available()
@@ -97,7 +97,7 @@ def native_available() -> tuple[bool, str]:
 
 
 def instruction_level(instruction_set: str | None = None) -> int:
-    """Return the number by which the library knows an instruction set; by default the widest that this CPU has.
+    """Return the library's number of an instruction set; by default the widest that this CPU supports.
 
     Raises:
         InputError: if this CPU does not have it.

@@ -1,4 +1,4 @@
-"""The weights of a denoiser as the native engine reads them: folded, tabulated and packed.
+"""Weights of a denoiser in the native engine's form: folded, tabulated and packed.
 
 Everything here is exact algebra on the network of :mod:`torchrl_sparse.networks.diffusion.transformer`, done once and in
 float64, so that the only rounding it adds is that of the result. :mod:`torchrl_sparse.blocks.engine.folding` does it;
@@ -44,7 +44,7 @@ _HEAD = CONSTANTS["HEAD"]  # heads are padded to whole vectors
 
 
 class PackedWeights:
-    """The weights of a network as the native engine computes with them, whatever the sampler; owns their memory.
+    """A network's weights packed for the native engine, independent of the sampler; owns their memory.
 
     Args:
         network: the denoiser, on the CPU, with n_cond_layers = 0.
@@ -128,7 +128,7 @@ class PackedWeights:
 
 
 class PackedNetwork:
-    """A network and a sampler as the native engine computes with them; owns the memory that ``model`` points into.
+    """A network and a sampler packed for the native engine; owns the memory that ``model`` points into.
 
     Args:
         network: that was packed.
@@ -169,7 +169,7 @@ class PackedNetwork:
             )
 
     def check(self, **query: Tensor) -> None:
-        """Raise InputError unless ``noise``, ``cond`` and ``mask`` of a policy call have the sizes that were packed."""
+        """Raise InputError unless ``noise``, ``cond`` and ``mask`` of a policy call have the packed sizes."""
         for name, tensor in query.items():
             if tuple(tensor.shape[1:]) != self._sizes[name]:
                 raise InputError(
@@ -189,7 +189,7 @@ class PackedNetwork:
 
 
 def weight_type(name: str) -> torch.dtype:
-    """Return the type of weights of that name, or raise InputError if there is none."""
+    """Return the weight type of that name, or raise InputError if there is none."""
     if name not in _WEIGHTS:
         raise InputError(f"weights: expected one of {list(_WEIGHTS)}, got {name!r}")
     return getattr(torch, name)

@@ -1,5 +1,4 @@
-"""The MLP of a learned planner in the compiled code of ``pruner.h``: a product with all cells of a mask, and nothing
-kept between.
+"""The MLP of a learned planner in compiled code, ``pruner.h``: products with all cells of a mask, without state between calls.
 
 PyTorch takes four passes over an activation of [K * 3L, hidden]; here a dozen cells at a time stay in the L1 cache.
 """
@@ -25,7 +24,7 @@ MAX_HIDDEN = CONSTANTS["MAX_HIDDEN"]
 
 @dataclass(frozen=True)
 class PrunerWeights:
-    """An MLP over all blocks of all denoising steps, ``last(relu(middle(relu(fuse(obs(features)) + cells))))``.
+    """Weights of an MLP over all blocks of all denoising steps, ``last(relu(middle(relu(fuse(obs(features)) + cells))))``.
 
     Each layer is a pair of a weight [outputs, inputs] and a bias [outputs], f32 on the CPU.
 
@@ -44,7 +43,7 @@ class PrunerWeights:
 
 
 class NativePruner:
-    """Computes by how much the second logit, as of pruning, is preferred to the first, for every block. Not differentiable.
+    """The MLP of a learned planner in compiled code: each block's pruning logit minus its keeping logit. Not differentiable.
 
     The two linear layers before the sum over cells are one here, and of the last layer's two logits the difference. A
     row of a batch is computed exactly as it would be alone, on ``torch.get_num_threads()`` threads, whose number changes
@@ -96,7 +95,7 @@ class NativePruner:
         return self._arena.floats(functional.pad(tensor, (0, -tensor.shape[-1] % PANEL)))
 
     def logits(self, features: Tensor) -> Tensor:
-        """Return by how much pruning is preferred, f32 [B, K, 3L].
+        """Return each block's pruning logit minus its keeping logit, f32 [B, K, 3L].
 
         Args:
             features: flat observations, and rates if they are an input, f32 [B, F] on the CPU.
@@ -109,7 +108,7 @@ class NativePruner:
         return logits
 
     def masks(self, features: Tensor) -> Tensor:
-        """Return where pruning is preferred, bool [B, K, 3L], False in the first step; see :meth:`logits`."""
+        """Return the prune masks, bool [B, K, 3L]: positive :meth:`logits`, and False in the first step."""
         masks = torch.empty(len(features), *self._shape, dtype=torch.bool, device="cpu")
         self._run(features, None, masks.data_ptr())
         return masks

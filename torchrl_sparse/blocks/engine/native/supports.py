@@ -1,4 +1,4 @@
-"""What the native engine can run, and why it cannot run the rest."""
+"""The networks and machines that the native engine supports, and the reason for each refusal."""
 
 from __future__ import annotations
 

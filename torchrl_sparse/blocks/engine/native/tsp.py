@@ -1,4 +1,4 @@
-"""The file of an exported policy, ``tsp/1``: what ``tsp.cpp`` reads, written.
+"""Writer of exported policy files, ``tsp/1``, which ``tsp.cpp`` reads.
 
 A header of sizes, little-endian, and then arrays in a fixed order, whose lengths follow from these sizes. Each begins on a
 cache line, so that the file can be computed with where it lies. There is no offset in it.
@@ -29,7 +29,7 @@ _BOTH = {field[0] for field in Header._fields_} & {field[0] for field in Model._
 
 @dataclass(frozen=True)
 class ExportedPlan:
-    """What a policy call skips, in a form that needs no Python.
+    """The plan of a policy's calls, in a form that needs no Python.
 
     Attributes:
         slots: outputs that are kept, :func:`~torchrl_sparse.blocks.mask.num_buffers`.
@@ -44,7 +44,7 @@ class ExportedPlan:
     rate: float | None = None
 
     def fields(self) -> dict[str, float]:
-        """Return the header's fields of the plan."""
+        """Return the plan's fields of the file header."""
         if self.pruner is None:
             return {"slots": self.slots, "plan": CONSTANTS["DENSE" if self.mask is None else "MASK"]}
         found = self.pruner.packed
@@ -64,7 +64,7 @@ class ExportedPlan:
 def write_tsp(
     path: Path, network: PackedNetwork, normalizer: list[Tensor], plan: ExportedPlan, description: str
 ) -> None:
-    """Write a policy in one piece or not at all.
+    """Write an exported policy file completely or not at all.
 
     Args:
         path: of the file.

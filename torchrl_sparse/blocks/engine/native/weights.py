@@ -1,4 +1,4 @@
-"""The packed weights of a network, once for all engines that run it, and how a policy call notices that they have changed."""
+"""Packed weights shared by all engines of one network, and the check for weight changes at each policy call."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["NativeWatch", "SharedWeights"]
 
 
 class NativeWatch(WeightWatch):
-    """Reads the first values of each parameter in one call of compiled code."""
+    """Weight watch that reads the first values of each parameter in one native call."""
 
     def locate(self, samples: list[Tensor]) -> ctypes.Array:
         for sample in samples:
@@ -38,7 +38,7 @@ class NativeWatch(WeightWatch):
 
 
 class SharedWeights:
-    """The packed weights of one network in one type: engines of whatever sampler, plan and policy read the same memory.
+    """Packed weights of one network in one type, shared by engines of any sampler, plan and policy.
 
     So a network's methods beside each other need its weights in memory once, and do not drive each other's out of the caches.
     :meth:`of` gives the one of a network and a type.
@@ -52,12 +52,12 @@ class SharedWeights:
 
     @classmethod
     def of(cls, network: TransformerForDiffusion, dtype: torch.dtype) -> SharedWeights:
-        """Return what is shared of ``network``, for as long as that lives."""
+        """Return the shared weights of ``network``, which are kept for as long as the network lives."""
         types = cls._all.setdefault(network, {})
         return types.get(dtype) or types.setdefault(dtype, cls(network, dtype))
 
     def current(self) -> PackedWeights:
-        """Return the packed weights, packed again if the network has changed.
+        """Return the packed weights, packing them again if the network has changed.
 
         Raises:
             InputError: naming a weight that cannot be packed.
@@ -70,5 +70,5 @@ class SharedWeights:
         return packed
 
     def refresh(self) -> None:
-        """Pack the weights again in the next policy call of any engine."""
+        """Pack the weights again at the next policy call of any engine."""
         self._watch.refresh()

@@ -1,4 +1,4 @@
-"""The engine that runs PyTorch on any device."""
+"""The PyTorch engine, for any device."""
 
 import lazy_loader as lazy
 

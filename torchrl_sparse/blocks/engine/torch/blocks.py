@@ -1,4 +1,4 @@
-"""The three blocks as the PyTorch engine runs them: few large operations on prepared weights, no gradients.
+"""The three block types of the PyTorch engine: few large operations on prepared weights, no gradients.
 
 Tokens of a batch are rows, [B * H, d]. A block reads the centred residual stream ``x`` and returns what it adds to it
 (:mod:`torchrl_sparse.blocks.engine.torch.norms` says why). It works in the memory of a :class:`BlockScratch` and
@@ -19,7 +19,7 @@ __all__ = ["BlockScratch", "CrossAttention", "FeedForward", "SelfAttention"]
 
 
 class BlockScratch:
-    """Memory for the intermediate results of one block, shared by all of them.
+    """Scratch memory for one block's intermediate results, shared by all blocks.
 
     Args:
         network: the denoiser.
@@ -58,7 +58,7 @@ class BlockScratch:
         self.output = like.new_empty(rows, width)
 
     def normalise(self, x: Tensor) -> Tensor:
-        """Divide ``x`` [N * H, d] by its length, which is what is left of a layer norm."""
+        """Divide ``x`` [N * H, d] by its length: all that remains of a layer norm after folding."""
         torch.linalg.vector_norm(x, 2, -1, True, out=self._length)
         self._length.hypot_(self._smallest)
         return torch.div(x, self._length, out=self._direction)

@@ -1,4 +1,4 @@
-"""The PyTorch engine: the reference's results in a fraction of its time, on a CPU or a GPU.
+"""The PyTorch engine: the reference's results in a fraction of the time, on a CPU or a GPU.
 
 What does not change within a policy call is done before its loop: time tokens are encoded and folded once per
 network, observations once per query, cross-attention reads folded memory
@@ -35,7 +35,7 @@ __all__ = ["TorchEngine"]
 
 
 class TorchEngine:
-    """Runs programs in PyTorch. Not differentiable; safe to share between threads.
+    """Engine that runs programs in PyTorch. Not differentiable; safe to share between threads.
 
     The engine tabulates the network's weights, and does so again when it finds them changed
     (:class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`). Dropout is never applied, and ``torch.autocast`` changes
@@ -100,7 +100,7 @@ class TorchEngine:
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
     def refresh(self) -> None:
-        """Tabulate the weights again in the next policy call."""
+        """Tabulate the weights again at the next policy call."""
         self._watch.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Folding memory tokens within a policy call, in memory that was allocated before it.
+"""Folding of memory tokens within a policy call, in preallocated memory.
 
 :func:`~torchrl_sparse.blocks.engine.folding.fold_tokens` says what is computed; here it is a few large products.
 """
@@ -17,7 +17,7 @@ __all__ = ["FoldScratch", "TokenFold"]
 
 
 class FoldScratch:
-    """The memory that folding N tokens takes, and its result; made by :meth:`TokenFold.scratch`.
+    """Scratch memory and result of folding N tokens; made by :meth:`TokenFold.scratch`.
 
     Args:
         num_tokens: N.
@@ -42,7 +42,7 @@ class FoldScratch:
 
 
 class TokenFold:
-    """Folds memory tokens into keys and values of width d.
+    """Function that folds memory tokens into keys and values of width d.
 
     Args:
         layers: of the denoiser, folded.
@@ -63,7 +63,7 @@ class TokenFold:
         self._project = make_linear(weight, stacked(layer.key_value.bias for layer in layers).flatten())
 
     def scratch(self, num_tokens: int) -> FoldScratch:
-        """Allocate memory to fold ``num_tokens`` tokens in."""
+        """Allocate the memory in which ``num_tokens`` tokens are folded."""
         return FoldScratch(num_tokens, self._sizes, self._like)
 
     def __call__(self, tokens: Tensor, scratch: FoldScratch) -> FoldedMemory:

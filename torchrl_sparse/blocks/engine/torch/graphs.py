@@ -1,4 +1,4 @@
-"""CUDA graphs of what the PyTorch engine plays."""
+"""CUDA graphs of the PyTorch engine's operations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CAPTURES = threading.Lock()
 
 
 class GraphCapture:
-    """Captures functions without arguments as CUDA graphs.
+    """Capturer of argument-free functions as CUDA graphs.
 
     They may launch what they like but read and write only memory that outlives the graph, and may not wait for the device.
     All graphs of one `GraphCapture` take their scratch memory from one pool: none leaves anything there for another, so
@@ -48,7 +48,7 @@ class GraphCapture:
 
 
 def padded_batch(rows: int) -> int:
-    """Round a number of rows up to a power of two: the rows that are due vary, and each size is captured again.
+    """Round a batch size up to a power of two: the number of due rows varies, and each size needs its own graph.
 
     >>> [padded_batch(rows) for rows in (1, 2, 3, 5, 8, 9)]
     [1, 2, 4, 8, 8, 16]

@@ -1,4 +1,4 @@
-"""Matrix products with fixed weights, as fast as PyTorch has them."""
+"""Matrix products with fixed weights, in PyTorch's fastest form."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Linear = Callable[[Tensor, Tensor], Tensor]
 
 
 def make_linear(weight: Tensor, bias: Tensor, gelu: bool = False) -> Linear:
-    """Prepare ``(x [N, in], out [N, out]) -> [N, out]``, with GELU behind it if asked for.
+    """Prepare ``(x [N, in], out [N, out]) -> [N, out]``, optionally followed by GELU.
 
     The general product puts its result into ``out``. But ten rows leave it at a half of the speed that the
     weights could be read with; oneDNN's product on weights that were laid out for it in advance (what
@@ -32,11 +32,11 @@ def make_linear(weight: Tensor, bias: Tensor, gelu: bool = False) -> Linear:
 
 
 def can_pack(weight: Tensor) -> bool:
-    """Return whether ``weight`` can be laid out for oneDNN: float32, on a CPU, in a PyTorch built with it."""
+    """Return whether ``weight`` can be packed for oneDNN: float32, on a CPU, in a PyTorch built with it."""
     available = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
     return available and weight.device.type == "cpu" and weight.dtype == torch.float32
 
 
 def transposed(weight: Tensor) -> Tensor:
-    """Copy the transpose, contiguously."""
+    """Return a contiguous copy of the transpose."""
     return weight.t().clone(memory_format=torch.contiguous_format)

@@ -1,4 +1,4 @@
-"""The denoising loop of the PyTorch engine, and the memory in which it runs.
+"""The denoising loop of the PyTorch engine, and its working memory.
 
 A loop is a sequence of *segments*, and a program says which come in which order: the block of a column, for all rows of
 a batch or for some, the predicted noise with the sampler's step, and a few single operations such as adding a run of
@@ -33,7 +33,7 @@ Segment = Callable[[], object]
 
 
 class Workspace:
-    """Everything that the policy calls of one batch size write to, allocated once; for one call at a time.
+    """Buffers for the policy calls of one batch size, allocated once; for one call at a time.
 
     Args:
         tables: of the network.
@@ -121,7 +121,7 @@ class Workspace:
         return self._sample.view(noise[:, 0].shape).clone()
 
     def walk(self, kind: int) -> None:
-        """Run, to be timed, the blocks of type ``kind`` (an index of ``BLOCK_TYPES``) of all layers."""
+        """Run the blocks of type ``kind`` (an index of ``BLOCK_TYPES``) of all layers, for timing."""
         for segment in self._compute[kind::_KINDS]:
             segment()
 

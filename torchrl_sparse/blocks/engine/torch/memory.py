@@ -1,4 +1,4 @@
-"""Folded memory tokens, which cross-attention reads in the same place in every denoising step."""
+"""Folded memory tokens, at the same address in every denoising step, for cross-attention."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Memory"]
 
 
 class Memory:
-    """Folded memory of the denoising step at hand, for every row of a batch.
+    """Folded memory of the current denoising step, for every row of a batch.
 
     Args:
         tables: of the network.
@@ -47,7 +47,7 @@ class Memory:
             self._scratch = tables.fold.scratch(batch * observations)
 
     def begin(self, cond: Tensor) -> None:
-        """Take the observations [B, To, D] of a policy call."""
+        """Set the observations [B, To, D] of a policy call."""
         encoder = self._tables.encoder
         if encoder.separable:
             tokens = encoder.observation_tokens(cond).flatten(0, 1)
@@ -56,7 +56,7 @@ class Memory:
             self._tokens.copy_(encoder.memory(cond).flatten(1, 2))
 
     def load(self, step: int) -> None:
-        """Make denoising step ``step`` the one at hand; without time tables, :meth:`fold` has to follow."""
+        """Make ``step`` the current denoising step; without time tables, :meth:`fold` has to follow."""
         if self._tables.time is None:
             self._present.copy_(self._tokens[step])
         else:
@@ -66,7 +66,7 @@ class Memory:
             self._time_bias.copy_(time.bias)
 
     def fold(self) -> None:
-        """Fold the tokens of the step at hand, which :meth:`load` put in their place."""
+        """Fold the tokens of the current step, which :meth:`load` has put in place."""
         self._put(slice(None), self._tables.fold(self._present, self._scratch))
 
     def _put(self, tokens: slice, folded: FoldedMemory) -> None:

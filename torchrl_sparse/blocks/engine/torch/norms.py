@@ -1,4 +1,4 @@
-"""Layer norms in the PyTorch engine: a division by a length is all that is left of them.
+"""Layer norms of the PyTorch engine, reduced by folding to a division by the vector's length.
 
 Nothing ever sees the mean of the residual stream, so what is added to it is centred beforehand, in the weights that make
 it. A norm is then ``x / sqrt(|x|^2 + d eps)`` and a factor sqrt(d), which goes into the weights behind it.
@@ -14,7 +14,7 @@ __all__ = ["after_length", "centred", "without_norms"]
 
 
 def without_norms(layer: FoldedLayer) -> FoldedLayer:
-    """Let a folded ``layer`` read the stream divided by its length, and add to it what is centred."""
+    """Rewrite a folded ``layer`` so that it reads the stream divided by its length, and adds centred outputs to it."""
     return FoldedLayer(
         qkv=after_length(layer.qkv),
         out=_centred(layer.out),
@@ -27,7 +27,7 @@ def without_norms(layer: FoldedLayer) -> FoldedLayer:
 
 
 def after_length(layer: Affine) -> Affine:
-    """Let a folded ``layer``, weight [..., d], read ``x / sqrt(|x|^2 + d eps)`` of a centred x instead of its norm.
+    """Rewrite a folded ``layer``, weight [..., d], to read ``x / sqrt(|x|^2 + d eps)`` of a centred x instead of its norm.
 
     >>> import torch
     >>> x = torch.tensor([1.0, -3.0, 0.0, 2.0])

@@ -1,4 +1,4 @@
-"""Workspaces of the PyTorch engine, kept for the policy calls to come."""
+"""Workspaces of the PyTorch engine, kept for later policy calls."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Capture = Callable[[Segment], Segment]
 
 
 class WorkspacePool:
-    """Workspaces that wait for their next policy call; a call that finds none gets a new one.
+    """Pool of idle workspaces; a policy call that finds none gets a new one.
 
     Args:
         tables: of the network.
@@ -39,12 +39,12 @@ class WorkspacePool:
 
     @property
     def captures(self) -> bool:
-        """True if segments are captured, so that batches have to be padded."""
+        """True if segments are captured as CUDA graphs, so that batches have to be padded."""
         return self.new_capture is not None
 
     @contextmanager
     def take(self, batch: int, slots: int, guided: bool = False) -> Iterator[Workspace]:
-        """Lend a workspace for ``batch`` rows and ``slots`` latest outputs, guided or not, for the caller alone."""
+        """Lend the caller exclusively a workspace for ``batch`` rows and ``slots`` latest outputs, guided or not."""
         # On a GPU the next policy call may be launched before the last one has run, but in the same order only in one stream.
         stream = (
             torch.cuda.current_stream(self._tables.device) if self._tables.device.type == "cuda" else None

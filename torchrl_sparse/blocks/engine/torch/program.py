@@ -1,4 +1,4 @@
-"""The programs of a batch as the PyTorch engine walks them."""
+"""The programs of a batch, as the PyTorch engine executes them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Operation = tuple[int, int, int, list[int] | Tensor | None]
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """The program of a batch.
+    """Combined program of a batch.
 
     Attributes:
         steps: for each denoising step its operations (operation, first, last, rows), see
@@ -38,7 +38,7 @@ class Loop:
 
 
 def build_loop(masks: np.ndarray, device: torch.device, gather: bool) -> Loop:
-    """Make the loop of the masks bool [B, K, 3L] of a batch, kept for the next batch with the same masks.
+    """Compile the masks bool [B, K, 3L] of a batch to a loop, cached for the next batch with the same masks.
 
     Args:
         masks: True = pruned.

@@ -1,4 +1,4 @@
-"""The tables of the PyTorch engine: all that follows from a network and a sampler alone."""
+"""The PyTorch engine's tables: everything that depends only on network and sampler."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SHARED_BUFFERS = tuple(num_buffers(reuse, num_blocks=0) for reuse in ("type", "
 
 
 class Tables:
-    """A snapshot of the network's weights, prepared, and of the sampler.
+    """A snapshot of the network's prepared weights and of the sampler.
 
     Args:
         network: the denoiser.
