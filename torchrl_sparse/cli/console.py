@@ -29,7 +29,10 @@ RECIPES = {
         *("accelerate", "calibrate_bac", "calibrate_timesteps", "calibrate_tokens"),
         "train_pruner",
     ),
-    "Evaluation": ("benchmark", "benchmark_vla", "realtime", "profile", "sweep", "report"),
+    "Evaluation": (
+        *("plan", "benchmark", "benchmark_vla", "realtime", "profile", "sweep"),
+        *("compare", "report"),
+    ),
 }
 """What one wants -> the recipes for it, all in the order in which they are used."""
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from unittest.mock import patch
 
 import hydra
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -35,6 +36,7 @@ def recipe(
     *,
     out: Literal["folder", "file"] | None = "folder",
     options: Mapping[str, Any] | None = None,
+    positional: str | None = None,
 ) -> Callable:
     """Turn a function of options into a program whose options are listed in ``name.yaml`` beside its file.
 
@@ -46,6 +48,7 @@ def recipe(
         name: of the recipe.
         out: what the option ``out`` names; None if the recipe has none, or locks it itself.
         options: option -> type, of options that no recipe of the library has, as a study's own.
+        positional: option, a list, that takes the words of the command line that are no options: paths.
     """
     table = OPTIONS | dict(options or {})
 
@@ -59,7 +62,7 @@ def recipe(
                 return
             gc.freeze()  # robosuite collects garbage whenever a simulator closes, and what was imported never is any
             with _one_line_errors():
-                for config in _read_options(folder, name):
+                for config in _read_options(folder, name, positional):
                     check_options(
                         name, OmegaConf.to_container(config, resolve=True, throw_on_missing=True), table
                     )
@@ -124,16 +127,36 @@ def _help(purpose: str, options: Path) -> str:
     return f"{purpose.strip()}\n\n{text.strip()}"
 
 
-def _read_options(folder: Path, name: str) -> list[DictConfig]:
+def _read_options(folder: Path, name: str, positional: str | None) -> list[DictConfig]:
     """Return the options of this command line: one set, or several of ``--multirun``."""
     read: list[DictConfig] = []
+    words = [*sys.argv] if positional is None else [sys.argv[0], *_name_paths(sys.argv[1:], positional)]
 
     def note(config: DictConfig) -> None:
         read.append(config)
 
-    with patch.dict(os.environ, {_FULL: "1"}):  # so that Hydra raises its errors instead of printing them
+    with (
+        patch.dict(os.environ, {_FULL: "1"}),
+        patch.object(sys, "argv", words),
+    ):  # so that Hydra raises its errors instead of printing them
         hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
     return read
+
+
+def _name_paths(words: Sequence[str], option: str) -> list[str]:
+    """Make of the words that are no options one option, a list of them; a path with an equals sign is one if it is there.
+
+    >>> _name_paths(["a.json", "margin=0.1", "b c.csv"], "files")
+    ['margin=0.1', "files=['a.json','b c.csv']"]
+    """
+    paths = [word for word in words if not word.startswith("-") and ("=" not in word or Path(word).exists())]
+    rest = [word for word in words if word not in paths]
+    if not paths:
+        return rest
+    if any(word.startswith(f"{option}=") for word in rest):
+        raise InputError(f"{option}: expected paths as words or as {option}=[…], got both")
+    quoted = (QuotedString(path, Quote.single).with_quotes() for path in paths)
+    return [*rest, f"{option}=[{','.join(quoted)}]"]
 
 
 @contextmanager

@@ -29,8 +29,7 @@ from torchrl_sparse.evaluation.results.schema import load_results
 from torchrl_sparse.evaluation.results.tables import LEFT, select_columns
 from torchrl_sparse.storage.atomic import atomic_path
 
-__all__ = ["find_runs", "write_report"]
-
+__all__ = ["Medium", "Run", "find_runs", "write_page", "write_report"]
 
 _DRAWN = {  # by the beginning of a file's name, what is drawn of it too: results.json, results_400.json
     "acceleration": (
@@ -149,21 +148,40 @@ def write_report(
         >>> 'src="http' in page.read_text()
         False
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     root, files = Path(root), find_runs(root)
     runs = [Run.read(file, str(file.relative_to(root))) for file in files]
     folders = {file.parent for file in files}
     media = {str(folder.relative_to(root.parent)): _media(folder, folders) for folder in sorted(folders)}
+    write_page(runs, path, title=title, folders={name: found for name, found in media.items() if found})
+    return {run.name: run.fault for run in runs if run.fault}
+
+
+def write_page(
+    runs: Sequence[Run],
+    path: str | os.PathLike,
+    *,
+    title: str,
+    folders: Mapping[str, Sequence[Medium]] | None = None,
+) -> Path:
+    """Write a page that needs nothing else; return its path.
+
+    Args:
+        runs: its sections.
+        path: of the HTML file.
+        title: of the page.
+        folders: name -> pictures and videos that are shown below all sections.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
     page = environment.get_template(_TEMPLATE).render(
-        title=title, runs=runs, folders={name: found for name, found in media.items() if found}, left=LEFT
+        title=title, runs=runs, folders=folders or {}, left=LEFT
     )
     with atomic_path(path) as temporary:
         temporary.write_text(page + "\n", encoding="utf-8")
-    return {run.name: run.fault for run in runs if run.fault}
+    return Path(path)
 
 
 def _media(folder: Path, folders: set[Path]) -> list[Medium]:

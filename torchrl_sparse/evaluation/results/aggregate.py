@@ -27,6 +27,7 @@ __all__ = [
     "AggregateResults",
     "aggregate_results",
     "aggregate_rows",
+    "counted_episodes",
     "load_aggregate",
     "num_verdicts",
 ]
@@ -104,7 +105,7 @@ def _entry(name: str, found: Mapping[Path, Results]) -> AggregateEntry:
 
 def _pairs(name: str, path: Path, results: Results) -> TaskPairs:
     n, stopping = results.methods[name].success.n, results.until_conclusive
-    ours, theirs = (_episodes(path, method, results.first_seed, n) for method in (name, DENSE))
+    ours, theirs = (counted_episodes(path, results, method, n) for method in (name, DENSE))
     pairs = pair_episodes(name, ours, DENSE, theirs)
     design = Design(stopping.max_episodes, stopping.analyses) if stopping else None
     return TaskPairs(pairs.solved, pairs.times(results.episode_horizon), results.episode_horizon, design)
@@ -114,8 +115,14 @@ def _margins(results: Results) -> tuple[float, float]:
     return results.dense.paired_vs_dense.margin, results.dense.time_vs_dense.margin
 
 
-def _episodes(path: Path, name: str, first: int, n: int) -> list[EpisodeResult]:
-    log = path.parent / "episodes" / f"{name}.jsonl"
+def counted_episodes(path: Path, results: Results, name: str, n: int) -> list[EpisodeResult]:
+    """Return the first ``n`` episodes that a ``results.json`` counts of a method, from the log beside it.
+
+    Raises:
+        FileNotFoundError: if there is no log.
+        ValueError: if the log lacks some of them.
+    """
+    first, log = results.first_seed, path.parent / "episodes" / f"{name}.jsonl"
     found = [episode for episode in read_episodes(log) if first <= episode.seed < first + n]
     if len(found) != n:
         raise InputError(

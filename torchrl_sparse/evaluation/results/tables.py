@@ -13,7 +13,7 @@ __all__ = ["LEFT", "markdown_table", "select_columns"]
 LEFT = frozenset(
     {
         *("task", "like", "method", "family", "against", "verdict", "time verdict", "budget"),
-        *("latency", "variant", "part of a dense policy call", "at 20 times dense's speed"),
+        *("latency", "variant", "design", "part of a dense policy call", "at 20 times dense's speed"),
     }
 )
 """Columns of words, which are aligned to the left; those of numbers are aligned to the right."""
