@@ -1,4 +1,4 @@
-"""The base of every method that prunes visual tokens, and the two ways to prune them.
+"""Base of all methods that prune visual tokens, and the two ways to prune them.
 
 * *Before the decoder.* Whoever runs earlier writes ``("tokens", "keep_mask")``, bool [*B, N], True = kept; a pruner may do so
   in `TokenPruner.begin`.
@@ -31,7 +31,7 @@ __all__ = ["TokenPruner"]
 
 
 class TokenPruner(LayerHooks):
-    """Base of everything that prunes visual tokens; this one keeps all. See the module for the order of calls.
+    """Base of all visual-token pruners; it keeps all tokens. See the module for the order of calls.
 
     Attributes:
         in_keys: what `begin` reads beside what the policy reads; keys that the environment lacks are left out.
@@ -58,14 +58,14 @@ class TokenPruner(LayerHooks):
     spec: VisualSpec
 
     def bind(self, spec: VisualSpec) -> None:
-        """Take note of the model that the pruner is assigned to: one that carries keys keeps it as ``self.spec``.
+        """Prepare for the model on assignment; pruners that carry keys keep its sizes as ``self.spec``.
 
         Raises:
             InputError: if the pruner does not fit it, for instance a budget larger than its tokens.
         """
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`; a pruner adds keys of its own.
+        """Return the spec of the keys carried for one environment, see :mod:`torchrl_sparse.carried`; pruners add their own.
 
         These are images and scores of the last policy call. What it leaves out follows any environment but a bare
         `ParallelEnv`.

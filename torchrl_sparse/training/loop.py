@@ -1,4 +1,4 @@
-"""The loop around a `Trainer`: steps until the end or a signal, with log, checkpoints and evaluations on the way."""
+"""The training loop of a `Trainer`: steps until the end or a signal, with logging, checkpoints and evaluations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def train(
     export: Callable[[], Path],
     evaluate: Callable[[], float | None] | None = None,
 ) -> None:
-    """Train until ``trainer.total`` or a signal to stop, from ``out/checkpoint.pt`` if it is there; save at the end.
+    """Train until ``trainer.total`` or a stop signal, resuming from ``out/checkpoint.pt`` if it exists; save at the end.
 
     A training that had ended is extended by one that asks for more steps, see `Trainer.load`.
 
