@@ -99,8 +99,8 @@ def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
     """Return whichever of +q and -q (xyzw), [..., 4], is nearer to the Panda's rest pose, (1, 1, 0, 0) / sqrt(2).
 
-    Both are the same rotation; at rest the gripper points down. Conventions that look at w flip where w crosses zero, which is
-    where a downward gripper lives, and a policy would see a jump where nothing moved.
+    Both are the same rotation; at rest the gripper points down. Conventions based on the sign of w flip where w crosses zero,
+    near a downward gripper, so a policy would see a jump without motion.
     """
     return np.where(quat[..., :1] + quat[..., 1:2] < 0, -quat, quat)
 

@@ -1,6 +1,6 @@
 """The robosuite version, from a policy's ``source``, that defines the meaning of its observations.
 
-What that means, and how one is had from the other, is in `torchrl_sparse.envs.conventions`.
+The conventions and the conversion between them are in `torchrl_sparse.envs.conventions`.
 """
 
 from __future__ import annotations

@@ -12,10 +12,9 @@
 **State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
 environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
 `begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
-in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a call,
-such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key, and `TokenPruner.carried` says what it looks
-like to an environment; it is missing or 0 at the first call of all, and
-rows with ``"is_init"`` start afresh.
+in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So state that outlives a call,
+such as ``("tokens", "score")`` or the previous frame, is both an out_key and an in_key, and `TokenPruner.carried` gives its
+spec to an environment; it is missing or 0 at the first call of all, and rows with ``"is_init"`` start afresh.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ def train(
 
     Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and, over those of
     them since the start or resumption, ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of
-    `Trainer.validate` and ``eval/success``. A CSV log has each step once: what it tells of steps after the checkpoint, which
-    are taken again, is removed first.
+    `Trainer.validate` and ``eval/success``. A CSV log has each step once: its lines on steps after the checkpoint, which are
+    run again, are removed first.
 
     Raises:
         InputError: if the checkpoint belongs to another training, see `Trainer.load`.
@@ -105,7 +105,7 @@ def _make_logger(settings: Mapping[str, Any]) -> Logger:
 
 
 def _forget_after(step: int, folder: Path) -> None:
-    """Remove from a CSV log what was logged after ``step``, and what a kill left of a line."""
+    """Remove from a CSV log the lines after ``step``, and a partial line left by a kill."""
     for path in folder.glob("scalars/**/*.csv"):
         lines = path.read_bytes().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith(b"\n") and _step_of(line, path) <= step]

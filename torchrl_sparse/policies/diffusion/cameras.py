@@ -30,7 +30,7 @@ class CameraSlot:
     ) -> Callable[[Mapping[str, Tensor]], Tensor]:
         """Return an encoder of ``frames`` images per camera, equal to ``vision`` up to rounding, bfloat16 included.
 
-        That is `pack_vision`'s copy of it, where no gradient can be asked for and nobody looks at its layers.
+        It is the copy from `pack_vision` if gradients are off and no hooks watch its layers.
         """
         watched = any(module._forward_hooks or module._forward_pre_hooks for module in vision.modules())
         if (

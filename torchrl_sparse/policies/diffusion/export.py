@@ -1,6 +1,7 @@
 """Export of a policy to one file that robots run through the C interface ``tsp.h``, without Python or PyTorch.
 
-It answers as the policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
+The file holds network, normaliser, sampler and planner. Its actions equal the policy's with ``noise = "philox"``, to the last
+bit on a CPU with the same instruction set.
 """
 
 from __future__ import annotations

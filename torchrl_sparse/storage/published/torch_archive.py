@@ -64,8 +64,8 @@ class StoredTensor:
 class TorchArchive:
     """An open ``torch.save`` file. Nothing in it is executed, and tensors are read one by one.
 
-    What it says of a tensor is compared with its record before anything is made of it, and all tensors that are read take
-    no more than a few times the room of the file.
+    A tensor's description is compared with its record before it is read, and all tensors that are read take at most a few times
+    the file's size.
 
     Args:
         path: the file.

@@ -29,8 +29,8 @@ def begun_policy(
 
     Args:
         path: see `DiffusionPolicy.from_pretrained`.
-        sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, which no weight
-            depends on, is changed to what is asked for.
+        sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, on which no weight
+            depends, is set to the requested value.
         state_mode, crop, width: as of `untrained_policy`; None for the policy's own.
 
     Raises:

@@ -17,9 +17,9 @@ __all__ = ["export_planner", "exported"]
 def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping[str, Any]) -> Path:
     """Write the planner from the training so far and return its path.
 
-    That is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
-    objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the
-    schedule of their mean mask, the ablation, beside it: ``fixed.json``.
+    The planner is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
+    objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the schedule
+    of their mean mask, the ablation, beside it: ``fixed.json``.
 
     Args:
         trainer: the gates, and what they were trained for.

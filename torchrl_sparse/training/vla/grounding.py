@@ -117,7 +117,7 @@ class Grounding(nn.Module):
     ) -> Tensor:
         """Return the L1 loss, a scalar, of a randomly chosen object's position, regressed from the action readout.
 
-        A part of `locate`'s is added, so that vision does not forget it before the decoder has learnt to use it.
+        Part of the loss of `locate` is added, so that vision keeps what it learnt until the decoder uses it.
         """
         asked = torch.randint(len(instructions), (len(positions),))
         words = NonTensorStack(*[instructions[index] for index in asked.tolist()])
