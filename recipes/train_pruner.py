@@ -73,7 +73,7 @@ def initial_schedules(config: DictConfig) -> list[str]:
 def calibration_set(policy: DiffusionPolicy, config: DictConfig) -> TensorDict:
     """Return calibration observations and target actions, from an earlier run's file if there is one.
 
-    Those of other settings are made again, or refused once something was trained on them.
+    A file with other settings is made again, or refused once gates were trained on it.
     """
     path = Path(config.out) / "targets.safetensors"
     made_for = {

@@ -1,8 +1,7 @@
 """Sparse, fast robot policies as TensorDictModules for TorchRL.
 
-Importing the package is light: each name is imported from its module when it is first used, so that what needs a
-simulator costs nothing to those who do not. As in every package here, ``__init__.pyi`` lists the names, for editors
-and for the import alike.
+Importing the package is light: each name is imported from its module on first use, so simulators are loaded only by the code
+that needs them. As in every package here, ``__init__.pyi`` lists the names, for editors and for the import alike.
 """
 
 import lazy_loader as lazy

@@ -147,7 +147,7 @@ def history_of(key: NestedKey) -> tuple[str, str]:
 
 
 def read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return the entry under ``key``; InputError if there is none.
+    """Return the entry under ``key``.
 
     Raises:
         KeyError: if there is none; the message names the key and those that are there.

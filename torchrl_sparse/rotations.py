@@ -20,12 +20,12 @@ ABSOLUTE_DIM = 10
 
 
 def matrix_to_rot6d(matrix: np.ndarray) -> np.ndarray:
-    """Convert [..., 3, 3] rotation matrices to [..., 6] first two rows."""
+    """Convert [..., 3, 3] rotation matrices to [..., 6], their first two rows."""
     return matrix[..., :2, :].reshape(*matrix.shape[:-2], 6)
 
 
 def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
-    """Convert [..., 6] to [..., 3, 3]: Gram-Schmidt makes any two independent rows a rotation.
+    """Convert [..., 6] to [..., 3, 3]: Gram-Schmidt turns any two independent rows into a rotation.
 
     Raises:
         InputError: if the last axis is not 6, or the two rows are parallel, zero or beyond measure.
@@ -39,7 +39,7 @@ def rot6d_to_matrix(rot6d: np.ndarray) -> np.ndarray:
 
 
 def fixes_rotation(rot6d: np.ndarray) -> bool:
-    """Return whether 6 numbers fix a rotation, which parallel rows do not.
+    """Return whether 6 numbers define a rotation; parallel rows do not.
 
     >>> fixes_rotation(np.array([1.0, 0, 0, 0, 1, 0])), fixes_rotation(np.ones(6))
     (True, False)
@@ -97,10 +97,10 @@ def absolute_to_pose(absolute: np.ndarray) -> np.ndarray:
 
 
 def downward_quaternion(quat: np.ndarray) -> np.ndarray:
-    """Return of each [..., 4] the one of +q and -q (xyzw) that is nearer to the Panda's rest, (1, 1, 0, 0) / sqrt(2).
+    """Return whichever of +q and -q (xyzw), [..., 4], is nearer to the Panda's rest pose, (1, 1, 0, 0) / sqrt(2).
 
-    Both are the same rotation; at rest the gripper points down. Conventions that look at w flip where w crosses zero, which is
-    where a downward gripper lives, and a policy would see a jump where nothing moved.
+    Both are the same rotation; at rest the gripper points down. Conventions based on the sign of w flip where w crosses zero,
+    near a downward gripper, so a policy would see a jump without motion.
     """
     return np.where(quat[..., :1] + quat[..., 1:2] < 0, -quat, quat)
 

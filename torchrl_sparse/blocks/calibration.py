@@ -1,7 +1,7 @@
 """Calibration: per-block statistics of dense policy calls, from which BAC derives its schedules.
 
-They tell how alike a block's outputs are between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much they
-vary in all. Few calls suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
+They measure the similarity of a block's outputs between denoising steps (BAC, arXiv:2506.13456, Fig. 1), and how much
+they vary in all. Few calls suffice: within a task the similarities hardly depend on the episode (its Fig. 7).
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def refuse_unread(config: DictConfig, names: Sequence[str], program: str, why: s
 
 
 def _help(purpose: str, options: Path) -> str:
-    """Return what a recipe is for, and its yaml with the comments, without what is Hydra's."""
+    """Return a recipe's description and its commented YAML without Hydra's own section."""
     text = options.read_text(encoding="utf-8").rpartition("- _self_")[2].partition("\nhydra:")[0]
     return f"{purpose.strip()}\n\n{text.strip()}"
 

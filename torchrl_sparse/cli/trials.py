@@ -56,7 +56,7 @@ def check_served(file: Path, settings: Mapping[str, Any], project: str) -> None:
 
 
 def _agent_changes(value: Any) -> bool:
-    """Tell whether W&B's agent, which writes a value as Python prints it, writes what Hydra reads as another."""
+    """Tell whether Hydra would misread a value as W&B's agent writes it, in Python's notation."""
     if isinstance(value, list):
         return any(isinstance(entry, (list, dict)) or entry is None for entry in value)
     return value is None or isinstance(value, dict) or (isinstance(value, str) and hydra_word(value) != value)

@@ -163,8 +163,8 @@ class ActionAwareController(TensorDictModuleBase):
     """Controller that switches each sample between coarse and fine, sets that mode's budget, and replans on entering fine.
 
     The controller of a `ChunkExecutor`: it runs at every step and writes ``("control", "fine")``, the budget, and
-    ``("control", "replan")``, which is True where fine mode begins, so that what is left of a chunk that was planned coarsely
-    is dropped. State is in keys, per sample, and starts again where ``"is_init"``.
+    ``("control", "replan")``, which is True where fine mode begins, so that the rest of a coarsely planned chunk is dropped.
+    State is in keys, per sample, and starts again where ``"is_init"``.
 
     Args:
         on: ``"measured"`` reads the hand's velocity, ``("observation", "eef_vel")``; ``"commanded"`` the action served last,

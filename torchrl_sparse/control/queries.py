@@ -52,7 +52,8 @@ def _queries(steps: TensorDictBase) -> TensorDictBase:
 def answer(policy: TensorDictModuleBase, queries: TensorDictBase) -> TensorDictBase:
     """Run ``policy`` on recorded policy calls, with the same observations and noise; ``queries`` is not modified.
 
-    All [N] at once, or in turn if it has to remember what it was asked before, see `in_turn`; a single one [] as the first.
+    All [N] run at once, or one after another if the policy carries keys between calls, see `in_turn`; a single one [] as the
+    first.
     """
     if not queries.ndim or not _unrecorded(policy, queries):
         return policy(queries.select(*policy.in_keys, strict=False))

@@ -10,8 +10,9 @@ Here it is kept as a running mean, so one chunk and a count are all that a call 
     mean_{k+1} = (W_k mean_k + w_k a_t^(k)) / W_{k+1},     W_k = sum_{i<k} w_i
 
 How often the policy is asked is the executor's (`ChunkExecutor.n_action_steps`): with chunks of n actions, asked every m steps,
-up to ceil(n / m) predictions meet. What is averaged is what the environment is given; a mean of rotations' first two columns is
-made orthonormal where the environment reads it. Predictions that disagree, such as two ways past an obstacle, are averaged too.
+up to ceil(n / m) predictions meet. The averaged actions are those that the environment gets; a mean of rotations' first two
+columns is made orthonormal where the environment reads it. Predictions that disagree, such as two ways past an obstacle, are
+averaged too.
 """
 
 from __future__ import annotations

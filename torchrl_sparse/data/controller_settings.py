@@ -1,9 +1,8 @@
 """Checks of a demonstration file's robot and controller settings, entry by entry.
 
-An entry is honoured, or it has a value under which steps and actions mean what they mean in this library's environments, or it
-cannot change that meaning. Any other is refused by its name. Entries are those of robosuite 1.2 to 1.5, in the form in
-which robomimic (arXiv:2108.03298) keeps them: up to 1.4 one flat dictionary, from 1.5 on a composite controller's
-``body_parts``.
+An entry is honoured, has the value that gives steps and actions their meaning in this library's environments, or cannot change
+that meaning. Any other is refused by its name. Entries are those of robosuite 1.2 to 1.5, in the form in which robomimic
+(arXiv:2108.03298) keeps them: up to 1.4 one flat dictionary, from 1.5 on a composite controller's ``body_parts``.
 """
 
 from __future__ import annotations

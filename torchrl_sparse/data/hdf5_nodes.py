@@ -1,6 +1,6 @@
 """Groups, arrays and attributes of HDF5 files that may be damaged.
 
-Whatever of a file this library reads, it reads here: what h5py raises becomes one line that says which file and which entry.
+Whatever of a file this library reads, it reads here: errors of h5py become one line that names the file and the entry.
 """
 
 from __future__ import annotations

@@ -199,8 +199,8 @@ def _read_through(room: Room, name: str, node: Node) -> None:
 
 
 class _Endless(io.RawIOBase):
-    """A file that does not tell where it ends: HDF5 refuses to open one that is shorter than it should be, and so could not
-    say what of it is whole."""
+    """A file that does not tell where it ends: HDF5 refuses to open a truncated file, and so could not say which part is
+    intact."""
 
     def __init__(self, raw: io.BufferedReader):
         self._raw, self._at = raw, 0

@@ -1,7 +1,7 @@
 """Lift one of five named cubes while an irrelevant ball circles them.
 
-What moves in the pictures is not what counts: a pruner that keeps the visual tokens that changed since the last policy call
-    keeps the
+The moving object in the images is irrelevant to the task: a pruner that keeps the visual tokens that changed since the last
+    policy call keeps the
 ball's. That tells it from one that also asks what the model attends to, which LiftNamed, where only the arm moves, does not.
 
 Importing this module registers ``"LiftCrowded"`` with robosuite; `make_simulator` does so.

@@ -1,6 +1,6 @@
 """An obstacle that may be passed on several equally good sides: a task with several modes by construction.
 
-It is not simulated: whoever takes the grip site into it has failed the episode. So a policy that averages over the ways of its
+The obstacle is not simulated: an episode fails once the grip site enters it. So a policy that averages over the ways of its
 demonstrations, which pass on all sides, goes into it; one that knows a single way succeeds, but its rollouts have less entropy
 than the demonstrations.
 """

@@ -37,8 +37,8 @@ _WOODEN = ("green", "blue")  # those of which robosuite has a texture
 class LiftNamed(Lift):
     """Lift with a red, a green and a blue cube, of which only the named one counts.
 
-    Everything that `Lift` says of "the cube" (success, reward, object state) is true of the named one. Which one that is
-    is drawn last at a reset, so the same seed gives the same scene whatever is asked for there.
+    Everything that `Lift` says of "the cube" (success, reward, object state) is true of the named one. The named cube is drawn
+    last at a reset, so a seed gives the same scene whatever the instruction.
     """
 
     colours: tuple[str, ...] = COLOURS

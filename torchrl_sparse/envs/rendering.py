@@ -36,7 +36,7 @@ class CameraRenderer:
         sim: robosuite's ``MjSim``.
         height, width: pixels.
         fast: no multisampling, shadows or reflections. Software rendering is about four times faster so; it changes how images
-            look, so train and evaluate with the same setting. What the camera cannot see is not drawn then, which spares about
+            look, so train and evaluate with the same setting. Geometry outside the view is then not drawn, which saves about
             half of the time and changes nothing.
 
     Raises:

@@ -191,7 +191,7 @@ def _only_errors(record: logging.LogRecord) -> bool:
 def cv2_or_stand_in() -> Iterator[None]:
     """Let simulators import a stand-in for cv2 where libGL is missing.
 
-    They need it for what is drawn on a screen, which nothing here does. The stand-in is gone when the block ends.
+    Simulators use cv2 only to draw on a screen, which nothing here does. The stand-in is gone when the block ends.
     """
     try:
         import cv2  # noqa: F401

@@ -56,7 +56,7 @@ def full_fingerprint(weights: str, units: bytes) -> str:
 def is_same_policy(noted: Any, asked: Any) -> bool:
     """Tell whether a file's noted fingerprint is ``asked``, or the older form of it.
 
-    Those name the weights alone: policies that differ in their normaliser alone are one to them.
+    Older fingerprints identify the weights alone: policies that differ only in their normaliser share one.
 
     >>> is_same_policy("0123456789abcdef", "0123456789abcdef-01234567"), is_same_policy("a", "a-b")
     (True, False)

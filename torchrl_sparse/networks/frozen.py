@@ -1,9 +1,8 @@
 """Write protection of weights: every PyTorch write raises, so that values derived from them stay valid without checks.
 
-Parameters and buffers get a class that refuses whatever writes in place, as does all that shares their memory, and the
-dictionaries in which modules hold them refuse others. What was taken of them before has none of their memory: they are moved.
-It still counts its writes together with them, so that these are found in the next policy call, where an error says what they
-missed.
+Parameters, buffers and all tensors that share their memory get a class that refuses in-place writes, and the dictionaries in
+which modules hold them refuse replacements. What was taken of them before has none of their memory: they are moved. It still
+counts its writes together with them, so that these are found in the next policy call, where an error says what they missed.
 
 Not refused is what goes around PyTorch: a storage's bytes, and addresses handed to other languages.
 """
@@ -195,7 +194,7 @@ def _stays(tensor: Tensor, data: Tensor) -> bool:
 
 
 def _guarded(result: Any, held: list[Tensor]) -> Any:
-    """Return what a function gave, such that nothing can be written through it to what was ``held`` by its arguments."""
+    """Return a function's result such that no write through it can reach the tensors ``held`` by its arguments."""
     if isinstance(result, np.ndarray):
         result.flags.writeable = False
     elif isinstance(result, tuple | list) and any(isinstance(part, Tensor) for part in result):

@@ -1,4 +1,4 @@
-"""Policies: a network, a plan and an engine composed as TensorDict modules."""
+"""Policies: TensorDict modules composed of a network, a plan and an engine."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""The process: threads, a clock, backends for workers, progress bars and signals to stop."""
+"""Process utilities: threads, clock, worker backends, progress bars and stop signals."""
 
 import lazy_loader as lazy
 

@@ -17,11 +17,11 @@ _BACKENDS = ("process", "ray")
 
 
 class WorkerDied(RuntimeError):
-    """A worker was ended from outside, or did not start: what it had under way can be done again."""
+    """Error for a worker that was killed or did not start; its unfinished work can be repeated."""
 
 
 def check_backend(backend: str, workers: int) -> None:
-    """Raise InputError for an unknown backend or no worker."""
+    """Raise InputError for an unknown backend or fewer than one worker."""
     if backend not in _BACKENDS:
         raise InputError(f"backend: expected one of {', '.join(_BACKENDS)}, got {backend!r}")
     if workers < 1:
@@ -29,7 +29,7 @@ def check_backend(backend: str, workers: int) -> None:
 
 
 def backend_runtime(backend: str, workers: int) -> AbstractContextManager[None]:
-    """Return a context in which ``workers`` can run: nothing for processes, a cluster for Ray.
+    """Return a context for ``workers``: nothing for processes, a cluster for Ray.
 
     A cluster that this process is connected to, or that the variable ``RAY_ADDRESS`` names ("auto" for one that ``ray start``
     made on this machine), is used and left running. Otherwise a local one of ``workers`` CPUs lives as long as the block.
@@ -66,7 +66,7 @@ def _ray_runtime(workers: int) -> Iterator[None]:
 
 
 def ray_death(error: BaseException) -> str:
-    """Say which Ray worker died; empty if ``error`` says something else, such as what a worker's own work raised."""
+    """Say which Ray worker died; empty if ``error`` has another cause, such as an exception in a worker's task."""
     errors = _import_ray().exceptions
     deaths = (
         errors.RayActorError,

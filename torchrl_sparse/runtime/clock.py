@@ -1,4 +1,4 @@
-"""A clock that waits for the device."""
+"""A clock that synchronises with the device."""
 
 import time
 
@@ -8,7 +8,7 @@ __all__ = ["synchronised_clock"]
 
 
 def synchronised_clock(device: torch.device) -> float:
-    """Return seconds of a monotonic clock, once everything that was queued on ``device`` is done.
+    """Return seconds of a monotonic clock, after all work queued on ``device`` is done.
 
     >>> start = synchronised_clock(torch.device("cpu"))
     >>> synchronised_clock(torch.device("cpu")) >= start

@@ -1,4 +1,4 @@
-"""Devices by name."""
+"""Device names and their check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["check_device"]
 
 
 def check_device(name: str) -> str:
-    """Return the name of a device that this machine and PyTorch have.
+    """Return the device name if this machine and PyTorch have the device; otherwise raise InputError.
 
     Raises:
         InputError: if it has none of that name.

@@ -1,4 +1,4 @@
-"""Name the file and the volume of a disk that is full."""
+"""Errors for a full disk that name the file and its volume."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ _ROOM = 1 << 20  # bytes; a writer that reports a full disk as something else le
 
 @contextmanager
 def naming_full_disk(path: str | os.PathLike) -> Iterator[None]:
-    """Raise what a block raises because the disk is full as an OSError that names the file and the volume it lies on.
+    """Turn a full-disk error in the block into an OSError that names the file and its volume.
 
     >>> with naming_full_disk("log.csv"):
     ...     raise OSError(errno.ENOSPC, "No space left on device")  # doctest: +ELLIPSIS

@@ -1,4 +1,4 @@
-"""The error of a run that ends without a bug: a recipe says it in one line, any other `RuntimeError` keeps its traceback."""
+"""Error of a run that ends without a bug: recipes print it in one line; other errors keep their traceback."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ __all__ = ["RunFailed"]
 
 
 class RunFailed(RuntimeError):
-    """A run cannot go on, by no fault of this library's: no GL, an expert that fails, workers that die again and again.
+    """Error for a run that cannot continue through no fault of the library: no GL, a failing expert, workers that keep dying.
 
     >>> isinstance(RunFailed("the expert fails"), RuntimeError)
     True

@@ -1,4 +1,4 @@
-"""Stopping long work at a signal, cleanly."""
+"""Clean stops of long work on a signal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["StopSignal"]
 
 
 class StopSignal:
-    """Note SIGINT and SIGTERM within a ``with`` block, so that the work in progress can be finished and saved.
+    """Context that records SIGINT and SIGTERM, so that the work in progress can be finished and saved.
 
     After the first signal, and at the end of the block, the handlers from before the block are back: a second signal ends
     the program as usual.

@@ -1,4 +1,4 @@
-"""One process at a time on one output."""
+"""Lock that allows one process at a time per output folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["lock_output"]
 
 @contextmanager
 def lock_output(out: str | os.PathLike, *, is_file: bool = False) -> Iterator[int]:
-    """Keep other processes away from ``out`` while the block lasts.
+    """Lock ``out`` against other processes during the block.
 
     The lock lies in the folder or, of a file, beside it, and goes with the block, as do folders that it made and nobody filled.
     One whose process has died holds nobody up, unless a process that inherited it still runs: that one is waited for.

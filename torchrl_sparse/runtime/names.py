@@ -1,4 +1,4 @@
-"""What somebody who misspelt a name may have meant."""
+"""Suggestions for misspelt names."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ __all__ = ["closest", "did_you_mean"]
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that is most like ``name``; None if none is close."""
+    """Return the known name most similar to ``name``; None if none is close."""
     close = get_close_matches(name, [*known], n=1)
     return close[0] if close else None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return ``", did you mean ...?"`` for the end of an error, or nothing if no known name is close.
+    """Return ``", did you mean ...?"`` for the end of an error message; empty if no known name is close.
 
     >>> did_you_mean("benchmrak", ["benchmark", "report"]), did_you_mean("magic", ["benchmark", "report"])
     (', did you mean benchmark?', '')

@@ -1,4 +1,4 @@
-"""Progress bars for work that reports how far it is."""
+"""Progress bars for work that reports its progress."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ __all__ = ["progress"]
 
 @contextmanager
 def progress(description: str, unit: str, total: int | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar and yield the function ``(done, total)`` that moves it.
+    """Show a bar and yield the function ``(done, total)`` that updates it.
 
     >>> with progress("timing", "round") as show:
     ...     show(1, 2)

@@ -1,4 +1,4 @@
-"""PyTorch's number of threads, for a while."""
+"""Temporary change of PyTorch's number of threads."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ __all__ = ["num_threads"]
 
 @contextmanager
 def num_threads(threads: int | None) -> Iterator[None]:
-    """Run a block with ``threads`` intra-op threads of PyTorch (None: as many as now); restore them afterwards.
+    """Run a block with ``threads`` intra-op threads of PyTorch (None: unchanged), and restore them afterwards.
 
     Raises:
         InputError: for fewer than one thread.

@@ -1,4 +1,4 @@
-"""Which run of Weights & Biases a recipe logs to: the same one however often it is stopped and run again."""
+"""Weights & Biases run of a recipe, resumed under the same id whenever the recipe is restarted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NOTE = "wandb_run_id"
 
 
 def wandb_arguments(settings: Mapping[str, Any], folder: str | Path, name: str) -> dict[str, Any]:
-    """Return arguments of ``wandb.init``; the run's id is noted in ``folder``, so that the next call continues the run.
+    """Return arguments of ``wandb.init``; the run id is saved in ``folder`` so that the next call resumes the run.
 
     Offline, W&B begins another folder of the same id, and its own count of steps at 0: lines are logged with their step.
     W&B's own variables count before: ``WANDB_RUN_ID``, which its agents set, and ``WANDB_DIR``.

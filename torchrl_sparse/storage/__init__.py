@@ -1,4 +1,4 @@
-"""Files: policies in and out, published formats in. Nothing in a checkpoint is ever executed."""
+"""Files: reading and writing policies, and reading published formats. Nothing in a checkpoint is ever executed."""
 
 import lazy_loader as lazy
 

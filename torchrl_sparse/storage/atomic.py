@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Atomic file writing, so that a reader never sees half a file."""
 
 import os
 from collections.abc import Iterator
@@ -12,8 +12,8 @@ __all__ = ["atomic_path"]
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """Lend a temporary path beside ``path``, moved onto it when the block ends well and removed when it raises; what a kill
-    leaves of it is overwritten by the next try.
+    """Lend a temporary path beside ``path``, moved onto it if the block succeeds and removed if it raises. What a kill leaves
+    behind is overwritten by the next try.
 
     The folder is made if it is missing. A full disk raises an OSError that names the file and its volume. The temporary file
     keeps the suffix, since writers choose a format by it.

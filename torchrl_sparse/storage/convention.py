@@ -1,6 +1,6 @@
-"""Which version of robosuite a policy's ``source`` says that its observations have the meaning of.
+"""The robosuite version, from a policy's ``source``, that defines the meaning of its observations.
 
-What that means, and how one is had from the other, is in `torchrl_sparse.envs.conventions`.
+The conventions and the conversion between them are in `torchrl_sparse.envs.conventions`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Convention = Literal["1.5", "1.4"]
 
 
 def source_convention(source: Mapping[str, Any]) -> Convention:
-    """Return the convention of a policy's ``source``, see `torchrl_sparse.storage.diffusion.StoredPolicy`.
+    """Return the convention in a policy's ``source``, see `torchrl_sparse.storage.diffusion.StoredPolicy`.
 
     Policies that were trained here have the present one. An imported one has that of its ``"robosuite"``, a version; without
     it, that of robosuite 1.2, which the published code installs.
@@ -33,7 +33,7 @@ def source_convention(source: Mapping[str, Any]) -> Convention:
 
 
 def version_convention(version: str) -> Convention:
-    """Return the convention of a version of robosuite; ValueError for what is no version.
+    """Return the convention of a robosuite version; ValueError for an invalid version.
 
     >>> version_convention("1.4.1"), version_convention("1.10")
     ('1.4', '1.5')

@@ -1,4 +1,4 @@
-"""A diffusion policy as ``config.json``, ``model.safetensors`` and what else it has. None can hold anything that executes.
+"""Files of a diffusion policy: ``config.json``, ``model.safetensors`` and optional others. None can contain executable code.
 
 ::
 
@@ -56,7 +56,7 @@ class _Config:
 
 @dataclass(frozen=True)
 class StoredPolicy:
-    """The parts of a policy that files hold.
+    """Parts of a policy that are stored in files.
 
     Attributes:
         network: the denoiser, f32, in evaluation mode.
@@ -85,7 +85,7 @@ class StoredPolicy:
 
 
 def write_pretrained(path: Path, policy: StoredPolicy, *, half: bool = True) -> None:
-    """Write the files into the folder ``path``, each in one piece or not at all; ``half`` stores fp16 weights."""
+    """Write the files into the folder ``path``, each atomically; ``half`` stores fp16 weights."""
     vision = None if policy.vision is None else policy.vision.config
     network, schedule = policy.network.config, policy.sampler.config
     kept = policy.plan, policy.warm_start, policy.engine
@@ -103,7 +103,7 @@ def _weights(module: nn.Module, half: bool) -> dict[str, Tensor]:
 
 
 def read_pretrained(path: Path) -> StoredPolicy:
-    """Read the policy in the folder ``path``, its network in evaluation mode.
+    """Read a policy from the folder ``path``, its network in evaluation mode.
 
     Raises:
         FileNotFoundError: if a file is not there.

@@ -1,4 +1,4 @@
-"""GGUF, llama.cpp's files of language models: what a header says, and tensors, dequantised. Data only; nothing is executed.
+"""Reader of GGUF, llama.cpp's format of language models: header and dequantised tensors. Data only; nothing is executed.
 
 A file is ``"GGUF" | version | counts | metadata | descriptions of tensors | their data``, little-endian throughout. Quantised
 are blocks of 32 numbers with a scale of their own. Every length is compared with the bytes that are there before it is used.
@@ -67,7 +67,7 @@ class _Stored:
 
 
 class GGUF:
-    """A file, mapped into memory.
+    """A memory-mapped GGUF file.
 
     Args:
         path: the file.
@@ -102,11 +102,11 @@ class GGUF:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the tensors, as PyTorch has them, by name."""
+        """Tensor shapes in PyTorch's order, by name."""
         return {name: stored.shape for name, stored in self._tensors.items()}
 
     def tensor(self, name: str) -> Tensor:
-        """Return a tensor, f32.
+        """Return a dequantised tensor, f32.
 
         Raises:
             InputError: if it is of a type that is not read, cut off, or its numbers are not finite.

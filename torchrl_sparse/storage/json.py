@@ -1,4 +1,4 @@
-"""Every JSON file of this package, read into a dataclass and written from one.
+"""Reading and writing of all JSON files of this package as dataclasses.
 
 The dataclass is the schema: its fields are the only keys, its annotations their types, and its ``__post_init__`` checks what
 types cannot say, with messages that begin with the field (``"rate: expected k / n, got 2"``). A field with the default None
@@ -32,7 +32,7 @@ _NAMED = 12  # differing keys that are named
 
 
 def read_json(path: str | os.PathLike, kind: type[T]) -> T:
-    """Read a file as ``kind``: a dataclass, or any type with JSON values, such as ``dict[str, Any]``.
+    """Read a JSON file as ``kind``: a dataclass, or any type of JSON values, such as ``dict[str, Any]``.
 
     Types are strict (``true`` is no integer and ``1.0`` neither), numbers finite, and no key may be unknown or stand twice.
 
@@ -59,7 +59,7 @@ def read_json(path: str | os.PathLike, kind: type[T]) -> T:
 
 
 def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
-    """Parse what a file or a line of one holds, as `read_json` does.
+    """Parse JSON text, a file's or a line's, as `read_json` does.
 
     Args:
         text: the JSON.
@@ -100,7 +100,7 @@ def parse_json(text: str | bytes, kind: type[T], where: str) -> T:
 
 
 def check_plain(value: Any, kind: type[T], where: str) -> T:
-    """Check plain values, as strictly as `read_json` does those of a file, and return what they make.
+    """Build ``kind`` from plain values, checked as strictly as `read_json` checks a file.
 
     Raises:
         InputError: ``WHERE: key: expected …, got …``.
@@ -122,7 +122,7 @@ def check_plain(value: Any, kind: type[T], where: str) -> T:
 
 
 def write_json(path: str | os.PathLike, value: Any) -> Path:
-    """Write a dataclass, or plain JSON values, in one piece or not at all; return the path.
+    """Write a dataclass, or plain JSON values, atomically, and return the path.
 
     Raises:
         TypeError: if ``value`` holds something that JSON cannot.
@@ -140,7 +140,7 @@ def write_json(path: str | os.PathLike, value: Any) -> Path:
 
 
 def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
-    """Name the keys in which plain values differ, with both, those within mappings after dots; empty if they are equal.
+    """Return the keys, dotted for nested mappings, in which plain values differ, with both values; empty if equal.
 
     A fingerprint of a policy equals what earlier files note of that policy, see `is_same_policy`.
 
@@ -163,7 +163,7 @@ def describe_differences(found: Mapping[str, Any], asked: Mapping[str, Any]) -> 
 
 
 def to_plain(value: Any) -> Any:
-    """Turn dataclasses, mappings and sequences into the dicts and lists that a file holds.
+    """Convert dataclasses, mappings and sequences to JSON dicts and lists.
 
     >>> from dataclasses import make_dataclass
     >>> to_plain(make_dataclass("Note", ["text", ("by", str, None)])(text=("a", "b")))

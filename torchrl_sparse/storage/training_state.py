@@ -1,4 +1,4 @@
-"""Checkpoints from which a training is resumed."""
+"""Checkpoints for resuming a training run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["read_checkpoint", "write_checkpoint"]
 
 
 def write_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint. A kill leaves the old file or the new one, never a part of one."""
+    """Write a checkpoint atomically: a kill leaves the old file or the new one."""
     with atomic_path(path) as temporary:
         torch.save(dict(state), temporary)
 

@@ -1,4 +1,4 @@
-"""A vision-language-action policy as two files: ``config.json`` and ``model.safetensors``. Neither can hold code.
+"""Files of a vision-language-action policy: ``config.json`` and ``model.safetensors``. Neither can contain code.
 
 ::
 
@@ -40,7 +40,7 @@ _BASE_TOKENIZER = {"kind": "base"}
 
 @dataclass(frozen=True)
 class VLASource:
-    """What a vision-language-action policy was trained for.
+    """Task and data for which a vision-language-action policy was trained.
 
     Attributes:
         task: a task, a suite of LIBERO or a data set, by its name; None where nobody noted it.
@@ -56,7 +56,7 @@ class VLASource:
 
 @dataclass(frozen=True)
 class AdaptedBase:
-    """The language model that a policy adapts.
+    """Language model that a policy adapts.
 
     Attributes:
         sha256: of its file.
@@ -80,7 +80,7 @@ class _Config:
 
 @dataclass(frozen=True)
 class StoredVLA:
-    """The parts of a vision-language-action policy that files hold.
+    """Parts of a vision-language-action policy that are stored in files.
 
     Attributes:
         network: the network, in evaluation mode.
@@ -98,7 +98,7 @@ class StoredVLA:
 
 
 def write_vla(path: Path, policy: StoredVLA) -> None:
-    """Write both files into the folder ``path``, each in one piece or not at all."""
+    """Write both files into the folder ``path``, each atomically."""
     weights = {name: value.half() for name, value in trained_state(policy.network, policy.base).items()}
     tensors = _prefixed(_NETWORK, weights) | _prefixed(_NORMALIZER, policy.normalizer.state_dict())
     write_tensors(path / "model.safetensors", tensors)
@@ -110,7 +110,7 @@ def write_vla(path: Path, policy: StoredVLA) -> None:
 
 
 def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = None) -> StoredVLA:
-    """Read the policy in the folder ``path``, its network in f32.
+    """Read a policy from the folder ``path``, its network in f32.
 
     Args:
         path: the folder.
@@ -152,7 +152,7 @@ def read_vla(path: Path, expected: VLAConfig | None = None, base: Path | None = 
 
 
 def trained_state(network: VLANetwork, base: AdaptedBase | None) -> dict[str, Tensor]:
-    """Return what a file holds of a network's state: all, or what is not its language model's."""
+    """Return the stored part of a network's state: everything, or all but the language model's weights."""
     state = network.state_dict()
     return state if base is None else {name: value for name, value in state.items() if not is_frozen(name)}
 

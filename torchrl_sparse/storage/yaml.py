@@ -1,4 +1,4 @@
-"""YAML that somebody wrote by hand, read without guesses: as Hydra reads it, and nothing in it counts twice.
+"""Strict reader of handwritten YAML: values as Hydra reads them, and duplicate keys refused.
 
 PyYAML follows YAML 1.1, in which ``1e-4`` is a text and ``2026-01-01`` a date, and keeps the last of two entries of one name.
 """
@@ -73,7 +73,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: str | os.PathLike) -> Any:
-    """Read a file as mappings with texts as names, lists, texts, finite numbers, truth values and None.
+    """Read a file as mappings with text keys, lists, texts, finite numbers, truth values and None.
 
     Raises:
         FileNotFoundError: if there is no such file.

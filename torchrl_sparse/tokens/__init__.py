@@ -1,4 +1,4 @@
-"""Sparsity over visual tokens: which image patches a vision-language-action model goes on computing."""
+"""Sparsity over visual tokens: which image patches a vision-language-action model keeps computing."""
 
 import lazy_loader as lazy
 

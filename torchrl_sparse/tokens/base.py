@@ -1,4 +1,4 @@
-"""The base of every method that prunes visual tokens, and the two ways to prune them.
+"""Base of all methods that prune visual tokens, and the two ways to prune them.
 
 * *Before the decoder.* Whoever runs earlier writes ``("tokens", "keep_mask")``, bool [*B, N], True = kept; a pruner may do so
   in `TokenPruner.begin`.
@@ -12,10 +12,9 @@
 **State.** A pruner keeps nothing in itself. ``td`` is flat, [B], holds the policy's and the pruner's ``in_keys`` (as far as the
 environment has them; images are cropped as the network sees them, so that patch and token agree), and is the same object in
 `begin`, in ``state.td`` and in `end`: what must survive from one layer to the next is written there under any name. What is
-in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So what must outlive a call,
-such as ``("tokens", "score")`` or the previous frame, is an out_key and an in_key, and `TokenPruner.carried` says what it looks
-like to an environment; it is missing or 0 at the first call of all, and
-rows with ``"is_init"`` start afresh.
+in the pruner's ``out_keys`` at `end` goes back to the environment, everything else is dropped. So state that outlives a call,
+such as ``("tokens", "score")`` or the previous frame, is both an out_key and an in_key, and `TokenPruner.carried` gives its
+spec to an environment; it is missing or 0 at the first call of all, and rows with ``"is_init"`` start afresh.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ __all__ = ["TokenPruner"]
 
 
 class TokenPruner(LayerHooks):
-    """Base of everything that prunes visual tokens; this one keeps all. See the module for the order of calls.
+    """Base of all visual-token pruners; it keeps all tokens. See the module for the order of calls.
 
     Attributes:
         in_keys: what `begin` reads beside what the policy reads; keys that the environment lacks are left out.
@@ -58,14 +57,14 @@ class TokenPruner(LayerHooks):
     spec: VisualSpec
 
     def bind(self, spec: VisualSpec) -> None:
-        """Take note of the model that the pruner is assigned to: one that carries keys keeps it as ``self.spec``.
+        """Prepare for the model on assignment; pruners that carry keys keep its sizes as ``self.spec``.
 
         Raises:
             InputError: if the pruner does not fit it, for instance a budget larger than its tokens.
         """
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`; a pruner adds keys of its own.
+        """Return the spec of the keys carried for one environment, see :mod:`torchrl_sparse.carried`; pruners add their own.
 
         These are images and scores of the last policy call. What it leaves out follows any environment but a bare
         `ParallelEnv`.

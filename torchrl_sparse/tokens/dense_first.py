@@ -1,4 +1,4 @@
-"""A pruner that leaves an episode's first policy call dense, as those do that compare each call with the last."""
+"""A pruner that keeps an episode's first policy call dense, as pruners that compare successive calls do."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["DenseFirst"]
 
 
 class DenseFirst(TokenPruner):
-    """Another pruner, but for rows with ``"is_init"``, which keep all tokens as they are.
+    """Wrapper of another pruner that keeps all tokens in rows with ``"is_init"``.
 
     SpecPrune and frame difference see an episode's first policy call whole, since nothing is known of the scene yet. A control
     that is to be compared with them gets the same.

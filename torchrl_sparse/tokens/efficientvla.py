@@ -1,4 +1,4 @@
-"""EfficientVLA, the part that concerns the language model (Yang et al., arXiv:2506.10100): fewer layers, fewer visual tokens.
+"""EfficientVLA's language-model part (Yang et al., arXiv:2506.10100): fewer layers, fewer visual tokens.
 
 Layers that hardly change their input are skipped. Visual tokens are chosen in three rounds: a few key tokens to which the
 instruction attends most; more tokens by the same attention; and, for diversity, those least similar to the key tokens. The
@@ -47,7 +47,7 @@ def relevant_and_diverse(
 
 
 class EfficientVLAPruner(TokenPruner):
-    """Skips layers, and drops visual tokens once, after the first two layers.
+    """Pruner that skips layers and drops visual tokens once, after the first two layers.
 
     Args:
         share: of all visual tokens that stay, in (0, 1].
@@ -100,7 +100,8 @@ _INPUT = ("efficientvla", "input")
 
 
 class LayerSimilarity(TokenPruner):
-    """Drops nothing, and says how little each layer changes: ``("efficientvla", "similarity")``, f32 [B, L].
+    """Pruner that drops nothing and writes each layer's input-output similarity: ``("efficientvla", "similarity")``, f32 [B,
+    L].
 
     It is the cosine between a token before and after the layer, mean over tokens. That of the first layer is not measured: 0.
     """
@@ -122,7 +123,7 @@ class LayerSimilarity(TokenPruner):
 
 
 def redundant_layers(similarity: Tensor, count: int) -> list[int]:
-    """Return the ``count`` layers, none of the first two, that change their input least.
+    """Return the ``count`` layers that change their input least; the first two are never among them.
 
     Args:
         similarity: f32 [Q, L], what `LayerSimilarity` says of Q policy calls of the dense policy.

@@ -1,4 +1,4 @@
-"""FastV: after a few layers, keep the visual tokens to which the last token attends (Chen et al., arXiv:2403.06764)."""
+"""FastV (Chen et al., arXiv:2403.06764): after a few layers, keep the visual tokens that the last token attends to."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def last_text_token(kind: Tensor, alive: Tensor) -> Tensor:
 
 
 class FastVPruner(TokenPruner):
-    """Drops visual tokens once, after ``layer`` layers, by the attention of the last prompt token in the layer before.
+    """Pruner that drops visual tokens once, after ``layer`` layers, by the last prompt token's attention in the layer before.
 
     FastV's last token is the one that predicts the first output; with parallel action slots that is the last of the prompt.
 

@@ -1,4 +1,4 @@
-"""Frame difference alone: what changed since the last call stays, the rest goes. One ingredient of SpecPrune-VLA by itself."""
+"""Frame differencing alone, one ingredient of SpecPrune-VLA: keep what changed since the last call, drop the rest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_sparse.tokens.selection import best_per_camera, check_share
 
 
 def most_changed(similarity: Tensor, count: int, cameras: int) -> Tensor:
-    """Choose in each camera the ``count`` patches least similar to their predecessors, bool [B, N].
+    """Choose the ``count`` patches of each camera least similar to their predecessors, bool [B, N].
 
     Args:
         similarity: [B, N], see `torchrl_sparse.tokens.frames.similarity`.
@@ -27,7 +27,7 @@ def most_changed(similarity: Tensor, count: int, cameras: int) -> Tensor:
 
 
 class FrameDifferencePruner(TokenPruner):
-    """Keeps, of each camera, the ``share`` of patches that changed most since the last policy call; all at an episode's first.
+    """Pruner that keeps each camera's ``share`` of patches that changed most since the last call; all at an episode's first.
 
     It prunes before the decoder, so that no layer is scored.
 

@@ -1,4 +1,4 @@
-"""Changes in the cameras' images since the last call, or since one further back while the hand is slow, patch by patch."""
+"""Patch-wise image changes since the last policy call, or since an earlier one while the hand is slow."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FRAME_KEYS = [keys.TOKEN_FRAMES, keys.IS_INIT]
 
 
 def past_frame_keys(furthest: int) -> list[NestedKey]:
-    """Return what `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` calls back; the first it writes as well.
+    """Return the keys that `compare_frames` reads beside `FRAME_KEYS` to look ``furthest`` calls back; it writes the first too.
 
     Raises:
         InputError: if that is less than one call.
@@ -92,7 +92,7 @@ def look_back(speed: Tensor, furthest: int, swift: float) -> Tensor:
 def compare_frames(
     td: TensorDictBase, spec: VisualSpec, furthest: int = 1, swift: float = 0.3
 ) -> tuple[Tensor, Tensor]:
-    """Compare the images of this policy call with those of an earlier one, and remember these.
+    """Compare this policy call's images with an earlier call's, and store them for later calls.
 
     Args:
         td: a call [B] with the cameras' images, u8 [B, 3, h, w]; ``("tokens", "frames")`` is read and replaced, and where

@@ -1,4 +1,4 @@
-"""Random pruning: visual tokens drawn blindly, the control that every other method has to beat."""
+"""Random pruning of visual tokens: the control that every other method has to beat."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def random_set(seed: Tensor, num_tokens: int, count: int) -> Tensor:
 
 
 class RandomPruner(TokenPruner):
-    """Keeps a random ``share`` of all visual tokens, drawn again at each policy call, before the decoder.
+    """Pruner that keeps a random ``share`` of all visual tokens, redrawn at each policy call, before the decoder.
 
     The draw follows from ``("episode", "seed")`` and ``("episode", "step")`` where the environment writes them, else from
     torch's global generator.

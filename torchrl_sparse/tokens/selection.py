@@ -1,4 +1,4 @@
-"""Choosing tokens: ranks, the best few of each camera, and whether a budget fits the model."""
+"""Token selection: ranks, the best tokens of each camera, and checks that a budget fits the model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["best", "best_per_camera", "check_budget", "check_share", "ranks", "s
 
 
 def ranks(score: Tensor, among: Tensor) -> Tensor:
-    """Rank the tokens, i64 [B, N]: 0 has the highest score; equal ones in the order of their ids; those not ``among`` last.
+    """Rank the tokens, i64 [B, N]: 0 is the highest score; ties in the order of ids; those not ``among`` come last.
 
     Args:
         score: [B, N].
@@ -30,7 +30,7 @@ def ranks(score: Tensor, among: Tensor) -> Tensor:
 
 
 def best(score: Tensor, count: Tensor | int, among: Tensor) -> Tensor:
-    """Choose the ``count`` tokens of highest score, bool [B, N]; all of them where fewer compete.
+    """Choose the ``count`` tokens with the highest scores, bool [B, N]; all candidates if there are fewer.
 
     Args:
         score: [B, N].
@@ -46,7 +46,7 @@ def best(score: Tensor, count: Tensor | int, among: Tensor) -> Tensor:
 
 
 def best_per_camera(score: Tensor, counts: Sequence[Tensor | int], among: Tensor) -> Tensor:
-    """Choose the `best` within each camera, bool [B, N]; the cameras' tokens follow each other, equally many each.
+    """Choose the `best` within each camera, bool [B, N]; tokens are ordered by camera, equally many each.
 
     Args:
         counts: one number, or i64 [B, 1], per camera.
@@ -57,7 +57,7 @@ def best_per_camera(score: Tensor, counts: Sequence[Tensor | int], among: Tensor
 
 
 def scaled_layers(layers: Sequence[int], depth: int, num_layers: int, first: int = 0) -> list[int]:
-    """Move layers of a model ``depth`` deep to the same relative depth in one of ``num_layers``; keep those from ``first`` on.
+    """Map layers of a model ``depth`` deep to the same relative depth in ``num_layers``; keep those from ``first`` on.
 
     Examples:
         >>> scaled_layers([5, 10, 15, 20], 32, 32, 2), scaled_layers([5, 10, 15, 20], 32, 8, 2)
@@ -68,7 +68,7 @@ def scaled_layers(layers: Sequence[int], depth: int, num_layers: int, first: int
 
 
 def check_budget(name: str, budget: float, spec: VisualSpec) -> None:
-    """Refuse a number of tokens per camera that the model does not have.
+    """Refuse more tokens per camera than the model has.
 
     Raises:
         InputError: naming the budget and the model's tokens.

@@ -1,4 +1,4 @@
-"""SparseVLM: words that matter to the image rate its tokens; of those dropped, the better part is merged (arXiv:2410.04417).
+"""SparseVLM (arXiv:2410.04417): image-relevant words rate visual tokens; the better of the dropped ones are merged.
 
 Zhang et al., ICML 2025. How many tokens go is adaptive: the more independent directions the raters' attention has (its rank),
 the fewer. A merged token takes the place, and the position, of the token at the centre of its cluster.
@@ -22,7 +22,7 @@ _RATERS = ("sparsevlm", "raters")
 
 
 def text_raters(hidden: Tensor, is_visual: Tensor, is_text: Tensor) -> Tensor:
-    """Choose the words that matter to the image, bool [B, S]: those more similar to the visual tokens than the mean word is.
+    """Choose the words relevant to the image, bool [B, S]: more similar to the visual tokens than the mean word.
 
     Args:
         hidden: [B, S, d].
@@ -41,7 +41,7 @@ def text_raters(hidden: Tensor, is_visual: Tensor, is_text: Tensor) -> Tensor:
 
 
 def dropped_counts(attention: Tensor, alive: Tensor, scale: float) -> Tensor:
-    """Count the visual tokens that each row drops, i64 [B]: ``scale`` times those beyond the rank of the raters' attention.
+    """Count the visual tokens to drop in each row, i64 [B]: ``scale`` times those beyond the raters' attention rank.
 
     Args:
         attention: [B, raters, N], 0 for dead tokens.
@@ -91,7 +91,7 @@ def _raters(state: LayerState) -> Tensor:
 
 
 class SparseVLMPruner(TokenPruner):
-    """Drops and recycles visual tokens in several layers.
+    """Pruner that drops and recycles visual tokens in several layers.
 
     Args:
         scale: share of the tokens beyond the rank that go in each layer (the paper's lambda), in (0, 1].

@@ -1,4 +1,4 @@
-"""SpecPrune-VLA: visual tokens chosen from the last policy call, from what moved, and from the decoder's own first layers.
+"""SpecPrune-VLA: visual tokens chosen from the last policy call, from image changes, and from the decoder's first layers.
 
 Wang et al., "SpecPrune-VLA: Accelerating Vision-Language-Action Models via Action-Aware Self-Speculative Pruning",
 arXiv:2509.05614. Nothing is trained. Each equation is the function named after what it defines:
@@ -53,7 +53,7 @@ from torchrl_sparse.tokens.selection import (
 
 
 def dynamic_set(similarity: Tensor, counts: list[Tensor], threshold: float) -> Tensor:
-    """Eq. 3: in each camera the ``counts`` most changed patches of those less similar than ``threshold``, bool [B, N].
+    """Choose each camera's ``counts`` most changed patches among those less similar than ``threshold``, bool [B, N] (Eq. 3).
 
     Args:
         similarity: [B, N], Eq. 2.
@@ -63,27 +63,27 @@ def dynamic_set(similarity: Tensor, counts: list[Tensor], threshold: float) -> T
 
 
 def layer_set(score: Tensor, counts: list[Tensor], alive: Tensor) -> Tensor:
-    """Eq. 4: in each camera the ``counts`` tokens to which one layer's words attend most, bool [B, N]."""
+    """Choose each camera's ``counts`` tokens to which one layer's words attend most, bool [B, N] (Eq. 4)."""
     return best_per_camera(score, counts, alive)
 
 
 def local_set(first: Tensor, second: Tensor) -> Tensor:
-    """Eq. 5: what either of the first two layers picks."""
+    """Return the tokens that either of the first two layers picks (Eq. 5)."""
     return first | second
 
 
 def retain_set(carried: Tensor, dynamic: Tensor, local: Tensor) -> Tensor:
-    """Eq. 6: what the last policy call found important, what changed since, and what this call's first layers pick."""
+    """Return the tokens important at the last policy call, changed since, or picked by this call's first layers (Eq. 6)."""
     return carried | dynamic | local
 
 
 def layer_score(rank_weight: Tensor, confidence: Tensor) -> Tensor:
-    """Eq. 7: [B, N] from a weight for each token and a confidence, [B, 1], for the layer."""
+    """Return a layer's scores [B, N] from a weight per token and the layer's confidence, [B, 1] (Eq. 7)."""
     return rank_weight * confidence
 
 
 def rank_weight(rank: Tensor, alive: Tensor, steepness: float) -> Tensor:
-    """Eq. 8: sigmoid(-steepness * rank), 0 for dead tokens, over its sum: [B, N].
+    """Return the rank weights [B, N]: sigmoid(-steepness * rank), 0 for dead tokens, normalised to sum 1 (Eq. 8).
 
     Args:
         rank: i64 [B, N], 0 for the token of highest attention.
@@ -94,7 +94,7 @@ def rank_weight(rank: Tensor, alive: Tensor, steepness: float) -> Tensor:
 
 
 def confidence(score: Tensor, alive: Tensor, epsilon: float = 1e-6) -> Tensor:
-    """Eq. 9: mean of the living tokens' scores over their standard deviation, [B, 1]."""
+    """Return the mean of the living tokens' scores over their standard deviation, [B, 1] (Eq. 9)."""
     count = alive.sum(-1, keepdim=True).clamp_min(1)
     mean = (score * alive).sum(-1, keepdim=True) / count
     variance = ((score - mean).square() * alive).sum(-1, keepdim=True) / count
@@ -102,7 +102,7 @@ def confidence(score: Tensor, alive: Tensor, epsilon: float = 1e-6) -> Tensor:
 
 
 def updated_score(before: Tensor, layer_score: Tensor, beta: float) -> Tensor:
-    """Eq. 10: ``(1 - beta) * before + beta * layer_score``."""
+    """Return ``(1 - beta) * before + beta * layer_score`` (Eq. 10)."""
     return (1 - beta) * before + beta * layer_score
 
 
@@ -111,7 +111,7 @@ def updated_score(before: Tensor, layer_score: Tensor, beta: float) -> Tensor:
 
 @dataclass(frozen=True)
 class SpecPruneOptions:
-    """Settings in which the paper and its release differ. Layers are those of a decoder 32 deep, and are scaled to the model's.
+    """Settings that differ between paper and release. Layers are for a 32-layer decoder and are scaled to the model's depth.
 
     Attributes:
         alpha: multiplies the budget: K = floor(alpha * camera share * budget) tokens per camera.
@@ -175,7 +175,7 @@ _COUNTS, _CARRIED, _CHANGED, _FIRST, _RUNNING, _TO_CARRY = (
 
 
 class SpecPrune(TokenPruner):
-    """Static pruning after two layers, dynamic pruning in deeper ones; see the module.
+    """Pruner with static pruning after two layers and dynamic pruning in deeper ones; see the module.
 
     The budget is ``("tokens", "budget")``, per sample, where an `ActionAwareController` writes it. Scores and images of the
     last policy call travel as ``("tokens", "score")`` and ``("tokens", "frames")``.
@@ -227,7 +227,7 @@ class SpecPrune(TokenPruner):
         return {*range(_SPECULATION), *self._dynamic_layers, *self._carry_layers}
 
     def begin(self, td: TensorDictBase) -> None:
-        """Compute everything that is known before the decoder runs: the budgets, the carried set, and the changed set."""
+        """Compute what is known before the decoder runs: the budgets, the carried set, and the changed set."""
         alike, first = compare_frames(td, self.spec, self.options.look_back)
         counts = self._counts(td)
         td.set(_COUNTS, torch.cat(counts, -1))

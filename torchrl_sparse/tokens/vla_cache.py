@@ -1,4 +1,4 @@
-"""VLA-Cache: tokens that did not change are taken from the last call instead of being computed (Xu et al., arXiv:2502.02175).
+"""VLA-Cache (Xu et al., arXiv:2502.02175): reuse unchanged tokens from the last policy call instead of computing them.
 
 Nothing is dropped. A token is reused where its patch did not change and the instruction did not attend to it; the share of such
 tokens grows from layer to layer, the more, the more focused attention is.
@@ -38,8 +38,8 @@ _REUSABLE, _ALIKE, _REUSED_NOW, _ENTROPY, _NEW_CACHE = (
 def reusable_set(
     similarity: Tensor, attention: Tensor, static: int, relevant: int, threshold: float, cameras: int
 ) -> Tensor:
-    """Choose unchanged and irrelevant tokens, bool [B, N]: in each camera the ``static`` patches most similar to their
-    predecessors, none below ``threshold``, without the ``relevant`` most attended.
+    """Choose unchanged, irrelevant tokens, bool [B, N]: per camera the ``static`` patches most similar to their predecessors,
+    at least ``threshold``, except the ``relevant`` most attended ones.
 
     Args:
         similarity: [B, N] to the last policy call's patches.
@@ -50,7 +50,7 @@ def reusable_set(
 
 
 def attention_entropy(attention: Tensor) -> Tensor:
-    """Return the entropy [B], in nats, of each row's attention over the visual tokens; mean over rows.
+    """Return the entropy [B], in nats, of the attention over the visual tokens, mean over rows.
 
     Args:
         attention: [B, R, N]; rows of zeros do not count.
@@ -63,7 +63,7 @@ def attention_entropy(attention: Tensor) -> Tensor:
 
 
 def reuse_shares(entropy: Tensor, growth: float) -> Tensor:
-    """Return the share of the reusable tokens that each layer reuses, [B, L]: from 0 at the highest entropy to 1 at the lowest.
+    """Return the share of reusable tokens reused in each layer, [B, L]: 0 at the highest entropy to 1 at the lowest.
 
     Args:
         entropy: [B, L].
@@ -82,7 +82,7 @@ def reuse_shares(entropy: Tensor, growth: float) -> Tensor:
 
 
 class VLACachePruner(TokenPruner):
-    """Reuses unchanged, irrelevant tokens from the last policy call; see the module for what that means here.
+    """Pruner that reuses unchanged, irrelevant tokens from the last policy call; see the module for its limits.
 
     Entropy and relevance are those of the last query, over the attention of the instruction's words to the visual tokens.
 

@@ -1,4 +1,4 @@
-"""Curves of a pruner's training: what fidelity costs, and where the sparsity goes."""
+"""Training curves of a pruner: fidelity loss and sparsity."""
 
 import os
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ __all__ = ["plot_pruner_curves", "read_scalars"]
 
 
 def read_scalars(folder: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Read everything that TorchRL's CSV logger wrote: name -> f64 [n, 2] of step and value.
+    """Read all scalars written by TorchRL's CSV logger: name -> f64 [n, 2] of step and value.
 
     A training that was killed and resumed logs the steps since its checkpoint twice; the later entry counts.
 
@@ -36,7 +36,7 @@ def read_scalars(folder: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike, *, rate: float) -> Path:
-    """Draw fidelity loss and held-out error; prune rate; pruned share of each type of block, over the updates.
+    """Draw fidelity loss and held-out error, prune rate, and pruned share per block type, over the updates.
 
     Args:
         curves: of :func:`read_scalars`, with ``train/fidelity``, ``train/rate``, ``train/rate_cost`` and

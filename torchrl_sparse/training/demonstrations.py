@@ -1,4 +1,4 @@
-"""Base of trainings on demonstrations: their configuration, windows, held-out episodes and averaged weights."""
+"""Base of training on demonstrations: configuration, windows, held-out episodes and averaged weights."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class TrainConfig:
 
 
 class DemonstrationTrainer(Trainer):
-    """Base of trainings on windows of demonstrations, which keep a running average of the weights.
+    """Base of trainers on demonstration windows, with a running average of the weights.
 
     Args:
         module: the module to train, in place.
@@ -112,7 +112,7 @@ class DemonstrationTrainer(Trainer):
 
     @abstractmethod
     def window_loss(self, rows: Tensor) -> Tensor:
-        """Return the loss, a scalar, of windows ``rows`` i64 [B, H]."""
+        """Return the scalar loss of windows ``rows`` i64 [B, H]."""
 
     def batch_losses(self, index: Tensor) -> dict[str, Tensor]:
         return {"loss": self.window_loss(self.train_rows[index])}
@@ -124,7 +124,7 @@ class DemonstrationTrainer(Trainer):
 
     @torch.no_grad()
     def validate(self, max_windows: int = 512) -> dict[str, float]:
-        """Return the loss of the averaged weights on held-out episodes and fixed noise; empty if none are held out."""
+        """Return the averaged weights' loss on held-out episodes with fixed noise; empty if none are held out."""
         if self.val_rows is None:
             return {}
         self.module.eval()
@@ -166,7 +166,7 @@ def trained_parameters(module: nn.Module) -> list[nn.Parameter]:
 def split_windows(
     demos: Demonstrations, sizes: tuple[int, int, int], val_ratio: float
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the training windows, and those of the last ``val_ratio`` of the episodes, None for a ratio of 0.
+    """Return the training windows, and those of the last ``val_ratio`` of episodes, None for a ratio of 0.
 
     Args:
         demos: the demonstrations.

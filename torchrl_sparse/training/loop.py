@@ -1,4 +1,4 @@
-"""The loop around a `Trainer`: steps until the end or a signal, with log, checkpoints and evaluations on the way."""
+"""The training loop of a `Trainer`: steps until the end or a signal, with logging, checkpoints and evaluations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def train(
     export: Callable[[], Path],
     evaluate: Callable[[], float | None] | None = None,
 ) -> None:
-    """Train until ``trainer.total`` or a signal to stop, from ``out/checkpoint.pt`` if it is there; save at the end.
+    """Train until ``trainer.total`` or a stop signal, resuming from ``out/checkpoint.pt`` if it exists; save at the end.
 
     A training that had ended is extended by one that asks for more steps, see `Trainer.load`.
 
@@ -44,8 +44,8 @@ def train(
 
     Logged are, over the steps since the last entry, the means of ``train/<name>`` of `Trainer.train_step` and, over those of
     them since the start or resumption, ``train/seconds_per_step``; further ``train/lr``, and ``held_out/<name>`` of
-    `Trainer.validate` and ``eval/success``. A CSV log has each step once: what it tells of steps after the checkpoint, which
-    are taken again, is removed first.
+    `Trainer.validate` and ``eval/success``. A CSV log has each step once: its lines on steps after the checkpoint, which are
+    run again, are removed first.
 
     Raises:
         InputError: if the checkpoint belongs to another training, see `Trainer.load`.
@@ -105,7 +105,7 @@ def _make_logger(settings: Mapping[str, Any]) -> Logger:
 
 
 def _forget_after(step: int, folder: Path) -> None:
-    """Remove from a CSV log what was logged after ``step``, and what a kill left of a line."""
+    """Remove from a CSV log the lines after ``step``, and a partial line left by a kill."""
     for path in folder.glob("scalars/**/*.csv"):
         lines = path.read_bytes().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith(b"\n") and _step_of(line, path) <= step]

@@ -1,4 +1,4 @@
-"""The linear model that rolls a state forward, from demonstrations."""
+"""Fit of the linear state model to demonstrations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["fit_state_model"]
 
 
 def fit_state_model(demos: Demonstrations, steps: int) -> tuple[StateModel, float]:
-    """Fit a model of one step to demonstrations and try it on some that are held out.
+    """Fit a one-step model to demonstrations and test it on held-out ones.
 
     Args:
         demos: two episodes or more, with states; the last tenth, one at least, is held out.

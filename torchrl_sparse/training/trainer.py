@@ -1,4 +1,4 @@
-"""Base of all trainings: seeds, batches, the optimiser and its learning rate, and checkpoints.
+"""Base of all trainers: seeds, batches, optimiser, learning rate, and checkpoints.
 
 Everything random in step s (which samples, timesteps, noise, dropout) follows from ``(seed, s)``; a training that is stopped
 and resumed therefore ends bit by bit as if it had not been.
@@ -26,7 +26,7 @@ LENGTH = frozenset({"max_steps", "epochs", "max_updates"})  # of a header's keys
 
 
 class StepConfig(Protocol):
-    """Options of a step that every training has.
+    """Options of an optimiser step, common to all trainings.
 
     Attributes:
         batch_size: samples in a step.
@@ -40,7 +40,7 @@ class StepConfig(Protocol):
 
 
 class Trainer(ABC):
-    """Base of all trainings; a subclass defines the losses of a batch.
+    """Base of all trainers; subclasses define the losses of a batch.
 
     Args:
         module: the module to train, in place.
@@ -93,18 +93,18 @@ class Trainer(ABC):
 
     @abstractmethod
     def batch_losses(self, index: Tensor) -> dict[str, Tensor]:
-        """Return scalars of the samples ``index``, i64 [B]: ``"loss"``, which is minimised, and what is logged beside it."""
+        """Return scalars for the samples ``index``, i64 [B]: ``"loss"``, which is minimised, and others to log."""
 
     @abstractmethod
     def validate(self) -> dict[str, float]:
-        """Return how good the module is on held-out samples; empty if none are held out."""
+        """Return metrics of the module on held-out samples; empty if none are held out."""
 
     @abstractmethod
     def header(self) -> dict[str, dict[str, Any]]:
-        """Return what a checkpoint must agree in with the training that resumes it; plain values."""
+        """Return plain values that a checkpoint and the training that resumes it must agree on."""
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint holds beside the header."""
+        """Return a checkpoint's content without the header."""
         return {
             "step": self.step,
             "network": self.module.state_dict(),
@@ -113,14 +113,14 @@ class Trainer(ABC):
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Load a state that `state` returned."""
         self.module.load_state_dict(state["network"])
         self._optimizer.load_state_dict(state["optimizer"])
         self.step, self.unlogged = state["step"], state.get(UNLOGGED, [])
         self._lr_scheduler = self.make_lr_scheduler(self._optimizer)
 
     def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LambdaLR:
-        """Return the learning rate from `step` on: a linear warm-up, then a cosine to zero, and zero beyond `total`.
+        """Return the learning-rate schedule from `step` on: linear warm-up, cosine to zero, zero beyond `total`.
 
         diffusers' cosine of the same shape rises again there.
         """
@@ -135,11 +135,11 @@ class Trainer(ABC):
 
     @property
     def lr(self) -> float:
-        """The learning rate of the next step."""
+        """Learning rate of the next step."""
         return self._lr_scheduler.get_last_lr()[0]
 
     def train_step(self) -> dict[str, float]:
-        """Take one optimiser step; return the scalars of its batch, see `batch_losses`.
+        """Take one optimiser step and return its batch's scalars, see `batch_losses`.
 
         Raises:
             FloatingPointError: if the loss is not finite; the weights are then those of the step before.
@@ -160,11 +160,11 @@ class Trainer(ABC):
         return {name: scalar.item() for name, scalar in losses.items()}
 
     def save(self, path: str | Path) -> None:
-        """Write a checkpoint. A kill leaves the old file or the new one, never a part of one."""
+        """Write a checkpoint atomically: a kill leaves the old file or the new one."""
         write_checkpoint(path, self.header() | self.state())
 
     def load(self, path: str | Path) -> None:
-        """Resume from a checkpoint, be it of a training of another length. Nothing in the file is executed.
+        """Resume from a checkpoint, even of a training with another length. Nothing in the file is executed.
 
         The learning rate goes on along the cosine that ends at `total`: one that is extended ends otherwise than one that was
         as long from its first step.
@@ -184,7 +184,7 @@ class Trainer(ABC):
 
 
 def checksum(values: Tensor) -> float:
-    """Return the exact sum, rounded once: the same on every machine and for any number of threads.
+    """Return the exact sum, rounded once: equal on every machine and for any number of threads.
 
     Pictures are summed in place, by numpy, which is sixteen times as fast with bytes as torch.
 
@@ -199,7 +199,7 @@ def checksum(values: Tensor) -> float:
 
 
 def step_seed(seed: int, step: int) -> int:
-    """Return the seed of torch's global generator in step ``step``; distinct for all steps of a training.
+    """Return the seed of torch's global generator for ``step``; distinct for all steps of a training.
 
     torch's CPU generator reads only the low 32 bits of a seed, so both numbers have to be mixed into those.
 
@@ -211,7 +211,7 @@ def step_seed(seed: int, step: int) -> int:
 
 
 def batch_indices(num_samples: int, batch_size: int, step: int, seed: int) -> Tensor:
-    """Return the samples of step ``step``, i64 [batch_size].
+    """Return the samples of ``step``, i64 [batch_size].
 
     Every epoch is a permutation of all samples that follows from (seed, epoch). Batches run on over the end
     of an epoch, so that every sample is used equally often.

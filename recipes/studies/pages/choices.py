@@ -1,7 +1,6 @@
 """Recommendations from a ``results.json``: the best method within a time budget, and the best at twenty times dense's speed.
 
-Both are read off the table, so a choice among many methods looks better than it will play: what is chosen is to be confirmed
-on other seeds.
+Both are read off the table, so the best of many methods looks better than it is: confirm the choice on other seeds.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def _budget_row(results: Results, milliseconds: float) -> dict[str, str]:
 def headline(results: Results, goal: float = GOAL) -> tuple[str | None, str]:
     """Return the method to name first, with its results.
 
-    That is the fastest one that is non-inferior to dense in success and in time. Where it is slower than ``goal``, the second
+    It is the fastest method that is non-inferior to dense in success and in time. Where it is slower than ``goal``, the second
     text says what the method with the least time to success lacks that is fast enough.
 
     Args:

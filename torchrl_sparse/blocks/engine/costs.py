@@ -57,8 +57,8 @@ def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
 def folded_overhead_macs(network: TransformerForDiffusion, *, merged_stem: bool) -> Overhead:
     """Count the multiply-accumulates outside the blocks in an engine with folded memory.
 
-    A step embeds the sample and predicts its noise. What the condition is encoded and folded for is done once in a policy call,
-    but in every step by a condition encoder whose tokens attend to each other.
+    A step embeds the sample and predicts its noise. The condition is encoded and folded once per policy call, or in every step
+    if the condition encoder's tokens attend to each other.
 
     Args:
         network: the denoiser.

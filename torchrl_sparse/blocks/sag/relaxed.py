@@ -80,9 +80,9 @@ def denoise_relaxed(
     Args:
         network, sampler, noise, cond, reuse: as in :func:`~torchrl_sparse.blocks.engine.reference.denoise`.
         gate: f32 [B, K, 3L] of 0 and 1 (1 = pruned), row 0 all 0, as the functions above make them.
-        explore: probability in (0, 1] with which a pruned block is evaluated all the same, to learn what
-            computing it would change; drawn for the whole batch from torch's global generator. The gradient
-            of those that are drawn is divided by it, so that its expectation stays that of evaluating all.
+        explore: probability in (0, 1] of evaluating a pruned block nevertheless, to learn how computing it would change the
+            result; drawn for the whole batch from torch's global generator. The gradient of those that are drawn is divided by
+            it, so that its expectation stays that of evaluating all.
         checkpointed: recompute each denoising step in the backward pass instead of keeping its activations:
             the memory of one step instead of K, for about a third more time.
         detached: keep outputs for reuse without their gradient, see the module.

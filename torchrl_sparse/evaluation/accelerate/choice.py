@@ -46,8 +46,8 @@ def rank(names: Sequence[str], candidates: Mapping[str, Candidate], budget_ms: f
     With a budget, which all of them keep, the one of least error is the most promising. Without one it is the fastest of those
     that are no farther from demonstrations than dense, before the others by error.
 
-    The error compares chains of one family only: a chain without noise averages several good answers, which brings it
-    close to demonstrations in the mean and may cost success all the same.
+    The error compares chains of one family only: a chain without noise averages several good actions, which is close to
+        demonstrations in the mean but may still cost success.
 
     Examples:
         >>> from torchrl_sparse.evaluation.results.parts import Percentiles

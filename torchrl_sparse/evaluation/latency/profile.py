@@ -180,8 +180,8 @@ def paced_seconds(
 ) -> dict[str, list[float]]:
     """Time many calls of each caller, started ``hz`` times a second as in a control loop; None: back to back.
 
-    Those in ``inputs`` are called with the next of theirs, made before they begin. Several callers take turns, spread evenly
-    over the period. A call that comes late delays the next; each is timed from its own beginning.
+    Callers in ``inputs`` get their next input, made before the call begins. Several callers take turns, spread evenly over the
+    period. A call that comes late delays the next; each is timed from its own beginning.
 
     Returns:
         name of a caller -> seconds of its ``queries``, in order. Ctrl-C ends it with as many of each as there are by then.

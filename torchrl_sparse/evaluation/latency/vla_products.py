@@ -1,7 +1,7 @@
 """Matrix products of a decoder alone, beside a large one, to tell whether policy calls reach the machine's arithmetic limit.
 
-The products are those of a dense call, one layer's after the other's on their own weights, so that what is fetched from memory
-is what a call fetches. The large one, square, is what the machine does at best: by oneDNN where PyTorch has it, see
+The products are those of a dense call, layer after layer on each layer's own weights, so that memory traffic equals a call's.
+The large one, square, is what the machine does at best: by oneDNN where PyTorch has it, see
 `torchrl_sparse.evaluation.latency.limits.measure_multiply_adds`.
 """
 

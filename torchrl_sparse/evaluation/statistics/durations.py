@@ -161,7 +161,7 @@ def time_verdict(ci: tuple[float, float], margin: float = DEFAULT_TIME_MARGIN) -
 def allowed_steps(horizon: int, early_cut: int | None = None) -> list[int]:
     """Return the step limits for `success_within`: five octaves below the horizon, and the early cut.
 
-    They follow from horizon and cut alone, so that nobody chooses them by the result.
+    The limits follow from horizon and cut alone, so they cannot be chosen by the result.
 
     >>> allowed_steps(400, 36)[:5], allowed_steps(400)[-2:]
     ([12, 14, 16, 18, 20], [356, 400])

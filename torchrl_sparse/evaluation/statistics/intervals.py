@@ -195,7 +195,7 @@ def discordant_pairs(method: Sequence[bool], other: Sequence[bool]) -> tuple[int
 
 
 def checked_pairs(method: ArrayLike, other: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Return both inputs as f64 [n], or raise InputError if their lengths do not match."""
+    """Return both inputs as f64 [n], or raise InputError if they are empty or differ in length."""
     method, other = np.asarray(method, dtype=np.float64), np.asarray(other, dtype=np.float64)
     if method.shape != other.shape or method.ndim != 1 or not len(method):
         raise InputError(

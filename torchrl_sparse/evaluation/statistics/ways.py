@@ -14,8 +14,8 @@ __all__ = ["count_levels", "way_entropy"]
 def way_entropy(ways: Iterable[int]) -> float:
     """Return the entropy, in bits, of the modes that episodes took; 0 for a single mode, 2 for four equally frequent ones.
 
-    It is that of the frequencies, so a few episodes have less than the policy that they come from: of four equal ways and 20
-    episodes it is 1.9 in the mean.
+    It is the entropy of observed frequencies, so it underestimates the policy's: with four equal modes and 20 episodes it is
+    1.9 in the mean.
 
     Args:
         ways: one number an episode. Negative ones, which showed no way or went between them, count as no episode.

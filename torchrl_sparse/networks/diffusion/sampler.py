@@ -207,7 +207,7 @@ class Sampler:
     def last_steps(self, number: int) -> Sampler:
         """Return a sampler of the last ``number`` steps alone, 1 to K, with unchanged coefficients.
 
-        Those of solvers that remember earlier steps begin again: their first step is of first order.
+        Multistep solvers start again: their first step is of first order.
 
         >>> Sampler("ddpm", timesteps=[82, 41, 14]).last_steps(2).name
         'ddpm_41_14'

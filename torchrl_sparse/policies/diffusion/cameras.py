@@ -1,4 +1,4 @@
-"""The cameras' encoder in use: packed where that is faster and gives the same, the module itself elsewhere."""
+"""The camera encoder in use: a packed copy where that is faster and equivalent, else the module itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["CameraSlot"]
 
 
 class CameraSlot:
-    """Holds what computes the features of the cameras: made when it is first needed, and again when weights change.
+    """Camera encoder of a policy, made on first use and again when weights change.
 
     Copies and pickles carry nothing.
     """
@@ -28,9 +28,9 @@ class CameraSlot:
     def get(
         self, vision: VisionEncoder, frames: int, *, bf16: bool = False
     ) -> Callable[[Mapping[str, Tensor]], Tensor]:
-        """Return what encodes ``frames`` images of each camera as ``vision`` does, up to rounding, be it to bfloat16.
+        """Return an encoder of ``frames`` images per camera, equal to ``vision`` up to rounding, bfloat16 included.
 
-        That is `pack_vision`'s copy of it, where no gradient can be asked for and nobody looks at its layers.
+        It is the copy from `pack_vision` if gradients are off and no hooks watch its layers.
         """
         watched = any(module._forward_hooks or module._forward_pre_hooks for module in vision.modules())
         if (
@@ -53,7 +53,7 @@ class CameraSlot:
         return packed
 
     def refresh(self) -> None:
-        """Pack the weights again in the next policy call."""
+        """Pack the weights again at the next policy call."""
         self._made = {}
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""From a condition and a mask to a chunk of actions, and what that cost."""
+"""Denoising of a chunk of actions from a condition and a mask, with its cost."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def check_noise(name: str) -> str:
 
 
 class ActionDenoiser(TensorDictModuleBase):
-    """Denoises a chunk, leaving out the blocks that the mask prunes, and counts what that cost.
+    """Module that denoises a chunk without the pruned blocks, and counts the cost.
 
     Attributes:
         warm: whether policy calls say where they begin, see :mod:`torchrl_sparse.policies.diffusion.warm_start`.
@@ -85,21 +85,21 @@ class ActionDenoiser(TensorDictModuleBase):
         return plan.reuse
 
     def follow(self, plan: Planner) -> None:
-        """Take the reuse rule, and the FLOPs of deciding, of the planner that writes the masks from the next policy call on."""
+        """Take reuse rule and planning FLOPs from the planner that writes the masks, from the next policy call on."""
         self._plan = (plan,)  # in a tuple, since the planner is a stage of its own and no part of this one
         self.planning_flops = plan.flops
 
     def choose(self, engine: EngineName) -> None:
-        """Take another engine from the next policy call on; ValueError as `check_engine`."""
+        """Switch to another engine from the next policy call on; ValueError as in `check_engine`."""
         check_engine(engine)
         self.engine = EngineSlot(engine)
 
     def describe(self) -> str:
-        """Say which engine runs and on what, and why not a faster one."""
+        """Describe the engine and its device, and why no faster engine is used."""
         return self.engine.describe(self.network, self.sampler)
 
     def current_engine(self) -> Engine:
-        """Return the engine that policy calls run in now."""
+        """Return the current engine of policy calls."""
         return self.engine.get(self.network, self.sampler)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,7 +121,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return tensordict.set(keys.FLOPS, flops.reshape(*batch, 1))
 
     def static_flops(self, mask: Tensor) -> float:
-        """Count the FLOPs of a policy call under a planner's mask [K, 3L], once: the planner never writes to it."""
+        """Count the FLOPs of a policy call under a planner's constant mask [K, 3L], once."""
         known, flops = self._counted  # read and replaced in one go: other threads may do the same
         if known is not mask:
             flops = mask_flops(NetworkSizes.of(self.network), mask).item() + self.planning_flops
@@ -173,7 +173,7 @@ class ActionDenoiser(TensorDictModuleBase):
         number: int | None = None,
         guide: Guide | None = None,
     ) -> Tensor:
-        """Denoise normalised actions [B, H, A], all that the network predicts, in all steps or the last ``number``."""
+        """Denoise normalised actions [B, H, A] over the network's whole horizon, in all steps or the last ``number``."""
         sampler, slot = self.sampler, self.engine
         if number not in (None, sampler.num_inference_steps):
             sampler, slot = self._tail(number)
@@ -182,7 +182,7 @@ class ActionDenoiser(TensorDictModuleBase):
         return slot.get(self.network, sampler).denoise(noise, cond, mask, reuse, guide)
 
     def refresh(self) -> None:
-        """Read all weights again in the next policy call."""
+        """Read all weights again at the next policy call."""
         self.engine.refresh()
         self._tails.clear()
 

@@ -1,4 +1,4 @@
-"""What a policy is fed with and what it returns, in words."""
+"""Description of a policy's inputs and outputs as text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchrl_sparse.storage.convention import source_convention
 
 
 def describe(policy: Any) -> str:
-    """Return lines on the observation, with the state's layout and ranges, on the chunk, and on how it was trained.
+    """Return lines of text on observation layout and ranges, on the chunk, and on the training.
 
     A range is what the normaliser maps to [-1, 1], that of the demonstrations. Robosuite 1.5 orders the parts of the objects'
     state otherwise than 1.4 did, and turned the sign of some, see `torchrl_sparse.envs.conventions`. This library's

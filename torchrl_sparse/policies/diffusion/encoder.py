@@ -1,4 +1,4 @@
-"""Observations as the denoiser's condition: normalised states, with features of the cameras before them."""
+"""Observation encoder of the denoiser's condition: camera features, then normalised states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
 
 class ConditionEncoder(TensorKeys, nn.Module):
-    """Computes the condition f32 [*B, To, D] of observations; D is the features' size and the state's together.
+    """Encoder of observations to the condition f32 [*B, To, D]; D is the features' plus the state's size.
 
     Args:
         normalizer: of states.
@@ -44,7 +44,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
 
     @property
     def state_key(self) -> NestedKey:
-        """Where the last states are: the history of the environment's key."""
+        """Key of the state history, derived from the environment's key."""
         return keys.history_of(self.tensor_keys["state"])
 
     @property
@@ -55,7 +55,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
         return [self.state_key, *cameras, keys.ELAPSED, keys.FRAME_FEATURES]
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
-        """Encode one batch.
+        """Encode one batch of observations.
 
         Raises:
             KeyError: if an observation is missing.
@@ -86,7 +86,7 @@ class ConditionEncoder(TensorKeys, nn.Module):
 
 
 class ObservationEncoder(TensorDictModuleBase):
-    """Writes the denoiser's condition, and the seed of the policy call's noise.
+    """Module that writes the denoiser's condition and the noise seed of the policy call.
 
     Args:
         network: the denoiser, for the sizes.
@@ -133,12 +133,12 @@ class ObservationEncoder(TensorDictModuleBase):
         return tensordict.set(keys.SEED, self.seed(tensordict))
 
     def take_over(self, other: ObservationEncoder) -> None:
-        """Draw the noise that ``other`` does, read its keys, and share what it has made of the cameras' weights."""
+        """Adopt the noise, the keys and the packed camera weights of ``other``."""
         self.condition.set_keys(**other.condition.tensor_keys)
         self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
 
     def refresh(self) -> None:
-        """Read the cameras' weights again in the next policy call."""
+        """Read the cameras' weights again at the next policy call."""
         self.condition.cameras.refresh()
 
     def _check(self, state: Tensor) -> None:
@@ -157,7 +157,7 @@ class ObservationEncoder(TensorDictModuleBase):
             raise InputError(f"{key}: expected finite numbers, got {state[tuple(bad)]} at {bad}")
 
     def seed(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the seed of each policy call's noise, i64 [*B, 1]."""
+        """Return the noise seed of each policy call, i64 [*B, 1]."""
         seed, step = tensordict.get(keys.EPISODE_SEED, None), tensordict.get(keys.EPISODE_STEP, None)
         if seed is None or step is None:
             return torch.randint(2**62, (*tensordict.batch_size, 1), device=tensordict.device)

@@ -1,7 +1,7 @@
-"""A policy as one file that a robot runs without Python or PyTorch, through the C interface of
-``torchrl_sparse/blocks/engine/native/tsp.h``: network, normaliser, sampler and planner.
+"""Export of a policy to one file that robots run through the C interface ``tsp.h``, without Python or PyTorch.
 
-It answers as the policy does with ``noise = "philox"``, to the last bit on a CPU with the same instruction set.
+The file holds network, normaliser, sampler and planner. Its actions equal the policy's with ``noise = "philox"``, to the last
+bit on a CPU with the same instruction set.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def export_policy(
     weights: str,
     facts: dict[str, Any],
 ) -> None:
-    """Write the stages of a policy as one file; ``policy.export(path)`` calls it.
+    """Write a policy's stages to one file; ``policy.export(path)`` calls this.
 
     Args:
         path: of the file, e.g. ``"lift.tsp"``.

@@ -1,4 +1,4 @@
-"""Policies that are only played: their weights are not looked at before every call, and may not be written."""
+"""Frozen policies, for inference only: weights cannot be written, so calls need not check them for changes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ __all__ = ["FreezablePolicy"]
 
 
 class FreezablePolicy(PolicySizes, TensorDictSequential):
-    """What of a `DiffusionPolicy` depends on whether its weights may change."""
+    """Part of a `DiffusionPolicy` that depends on whether its weights may change."""
 
     _parts: Parts | None = None
 
     def freeze(self) -> Self:
-        """Refuse every write to the weights from now on, so that calls need not look for one; return the policy.
+        """Refuse all writes to the weights from now on, so that calls skip the check for changes; return the policy.
 
         A write is an error, never an old answer: an optimiser's step, ``load_state_dict``, ``.data``, a move, a
         parameter or module exchanged for another, also in policies that share the networks, as `with_plan` makes them. Weights
@@ -59,18 +59,18 @@ class FreezablePolicy(PolicySizes, TensorDictSequential):
 
     @property
     def frozen(self) -> bool:
-        """Whether `freeze` was called, for this policy or for another of the same networks."""
+        """Whether `freeze` was called on this policy or on another that shares its networks."""
         return all(Frozen.of(part) is not None for part in self._weights().values())
 
     def train(self, mode: bool = True) -> Self:
-        """Set training mode, which a frozen policy refuses with FrozenError."""
+        """Set training mode; a frozen policy raises FrozenError."""
         if mode and self.frozen:
             raise FrozenError("policy.train()")
         return super().train(mode)
 
     @property
     def fingerprint(self) -> str:
-        """A name of its weights, at the fp16 precision in which they are saved, and of its normaliser and training steps.
+        """Hash of the weights, at the fp16 precision of saved files, and of normaliser and training steps.
 
         Planners and episodes belong to one policy. Earlier files name the weights alone, the part before the hyphen.
         """

@@ -1,4 +1,4 @@
-"""What may be assigned to a policy."""
+"""Type checks of a policy's assignable parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["check_kinds", "check_trained"]
 
 
 def check_kinds(**parts: tuple[Any, type]) -> None:
-    """Raise InputError for the first part that is not of its class.
+    """Raise InputError for the first part that is not an instance of its class.
 
     Args:
         parts: name -> the part and its class.
@@ -30,7 +30,7 @@ def check_kinds(**parts: tuple[Any, type]) -> None:
 
 
 def check_trained(sampler: Sampler, own: Sampler) -> None:
-    """Raise InputError unless ``sampler`` is one of the network that the policy's ``own`` is of, see `Sampler.trained`."""
+    """Raise InputError unless ``sampler`` has the training settings of the policy's ``own``, see `Sampler.trained`."""
     if sampler.trained != own.trained:
         raise InputError(
             f"sampler: expected {own.trained}, with which the policy was trained, got {sampler.trained}; "

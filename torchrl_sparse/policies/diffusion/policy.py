@@ -148,7 +148,7 @@ class DiffusionPolicy(FreezablePolicy):
     def with_plan(
         self, plan: Planner | None, sampler: Sampler | None = None, start: QueryStart | None = None
     ) -> DiffusionPolicy:
-        """Return a policy of the same networks under another planner, another start and, unless None, another sampler.
+        """Return a policy with the same networks, another planner and start, and unless None another sampler.
 
         It is frozen if this one is.
 
@@ -165,19 +165,19 @@ class DiffusionPolicy(FreezablePolicy):
         return policy.freeze() if self.frozen else policy
 
     def with_noise(self, stream: int) -> DiffusionPolicy:
-        """Return the same policy with other noise, what chance alone does; ``stream`` 0 is that of every other policy."""
+        """Return the same policy with other random noise; ``stream`` 0 is every policy's default."""
         policy = self.with_plan(self.plan, start=self.start)
         policy.module["encode"].noise_stream = stream
         return policy
 
     @property
     def noise_stream(self) -> int:
-        """Which of the noises that an episode could have had it draws; see `with_noise`."""
+        """Index of the noise stream from which episodes draw; see `with_noise`."""
         return self.module["encode"].noise_stream
 
     @property
     def noise(self) -> str:
-        """What a seed stands for, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
+        """Noise generator, one of `torchrl_sparse.policies.diffusion.denoiser.NOISES`; assign another to change it."""
         return self.module["denoise"].noise
 
     @noise.setter
@@ -195,8 +195,8 @@ class DiffusionPolicy(FreezablePolicy):
         self.module["encode"].condition.bf16 = name == "native_bf16"
 
     def engine_info(self) -> str:
-        """Say which engine runs the denoising loop and on what, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why
-        ``"auto"`` had to do without the native one. ValueError if the chosen engine cannot run this network here.
+        """The engine and its device, e.g. ``"native: avx512, float32 weights, 2 threads"``, and why ``"auto"`` did not choose
+        the native one. ValueError if the chosen engine cannot run this network here.
         """
         return self.module["denoise"].describe()
 
@@ -207,7 +207,7 @@ class DiffusionPolicy(FreezablePolicy):
         return engine_block_costs(self.module["denoise"].current_engine())
 
     def refresh(self) -> None:
-        """Read all weights again in the next policy call, after writes to them that `Engine` says it does not see."""
+        """Read all weights again at the next policy call, after writes that `Engine` says it cannot detect."""
         self.module["denoise"].refresh()
         self.module["encode"].refresh()
         self.plan.train(self.plan.training)  # a mode that is set has a learned planner forget what it keeps
@@ -219,7 +219,9 @@ class DiffusionPolicy(FreezablePolicy):
     def denoise(
         self, noise: Tensor, cond: Tensor, mask: Tensor | None = None, *, reuse: Reuse = "block"
     ) -> Tensor:
-        """Return normalised actions f32 [B, H, A] from the chosen engine, see `torchrl_sparse.blocks.engine.Engine.denoise`."""
+        """Return normalised actions f32 [B, H, A] from the current engine, see
+        `torchrl_sparse.blocks.engine.Engine.denoise`.
+        """
         return self.module["denoise"].run(noise, cond, mask, reuse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -237,7 +239,7 @@ class DiffusionPolicy(FreezablePolicy):
         return tensordict.set(keys.LATENCY, latency.fill_(synchronised_clock(device) - start))
 
     def save_pretrained(self, path: str | Path, *, half: bool = True) -> None:
-        """Write ``config.json``, weights, fp16 if ``half``, else fp32, and the planner into the folder ``path``.
+        """Write ``config.json``, weights (fp16 if ``half``, else fp32) and planner into the folder ``path``.
 
         An engine that rounds is kept, any other is the reader's choice.
 
@@ -252,14 +254,14 @@ class DiffusionPolicy(FreezablePolicy):
         write_pretrained(Path(path), stored, half=half)
 
     def export(self, path: str | Path, *, weights: str = "float32") -> None:
-        """Write one file that a robot runs in C: `torchrl_sparse.policies.diffusion.export`, which also says what cannot be."""
+        """Write one file that a robot runs in C; see `torchrl_sparse.policies.diffusion.export`, also for its limits."""
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
         facts["robosuite"] = source_convention(self.source)  # whose meaning the objects' state has
         export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Read what `save_pretrained` wrote, with sampler, start and planner; a ``.ckpt`` as `from_diffusion_policy` does.
+        """Load a folder written by `save_pretrained`, or a ``.ckpt`` as `from_diffusion_policy` does.
 
         A policy that was saved with rounded weights rounds them again under ``engine="auto"``; ``"native"`` does not.
 
@@ -276,7 +278,7 @@ class DiffusionPolicy(FreezablePolicy):
     def from_diffusion_policy(
         cls, path: str | Path, *, engine: EngineName = "auto", ignore: Collection[str] = ()
     ) -> DiffusionPolicy:
-        """Read a ``.ckpt`` of the published code (`torchrl_sparse.storage.published.diffusion_policy`, also on ``ignore``).
+        """Load a ``.ckpt`` of the published code; see `torchrl_sparse.storage.published.diffusion_policy`, also on ``ignore``.
 
         Averaged weights are used unless ``use_ema`` is false; ``source`` says what it was trained for. Nothing is executed.
 

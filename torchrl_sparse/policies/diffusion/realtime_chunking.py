@@ -1,9 +1,9 @@
-"""Policy calls that are guided toward what is played while they are answered, so that two chunks meet where one takes over.
+"""Real-time chunking (RTC): policy calls guided toward the actions executed meanwhile, so that successive chunks join smoothly.
 
-In a world that does not wait, the first d actions of a new chunk come too late: the old chunk's are played instead. A new
-chunk that knows nothing of them may go on from somewhere else. Real-time chunking (RTC, arXiv:2506.07339) has every
-denoising step know them: those d are certain, the rest of the old chunk is a wish that weighs less the later it is for (its
-Eq. 5, with e for the end of what is left of the old chunk)::
+In a world that does not wait, the first d actions of a new chunk come too late: the old chunk's are played instead. A new chunk
+that ignores them may continue from another place. Real-time chunking (RTC, arXiv:2506.07339) has every denoising step know
+them: those d are certain, the rest of the old chunk is a wish that weighs less the later it is for (its Eq. 5, with e for the
+end of what is left of the old chunk)::
 
     pull_i = 1                                     i < d
              c (e^c - 1) / (e - 1)                 d <= i < e,   c = (e - i) / (e - d + 1)
@@ -32,7 +32,7 @@ __all__ = ["RealtimeChunking", "chunk_pull"]
 
 
 def chunk_pull(delay: Tensor, left: Tensor, length: int) -> Tensor:
-    """Return f32 [B, length], how far the actions of a new chunk are guided toward those of the old one: RTC's Eq. 5.
+    """Return how strongly each new action is guided toward the old chunk's, f32 [B, length]: RTC's Eq. 5.
 
     Args:
         delay: i64 [B, 1], d, actions that are played before the new chunk takes over.
@@ -48,10 +48,10 @@ def chunk_pull(delay: Tensor, left: Tensor, length: int) -> Tensor:
 
 
 class RealtimeChunking(QueryStart):
-    """Has policy calls go on from the last chunk, see the module; ``policy.start = RealtimeChunking()`` is all that it takes.
+    """Start that continues from the last chunk, see the module; ``policy.start = RealtimeChunking()`` enables it.
 
     Reads ``("control", "last_chunk")``, ``("control", "elapsed")`` and ``("control", "delay")``, which `RealtimeExecutor` hands
-    to a policy that asks for them; `ChunkExecutor`, whose world waits, hands over no delay, which is one of 0. The first
+    to a policy that asks for them; `ChunkExecutor` has no inference delay and hands over none, which counts as 0. The first
     call of an episode, and calls that come without these keys, are guided toward nothing.
 
     A chunk must reach further than from one call to the end of the next: where nothing of it is left, nothing is wished for.

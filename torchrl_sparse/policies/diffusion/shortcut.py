@@ -1,4 +1,4 @@
-"""A whole policy call in two calls of compiled code, where nothing between its state and its chunk is asked for.
+"""Fast path of a policy call: state to chunk in two native calls.
 
 Stages that only move tensors cost as much as a denoising step: after a call, the caches have lost what Python and PyTorch
 run on, and each operation has to fetch it again. So where the stages are those of the library, the state is all that the
@@ -30,7 +30,7 @@ __all__ = ["Parts", "answer_directly"]
 
 
 class Parts:
-    """What is read of the stages that stay, in every policy call again or, of a frozen policy, once.
+    """Values read from the policy's stages: at every policy call, or once for a frozen policy.
 
     Copies and pickles of it are None: those of a frozen policy are not frozen.
 
@@ -55,7 +55,7 @@ class Parts:
     def of(
         cls, encode: ObservationEncoder, denoise: ActionDenoiser, frozen: Frozen | None = None
     ) -> Parts | None:
-        """Return them, or None where the stages are not those of the library or compiled code cannot read the normaliser."""
+        """Return the parts, or None if stages are not the library's own or native code cannot read the normaliser."""
         if type(encode) is not ObservationEncoder or type(denoise) is not ActionDenoiser:
             return None
         condition, normalizer = encode.condition, denoise.normalizer
@@ -77,7 +77,7 @@ def answer_directly(
     plan: Planner,
     denoise: ActionDenoiser,
 ) -> bool:
-    """Write what the four stages would, or return False and leave everything as it is where they have to run themselves.
+    """Write the outputs of all four stages, or return False and change nothing if the stages must run themselves.
 
     Args:
         began: when the policy call began, as ``time.perf_counter`` has it; its latency is written, too.

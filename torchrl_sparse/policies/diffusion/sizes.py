@@ -1,4 +1,4 @@
-"""Where a policy is and how large: what its network and its sampler say."""
+"""Device and sizes of a policy, from its network and sampler."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PolicySizes"]
 
 
 class PolicySizes:
-    """Properties of a `DiffusionPolicy` that follow from its parts."""
+    """Mixin of `DiffusionPolicy` properties that follow from its parts."""
 
     module: nn.ModuleDict
     sampler: Sampler
@@ -34,17 +34,17 @@ class PolicySizes:
 
     @property
     def vision(self) -> VisionEncoder | None:
-        """Encoder of the cameras."""
+        """Camera encoder."""
         return self.module["encode"].condition.vision
 
     @property
     def device(self) -> torch.device:
-        """Where the networks are, and policy calls and their noise must be; ``policy.to("cuda")`` moves it."""
+        """Device of the networks, required of policy calls and their noise; ``policy.to("cuda")`` changes it."""
         return self.network.pos_emb.device
 
     @property
     def n_obs_steps(self) -> int:
-        """Observation steps To that the condition holds."""
+        """Observation steps To in the condition."""
         return self.network.n_obs_steps
 
     @property
@@ -59,7 +59,7 @@ class PolicySizes:
 
     @property
     def horizon(self) -> int:
-        """Actions that the network denoises, H; a chunk leaves out those before the present step."""
+        """Actions that the network denoises, H; a chunk omits those before the present step."""
         return self.network.horizon
 
     @property
@@ -68,7 +68,7 @@ class PolicySizes:
         return self.horizon - self.n_obs_steps + 1, self.network.input_dim
 
     def set_keys(self, **names: NestedKey | None) -> None:
-        """Read an environment that has other names, as losses of TorchRL do.
+        """Rename the environment's keys, as TorchRL losses do.
 
         Args:
             names: ``state``, the environment's key, ``("observation", "state")`` where none is set. The policy reads its
@@ -85,7 +85,7 @@ class PolicySizes:
         self.sampler = self.sampler  # which lists the keys again
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what is carried of one environment, see :mod:`torchrl_sparse.carried`."""
+        """Return the spec of the keys carried for one environment, see :mod:`torchrl_sparse.carried`."""
         frames = (self.n_obs_steps, 0 if self.vision is None else self.vision.feature_dim)
         known = {keys.FRAME_FEATURES: Entry(frames)}
         return {key: known[key] for key in carried_keys(self) if key in known}

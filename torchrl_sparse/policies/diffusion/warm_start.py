@@ -1,4 +1,4 @@
-"""Policy calls that begin from the last chunk instead of from noise, so that one or two network calls are enough.
+"""Warm starts: policy calls that begin from the last chunk instead of noise, so that one or two network calls suffice.
 
 Most of what a policy is asked for it has planned before: the actions of the last chunk for the steps that are still to
 come. A warm start shifts that chunk to the present step, noises it to the timestep of one of the sampler's last steps,
@@ -39,7 +39,7 @@ __all__ = ["QueryStart", "WarmStart", "shift_chunk", "stored_start"]
 
 
 def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
-    """Return f32 [B, length, A], the entries ``by``, ``by + 1``, ... of ``chunk``, its first and last one repeated.
+    """Return the entries ``by``, ``by + 1``, ... of ``chunk``, f32 [B, length, A], repeating its first and last one.
 
     Args:
         chunk: f32 [B, n, A].
@@ -53,7 +53,7 @@ def shift_chunk(chunk: Tensor, by: Tensor, length: int) -> Tensor:
 
 
 class QueryStart(TensorDictModuleBase):
-    """Has every policy call begin from noise: it reads and writes nothing.
+    """Default start, from noise: reads and writes nothing.
 
     A stage of one's own subclasses it, reads what it likes, and writes ``("diffusion", "start")`` f32 [*B, H, A], a
     normalised guess of the actions, and ``("diffusion", "num_steps")`` i64 [*B, 1], how many of the sampler's last steps
@@ -65,7 +65,7 @@ class QueryStart(TensorDictModuleBase):
     out_keys: list[NestedKey] = []
 
     def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
-        """Prepare to serve a policy of these parts; it calls this when it is given the start or another sampler.
+        """Prepare for a policy with these parts; the policy calls it on assignment of the start or another sampler.
 
         Raises:
             InputError: if the start cannot serve them; it then stays as it was.
@@ -73,7 +73,7 @@ class QueryStart(TensorDictModuleBase):
 
     @property
     def name(self) -> str:
-        """What it is, for people and logs; empty where policy calls begin from noise."""
+        """Name for people and logs; empty for starts from noise."""
         return ""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -81,7 +81,7 @@ class QueryStart(TensorDictModuleBase):
 
 
 class WarmStart(QueryStart):
-    """Has policy calls begin from the last chunk, see the module; ``policy.start = WarmStart(1)`` is all that it takes.
+    """Start from the last chunk, see the module; ``policy.start = WarmStart(1)`` enables it.
 
     Reads ``("control", "last_chunk")`` and ``("control", "elapsed")``, which `ChunkExecutor` hands to a policy that asks for
     them. Samples at the beginning of their episode, and calls that come without these keys, begin from noise.
@@ -137,7 +137,7 @@ class WarmStart(QueryStart):
 
 
 def stored_start(start: QueryStart) -> int | None:
-    """Return what a policy's file says of its start: the steps of a warm policy call, None where all begin from noise.
+    """Return the start for a policy's file: the steps of a warm policy call, or None for starts from noise.
 
     Raises:
         InputError: for a start of another class.

@@ -1,4 +1,4 @@
-"""Reading the inputs of a vision-language-action policy from a flat TensorDict [B]: errors name key, expected and found."""
+"""Readers of a vision-language-action policy's inputs from a flat TensorDict [B]; errors name key, expected and found."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_state(td: TensorDictBase, key: NestedKey, size: int) -> Tensor:
 
 
 def read_keep_mask(td: TensorDictBase, num_visual: int) -> Tensor | None:
-    """Return the visual tokens to keep, bool [B, num_visual], or None if nobody has written a mask.
+    """Return the visual tokens to keep, bool [B, num_visual], or None if no mask was written.
 
     Raises:
         InputError: if it has another type or size.
@@ -56,7 +56,7 @@ def read_keep_mask(td: TensorDictBase, num_visual: int) -> Tensor | None:
 
 
 def read_instructions(td: TensorDictBase, key: NestedKey) -> list[str]:
-    """Return B instructions; one for all is repeated.
+    """Return B instructions, repeating a single one.
 
     Raises:
         KeyError: if it is missing.

@@ -1,4 +1,4 @@
-"""OpenVLA-OFT as a TorchRL policy: camera images, state and an instruction in, a chunk of actions and its costs out."""
+"""OpenVLA-OFT as a TorchRL policy: camera images, state and instruction in; a chunk of actions and its costs out."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
 
     @property
     def pruner(self) -> TokenPruner | None:
-        """The method that drops visual tokens; None is dense."""
+        """Pruner of visual tokens; None is dense."""
         return self._pruner
 
     @pruner.setter
@@ -112,7 +112,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         self._update_keys()
 
     def with_pruner(self, pruner: TokenPruner | None) -> VLAPolicy:
-        """Return a policy of the same network under another pruner.
+        """Return a policy with the same network and another pruner.
 
         Raises:
             InputError: if the pruner does not fit the network.
@@ -170,7 +170,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         return dense(tensordict.select(*self.in_keys, strict=False), self).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
-        """Return normalised actions f32 [B, H, A] of a call [B], and the decoder's output; a pruner writes into ``query``."""
+        """Return normalised actions f32 [B, H, A] and the decoder's output for a call [B]; a pruner writes into ``query``."""
         config, names = self.network.config, self.tensor_keys
         images = self.crop_images(query)
         state = read_state(query, names.state, config.state_dim)
@@ -190,7 +190,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         return actions, decoded
 
     def crop_images(self, query: TensorDictBase) -> Tensor:
-        """Return the images, u8 [B, cameras, 3, h, w], cropped; replace those in ``query``, whose patches a pruner compares."""
+        """Return cropped images, u8 [B, cameras, 3, h, w]; also replace those in ``query``, whose patches a pruner compares."""
         config, names = self.network.config, self.tensor_keys
         cameras = [names.image, *([] if names.wrist_image is None else [names.wrist_image])]
         images = read_images(query, cameras, config.image_size)
@@ -215,7 +215,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def save_pretrained(self, path: str | Path) -> None:
-        """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``; of a `base`, its digest alone."""
+        """Write ``config.json`` and fp16 ``model.safetensors`` into the folder ``path``; only the digest of a `base`."""
         stored = StoredVLA(self.network, self.normalizer, self.tokenizer, self.source, self.base)
         write_vla(Path(path), stored)
 
@@ -229,7 +229,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         fold: bool = True,
         **published: Any,
     ) -> VLAPolicy:
-        """Load what `save_pretrained` wrote, or a folder as OpenVLA-OFT is published. Nothing in the files is executed.
+        """Load a folder written by `save_pretrained` or published for OpenVLA-OFT. Nothing in the files is executed.
 
         Args:
             path: the folder.

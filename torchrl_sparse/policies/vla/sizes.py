@@ -1,4 +1,4 @@
-"""How large a policy call and an answer of a VLA are: what its network and its pruner say."""
+"""Sizes of a VLA policy's inputs and outputs, from its network and its pruner."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["VLASizes"]
 
 
 class VLASizes:
-    """Properties of a `VLAPolicy` that follow from its network and its pruner."""
+    """Mixin of `VLAPolicy` properties that follow from its network and its pruner."""
 
     network: VLANetwork
     pruner: TokenPruner | None
@@ -33,5 +33,5 @@ class VLASizes:
         return self.horizon, self.network.config.action_dim
 
     def carried(self, chunk: Entry | None) -> dict[NestedKey, Entry]:
-        """Return what the pruner carries of one environment, see :mod:`torchrl_sparse.carried`."""
+        """Return the spec of the keys that the pruner carries for one environment, see :mod:`torchrl_sparse.carried`."""
         return {} if self.pruner is None else self.pruner.carried(chunk)

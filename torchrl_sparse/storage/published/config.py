@@ -1,4 +1,4 @@
-"""The configuration in a published checkpoint: OmegaConf objects in a pickle, read as data.
+"""Configurations in published checkpoints: OmegaConf objects in a pickle, read as data.
 
 References to other entries (``${task.obs_dim}``) are followed. Expressions (``${eval:'...'}``,
 ``${now:...}``) are text that is never evaluated.
@@ -40,7 +40,7 @@ _REQUIRED = object()
 
 
 class PublishedConfig:
-    """Entries by dotted path.
+    """Configuration entries by dotted path.
 
     Args:
         tree: what `read_pickle` found: records of OmegaConf objects, or plain containers.
@@ -61,7 +61,7 @@ class PublishedConfig:
             raise InputError(f"cfg: expected a configuration, got {type(tree).__name__}")
 
     def get(self, path: str, kind: type, default: Any = _REQUIRED) -> Any:
-        """Return the entry at ``path``, references followed.
+        """Return the entry at ``path`` with references resolved.
 
         Args:
             path: keys joined by dots.
@@ -88,7 +88,7 @@ class PublishedConfig:
         return value
 
     def names(self, path: str) -> list[str] | None:
-        """Return the names in the list at ``path``, or of the entries of the dict there; None if there is neither.
+        """Return the items of the list, or the keys of the dict, at ``path``; None if there is neither.
 
         Raises:
             InputError: if there are too many, or it holds anything but names.
@@ -102,12 +102,12 @@ class PublishedConfig:
         return list(found)
 
     def literal(self, path: str, kind: type) -> Any:
-        """Return the entry at ``path``; None if there is none, or an expression; errors as of `get`."""
+        """Return the entry at ``path``; None if it is missing or an expression; errors as in `get`."""
         found = self._find(path, _MAX_DEPTH)
         return None if isinstance(found, str) and "${" in found else self.get(path, kind, None)
 
     def value(self, path: str) -> Any:
-        """Return what is at ``path``, of any type; None if there is nothing."""
+        """Return the value at ``path``, of any type; None if it is missing."""
         return self._find(path, _MAX_DEPTH)
 
     def _find(self, path: str, depth: int) -> Any:

@@ -1,4 +1,4 @@
-"""Checkpoints of the published Diffusion Policy code (arXiv:2303.04137), transformer policies.
+"""Reader of transformer checkpoints of the published Diffusion Policy code (arXiv:2303.04137).
 
 A checkpoint is ``torch.save`` of ``{"cfg": OmegaConf, "state_dicts": {"model", "ema_model", "optimizer"},
 "pickles": {name: pickled bytes}}``, pickled by dill. Here all of it is data: nothing in it is executed, no

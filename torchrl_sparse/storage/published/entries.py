@@ -1,4 +1,4 @@
-"""Which entries of a published configuration are read, which must have one value, and which say nothing about a policy call.
+"""Entries of a published configuration: those that are read, those with one supported value, and those irrelevant to inference.
 
 What a policy computes, observes and does depends on every entry of its ``policy`` and ``task`` sections. So an entry is
 read (and compared with the tensors where those tell), fixed to the value that is supported, or listed as one that a call
@@ -23,7 +23,7 @@ _HYDRA = frozenset({"_target_", "_convert_"})
 
 @dataclass(frozen=True)
 class Section:
-    """The entries that a section may have.
+    """Entries allowed in one section.
 
     Attributes:
         fixed: name -> (what the published code takes where it is missing, what is supported).
@@ -38,7 +38,7 @@ class Section:
     nullable: frozenset[str] = frozenset()
 
     def check(self, config: PublishedConfig, path: str, ignore: Collection[str] = ()) -> None:
-        """Raise InputError for an entry of the section at ``path`` that is not supported, or unknown and not in ``ignore``."""
+        """Raise InputError for an unsupported entry of the section at ``path``, or an unknown one not in ``ignore``."""
         read = self.fixed.keys() | self.read
         for name in config.names(path) or ():
             place = f"{path}.{name}"
@@ -54,7 +54,7 @@ class Section:
 
 
 def check_value(config: PublishedConfig, path: str, default: Any, supported: Any) -> None:
-    """Raise InputError unless the entry at ``path``, or the ``default`` where there is none, is ``supported``."""
+    """Raise InputError unless the entry at ``path``, or ``default`` if it is missing, equals ``supported``."""
     found = config.value(path) if supported is None else config.get(path, type(supported), default)
     if found != supported:
         raise InputError(f"cfg: {path}: expected {_written(supported)}, got {_written(found)}")
@@ -161,7 +161,7 @@ _SIZES = {
 
 
 def check_policy_entries(config: PublishedConfig, *, cameras: bool, ignore: Collection[str]) -> None:
-    """Raise InputError for an entry of ``policy`` that is not known or not supported.
+    """Raise InputError for an unknown or unsupported entry of ``policy``.
 
     Args:
         config: the configuration.
@@ -180,7 +180,7 @@ def check_policy_entries(config: PublishedConfig, *, cameras: bool, ignore: Coll
 def check_task_entries(
     config: PublishedConfig, ignore: Collection[str]
 ) -> tuple[list[str] | None, bool | None]:
-    """Check the entries of ``task``; return the names of the observations and whether actions are absolute, None where unsaid.
+    """Check the entries of ``task``; return observation names and whether actions are absolute, None where unspecified.
 
     Raises:
         InputError: for an entry that is not known or not supported, or two that contradict each other.
@@ -209,7 +209,7 @@ def _agreed(said: Mapping[str, Any]) -> Any:
 
 
 def check_sizes(config: PublishedConfig, section: str, sizes: Any, *, cameras: bool) -> None:
-    """Compare what the configuration says of sizes with those of the tensors.
+    """Compare the configuration's sizes with those of the tensors.
 
     Args:
         config: the configuration; expressions in it say nothing.

@@ -1,4 +1,4 @@
-"""How published files that cannot be read are reported: one kind of error, one line, whatever is wrong with them."""
+"""Errors for unreadable published files: one error type, one line, for any defect."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _MAX_TEXT = 600
 
 
 class CheckpointError(InputError):
-    """A file is no checkpoint that can be read; the message names the file, what was expected and what came."""
+    """Error for an unreadable checkpoint; the message names the file, what was expected and what came."""
 
 
 @contextmanager
 def naming_faults(path: Path) -> Iterator[None]:
-    """Turn whatever the file or folder ``path`` brings about, but its absence, into a `CheckpointError` that names it.
+    """Turn any error in reading the file or folder ``path``, except its absence, into a `CheckpointError` that names it.
 
     Files from elsewhere may be wrong in ways that nobody thought of, so any exception counts as theirs.
 

@@ -1,4 +1,4 @@
-"""Pickles read as data: what they hold is returned, what they ask to run is refused.
+"""Reader of pickles as data: their content is returned, and code that they ask to run is refused.
 
 A pickle is a program for a small stack machine, and Python's own machine imports and calls whatever the
 program names. This one has no operation that imports, and calls nothing but the few functions that the
@@ -23,14 +23,14 @@ _MAX_BITS = 64
 
 @dataclass(frozen=True)
 class Name:
-    """A dotted name that a pickle mentions; nothing is looked up under it."""
+    """A dotted name mentioned in a pickle; never imported or looked up."""
 
     path: str
 
 
 @dataclass
 class Record:
-    """Stands for an object whose class is never made: the fields of its state."""
+    """Stand-in for an object whose class is never instantiated: the fields of its state."""
 
     name: str
     state: dict = field(default_factory=dict)
@@ -56,7 +56,7 @@ def read_pickle(
     known: Mapping[str, Callable[..., Any] | None] = PLAIN,
     persistent: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """Read the object that a pickle describes, made of plain containers and what ``known`` makes.
+    """Read the object described by a pickle, built from plain containers and the constructors in ``known``.
 
     Args:
         data: the pickle, of any protocol.

@@ -1,4 +1,4 @@
-"""The parts of a published checkpoint that both kinds of policy have: denoiser and entries of the normaliser."""
+"""Parts common to all published checkpoints: denoiser and normaliser entries."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["read_affine", "read_network", "read_tensors"]
 def read_network(
     archive: TorchArchive, config: PublishedConfig, section: str, stored: dict[str, StoredTensor]
 ) -> TransformerForDiffusion:
-    """Make the denoiser, in evaluation mode.
+    """Build the denoiser, in evaluation mode.
 
     Args:
         archive: the checkpoint.
@@ -93,7 +93,7 @@ def _describe(stored: Mapping[str, StoredTensor], name: str) -> str:
 def read_affine(
     archive: TorchArchive, stored: dict[str, StoredTensor], name: str, size: int
 ) -> tuple[Tensor, Tensor]:
-    """Scale and offset, f32 [size], of one entry of the normaliser; takes it out of ``stored``.
+    """Return scale and offset, f32 [size], of one normaliser entry, and remove it from ``stored``.
 
     Raises:
         InputError: if the entry is missing or of another size.
@@ -107,7 +107,7 @@ def read_affine(
 
 
 def read_tensors(archive: TorchArchive, where: str, stored: Mapping[str, StoredTensor]) -> dict[str, Tensor]:
-    """Read tensors as f32, checked to be finite."""
+    """Read tensors as f32 and check that they are finite."""
     tensors = {}
     for name, value in stored.items():
         if not value.storage.dtype.is_floating_point:

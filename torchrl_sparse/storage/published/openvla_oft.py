@@ -1,4 +1,4 @@
-"""Published OpenVLA-OFT checkpoints (arXiv:2502.19645), folders as on the Hugging Face hub, read as a `StoredVLA`.
+"""Reader of published OpenVLA-OFT checkpoints (arXiv:2502.19645), folders as on the Hugging Face hub, to a `StoredVLA`.
 
 Read are ``config.json``, the safetensors shards, ``action_head--*_checkpoint.pt`` and ``proprio_projector--*_checkpoint.pt``
 (tensors only), ``dataset_statistics.json`` and ``tokenizer.json``. The Python files in such a folder are neither imported nor
@@ -77,7 +77,7 @@ _HEAD_NAMES = {"mlp_resnet_blocks": "blocks", ".ffn.": ".", "model.": ""}
 
 
 def is_openvla_oft(path: str | Path) -> bool:
-    """Tell whether a folder is in the published layout, by its ``config.json``; not whether it is complete.
+    """Tell by ``config.json`` whether a folder has the published layout; other files are not checked.
 
     >>> is_openvla_oft("assets/vla")
     False
@@ -88,7 +88,7 @@ def is_openvla_oft(path: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class Unsaid:
-    """What a folder does not say; see `VLAPolicy.from_openvla_oft`.
+    """Settings that a published folder does not contain; see `VLAPolicy.from_openvla_oft`.
 
     Raises:
         InputError: if there are not one or two cameras, or no three numbers of heads.
@@ -109,7 +109,7 @@ class Unsaid:
 def read_openvla_oft(
     path: Path, *, unnorm_key: str | None, unsaid: Unsaid, dtype: torch.dtype | None
 ) -> StoredVLA:
-    """Read the policy in the folder ``path``; see `VLAPolicy.from_openvla_oft`.
+    """Read a policy from the folder ``path``; see `VLAPolicy.from_openvla_oft`.
 
     Raises:
         FileNotFoundError: if a file is not there.

@@ -1,4 +1,4 @@
-"""``dataset_statistics.json`` of an OpenVLA-OFT folder (arXiv:2502.19645) as the normaliser of states and actions."""
+"""Normaliser of states and actions from an OpenVLA-OFT folder's ``dataset_statistics.json`` (arXiv:2502.19645)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sampler of a published checkpoint, from the entries of diffusers' scheduler and of the policy.
+"""Sampler of a published checkpoint, from its diffusers scheduler and policy entries.
 
 All entries of diffusers' ``DDPMScheduler`` and ``DDIMScheduler`` are known: honoured, supported at one value, or without
 effect at the supported ones (``beta_start`` and ``beta_end`` belong to other schedules of betas, ``sample_max_value`` and
@@ -39,7 +39,7 @@ _SECTIONS = {
 
 
 def read_sampler(config: PublishedConfig, ignore: Collection[str] = ()) -> Sampler:
-    """Make the sampler.
+    """Build the sampler of a published checkpoint.
 
     Args:
         config: the configuration.

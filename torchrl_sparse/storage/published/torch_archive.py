@@ -1,4 +1,4 @@
-"""Files of ``torch.save`` read as data: a zip archive that holds a pickle and the bytes of its tensors."""
+"""Reader of ``torch.save`` files as data: a zip archive with a pickle and the bytes of its tensors."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class _Storage:
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor of an archive that has not been read yet; its place has been checked to lie in its storage."""
+    """A tensor of an archive, not yet read; its range has been checked to lie in its storage."""
 
     storage: _Storage
     offset: int
@@ -62,10 +62,10 @@ class StoredTensor:
 
 
 class TorchArchive:
-    """A file of ``torch.save``, open for reading. Nothing in it is executed, and tensors are read one by one.
+    """An open ``torch.save`` file. Nothing in it is executed, and tensors are read one by one.
 
-    What it says of a tensor is compared with its record before anything is made of it, and all tensors that are read take
-    no more than a few times the room of the file.
+    A tensor's description is compared with its record before it is read, and all tensors that are read take at most a few times
+    the file's size.
 
     Args:
         path: the file.
@@ -106,7 +106,7 @@ class TorchArchive:
         self._zip.close()
 
     def contents(self, known: Mapping[str, Callable[..., Any] | None] = PLAIN) -> Any:
-        """Return the saved object with a `StoredTensor` in the place of each tensor.
+        """Return the saved object with each tensor replaced by a `StoredTensor`.
 
         Args:
             known: names that the pickle may mention besides those of tensors, see `read_pickle`.

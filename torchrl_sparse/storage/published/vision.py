@@ -1,4 +1,4 @@
-"""The cameras of a published image policy: their layout, and robomimic's encoder as `VisionEncoder`."""
+"""Cameras of a published image policy: observation layout, and robomimic's encoder as a `VisionEncoder`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RENAMED = ((r"^nets\.0\.nets\.", "trunk."), (r"^nets\.1\.nets\.", "keypoints.")
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """Observations of a published image policy.
+    """Observation layout of a published image policy.
 
     Attributes:
         order: robomimic's name -> size in the condition, in the published order.
@@ -43,7 +43,7 @@ class ImageLayout:
 
     @classmethod
     def of(cls, config: PublishedConfig) -> ImageLayout:
-        """Parse the layout that ``policy.shape_meta`` describes.
+        """Parse the layout in ``policy.shape_meta``.
 
         Raises:
             InputError: if there is no camera or no state, or images of several sizes.
@@ -77,7 +77,7 @@ class ImageLayout:
         return sum(self.order.values())
 
     def columns(self) -> list[int]:
-        """Return the indices, in the published condition, of each number of the condition here, cameras first."""
+        """Return for each number of this library's condition, cameras first, its index in the published condition."""
         first, places = 0, {}
         for key, size in self.order.items():
             places[key] = range(first, first + size)
@@ -88,7 +88,7 @@ class ImageLayout:
 def read_vision(
     archive: TorchArchive, config: PublishedConfig, layout: ImageLayout, stored: dict[str, StoredTensor]
 ) -> VisionEncoder:
-    """Make the encoder of all cameras, in evaluation mode.
+    """Build the encoder of all cameras, in evaluation mode.
 
     Args:
         archive: the checkpoint.

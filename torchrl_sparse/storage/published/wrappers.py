@@ -1,4 +1,4 @@
-"""Names of weights that were saved while a wrapper held the module."""
+"""Removal of wrapper prefixes from the names of saved weights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WRAPPERS = frozenset({"module", "_orig_mod", "_fsdp_wrapped_module", "_checkpoi
 
 
 def without_wrappers(where: str, tensors: Mapping[str, T]) -> dict[str, T]:
-    """Return ``tensors`` under the names that they have without wrappers, at any depth.
+    """Return ``tensors`` with wrapper names removed from their names, at any depth.
 
     Raises:
         InputError: if two would have one name.

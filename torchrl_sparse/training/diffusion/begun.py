@@ -1,4 +1,4 @@
-"""A trained diffusion policy to go on training: options that ask for what it has not are refused, but for dropout."""
+"""Further training of a trained diffusion policy; options that conflict with it are refused, except dropout."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def begun_policy(
     crop: float | None = None,
     width: int | None = None,
 ) -> DiffusionPolicy:
-    """Read a policy to train on: its weights, sizes, normaliser, sampler and source stay, its planner does not.
+    """Read a policy for further training, with its weights, sizes, normaliser, sampler and source, but without its planner.
 
     Args:
         path: see `DiffusionPolicy.from_pretrained`.
-        sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, which no weight
-            depends on, is changed to what is asked for.
+        sizes: arguments of `TransformerForDiffusion` that are asked for, None for the policy's own. Dropout, on which no weight
+            depends, is set to the requested value.
         state_mode, crop, width: as of `untrained_policy`; None for the policy's own.
 
     Raises:
@@ -58,7 +58,7 @@ def begun_policy(
 def continued_policy(
     path: str | Path, task: str, cameras: Mapping[str, str], sizes: Mapping[str, Any], **asked: Any
 ) -> DiffusionPolicy:
-    """Read a policy to train on for a task of the library: its ``source`` then names the task.
+    """Read a policy for further training on a task of the library, which its ``source`` then names.
 
     Args:
         path, sizes, asked: see `begun_policy`.

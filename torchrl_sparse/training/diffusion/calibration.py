@@ -1,4 +1,4 @@
-"""The calibration of a policy on what it observes in its environment."""
+"""Calibration of a policy on observations from its environment."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["calibrate_policy", "lazy_calibration"]
 def calibrate_policy(
     policy: DiffusionPolicy, make_env: Callable[..., EnvBase], seeds: Sequence[int]
 ) -> Calibration:
-    """Calibrate on the first observation of one episode per seed, as BAC's release does with a single one."""
+    """Calibrate on the first observation of one episode per seed; BAC's release uses a single one."""
     env = make_env(seeds=list(seeds))
     first = torch.stack([env.reset() for _ in seeds]).to(policy.device)
     env.close()
@@ -31,5 +31,5 @@ def calibrate_policy(
 def lazy_calibration(
     policy: DiffusionPolicy, make_env: Callable[..., EnvBase], samples: int
 ) -> Callable[[], Calibration]:
-    """Return a function that calibrates on that many first observations when it is first called."""
+    """Return a function that calibrates on that many first observations when first called."""
     return cache(partial(calibrate_policy, policy, make_env, tuning_seeds(CALIBRATION_SEED, samples)))

@@ -26,7 +26,7 @@ def noise_prediction_loss(
     noise: Tensor,
     timestep: Tensor,
 ) -> Tensor:
-    """Return the mean squared error between ``noise`` and the network's prediction of it, a scalar.
+    """Return the mean squared error, a scalar, of the network's prediction of ``noise``.
 
     Args:
         network: noise predictor.
@@ -80,7 +80,7 @@ class DiffusionLoss(LossModule):
         self.sampler = Sampler() if sampler is None else sampler
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return ``{"loss": scalar}`` of a batch.
+        """Return ``{"loss": scalar}`` for a batch.
 
         Raises:
             InputError: if the chunk does not have the network's horizon and action size.

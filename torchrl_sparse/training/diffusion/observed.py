@@ -1,4 +1,4 @@
-"""Windows of demonstrations as the condition of a policy's network."""
+"""Encoding of demonstration windows as a policy network's condition."""
 
 from __future__ import annotations
 
@@ -15,6 +15,6 @@ _ENCODE_BATCH = 64  # windows whose images are in memory as floats at a time
 
 @torch.no_grad()
 def encode_windows(policy: DiffusionPolicy, windows: TensorDict) -> Tensor:
-    """Return the condition f32 [B, To, D] of windows [B] of `Demonstrations.windows`, where the policy is."""
+    """Return the condition f32 [B, To, D] of windows [B] from `Demonstrations.windows`, on the policy's device."""
     condition = policy.module["encode"].condition
     return torch.cat([condition(part.to(policy.device)) for part in windows.split(_ENCODE_BATCH)])

@@ -1,4 +1,4 @@
-"""Which weights decay."""
+"""Weight-decay groups of the optimiser."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["optimizer_groups"]
 
 
 def optimizer_groups(network: nn.Module, weight_decay: float) -> list[dict]:
-    """Return the parameter groups for AdamW as published: only Linear and attention weights decay.
+    """Return AdamW parameter groups as published: only Linear and attention weights decay.
 
     Args:
         network: any module.

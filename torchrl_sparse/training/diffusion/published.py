@@ -1,4 +1,4 @@
-"""The published shapes of Diffusion Policy's transformer on states (arXiv:2303.04137, Table VII), by task."""
+"""Published shapes of Diffusion Policy's transformer on states (arXiv:2303.04137, Table VII), by task."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["PublishedShape", "published_network", "published_shape", "with_publi
 
 @dataclass(frozen=True)
 class PublishedShape:
-    """The choices that differ between tasks; all networks have 8 layers and 4 heads.
+    """Published choices that differ between tasks; all networks have 8 layers and 4 heads.
 
     Attributes:
         horizon: actions of a chunk (Tp).
@@ -41,7 +41,7 @@ _SHAPES = {
 
 
 def published_shape(task: str) -> PublishedShape:
-    """Return the shape for a task; the robosuite tasks share one, which those without a published policy get too.
+    """Return the published shape for a task. The robosuite tasks share one, also used for tasks without a published policy.
 
     Raises:
         InputError: if there is no such task.
@@ -53,7 +53,7 @@ def published_shape(task: str) -> PublishedShape:
 
 
 def executed_steps(task: str, source: Mapping[str, Any], chosen: int | None = None) -> int:
-    """Return how many actions of a chunk are executed: ``chosen``, else what ``source`` says, else what is published.
+    """Return the executed actions per chunk: ``chosen``, else from ``source``, else the published number.
 
     Args:
         task: a name or alias.
@@ -70,7 +70,7 @@ def executed_steps(task: str, source: Mapping[str, Any], chosen: int | None = No
 
 
 def with_published(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``options`` with the published choice for the task where they are None and `PublishedShape` has one.
+    """Return ``options`` with None replaced by the task's published choice, where `PublishedShape` has one.
 
     Raises:
         InputError: if there is no such task.

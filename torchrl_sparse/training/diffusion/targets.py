@@ -1,4 +1,4 @@
-"""Calibration sets: observations that gates are trained on, and the actions that a pruned policy should give there.
+"""Calibration sets for training gates: observations and target actions for the pruned policy.
 
 The calibration set of SAG (arXiv:2601.12894, Section 3.3), also with the policy calls of the closed loop.
 """
@@ -48,7 +48,7 @@ def make_targets(
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TensorDict:
-    """Return a uniform sample of demonstration windows with the actions that a pruned policy should give there.
+    """Return a uniform sample of demonstration windows with target actions for the pruned policy.
 
     Args:
         policy: the dense policy with the sampler that will be pruned.
@@ -101,7 +101,7 @@ def add_queries(
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TensorDict:
-    """Return targets together with those of policy calls made in closed loop, in random order.
+    """Return targets merged with those of closed-loop policy calls, in random order.
 
     A pruned policy comes to states that demonstrations do not hold; as in DAgger (arXiv:1011.0686), the dense policy
     gives the targets there.
@@ -128,7 +128,7 @@ def dense_answers(
     queries: TensorDictBase,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Tensor:
-    """Return the dense policy's actions, normalised, f32 [N, H, A], whatever its planner.
+    """Return the dense policy's actions, normalised, f32 [N, H, A], ignoring its planner.
 
     Args:
         policy: the policy with its sampler.
@@ -144,7 +144,7 @@ def dense_answers(
 
 @torch.no_grad()
 def planned_answers(policy: DiffusionPolicy, queries: TensorDictBase) -> Tensor:
-    """Return the policy's actions under its planner, normalised, f32 [N, H, A]; arguments as of `dense_answers`."""
+    """Return the policy's actions under its planner, normalised, f32 [N, H, A]; arguments as in `dense_answers`."""
     parts = queries.select(keys.COND, keys.SEED).split(ANSWER_BATCH)
     return torch.cat([_answer(policy, part, policy.plan(part)[keys.PRUNE_MASK]) for part in parts])
 
@@ -155,14 +155,14 @@ def _answer(policy: DiffusionPolicy, queries: TensorDictBase, mask: Tensor | Non
 
 
 def save_targets(path: str | Path, targets: TensorDict, made_for: Mapping[str, Any]) -> None:
-    """Write targets and what they were ``made_for``, JSON values, in one piece or not at all."""
+    """Write targets and their settings ``made_for`` (JSON values) atomically."""
     tensors = dict(targets.flatten_keys("/").items())
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, {"made_for": json.dumps(made_for)})
 
 
 def load_targets(path: str | Path, made_for: Mapping[str, Any]) -> TensorDict:
-    """Read what `save_targets` wrote.
+    """Load targets written by `save_targets`.
 
     Raises:
         FileNotFoundError: if there is no file.

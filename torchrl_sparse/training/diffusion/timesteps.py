@@ -1,4 +1,4 @@
-"""A search for the timesteps at which a chain of few denoising steps does best.
+"""Search for the timesteps of a short denoising chain.
 
 A sampler may stop at any timesteps. The spacing ``"leading"`` in a few steps begins too low for a sample of pure noise
 and spends the last step at timestep 0, where hardly any noise is left; ``"logsnr"`` is a rule that mends both without
@@ -36,7 +36,7 @@ def search_timesteps(
     num_train_timesteps: int = 100,
     strides: Sequence[int] = (10, 5, 2),
 ) -> tuple[tuple[int, ...], dict[tuple[int, ...], float]]:
-    """Move one timestep at a time, always where it helps most, until no move of any stride helps.
+    """Search by coordinate descent: move the timestep that helps most until no move of any stride helps.
 
     Args:
         error: of a chain with these timesteps, falling; called once for each.
@@ -75,7 +75,7 @@ def search_timesteps(
 def demonstration_error(
     policy: DiffusionPolicy, targets: TensorDict, sampler: Sampler, *, n_action_steps: int = 8
 ) -> float:
-    """Return the mean absolute error, normalised, of the actions executed under a sampler against demonstrated ones.
+    """Return the mean absolute error, normalised, of a sampler's executed actions against demonstrated ones.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.
@@ -94,13 +94,13 @@ def demonstration_error(
 
 
 def planned_error(policy: DiffusionPolicy, targets: TensorDict, *, n_action_steps: int = 8) -> float:
-    """Return the same error of a policy under its own sampler and planner; arguments as of `demonstration_error`."""
+    """Return the `demonstration_error` of a policy under its own sampler and planner, with the same arguments."""
     return _executed_error(policy, planned_answers(policy, targets), targets, n_action_steps)
 
 
 @dataclass(frozen=True)
 class FoundTimesteps:
-    """What `find_timesteps` found.
+    """Result of `find_timesteps`.
 
     Attributes:
         sampler: the chain of least error.
@@ -127,7 +127,7 @@ def find_timesteps(
     n_action_steps: int = 8,
     on_chain: Callable[[], object] = lambda: None,
 ) -> FoundTimesteps:
-    """Search the timesteps of a chain that come closest to demonstrations, from the best of the spacings on.
+    """Search for the timesteps whose actions are closest to demonstrations, starting from the best spacing rule.
 
     Args:
         policy: the trained policy; its own sampler and planner do not matter.

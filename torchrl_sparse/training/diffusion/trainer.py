@@ -1,4 +1,4 @@
-"""Training a diffusion policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
+"""Training of a diffusion policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _VISION_WEIGHT_DECAY = 1e-6  # of all weights of the cameras' encoder, as publis
 
 
 class PolicyTrainer(DemonstrationTrainer):
-    """Trains the networks of a diffusion policy on demonstrations.
+    """Trainer of a diffusion policy's networks on demonstrations.
 
     Args:
         policy: the policy, whose networks are trained in place. Normaliser, sampler and ``source`` stay as they are.
@@ -50,7 +50,7 @@ class PolicyTrainer(DemonstrationTrainer):
         super().__init__(module, config, groups, *split_windows(demos, sizes, config.val_ratio))
 
     def ema_policy(self, sampler: Sampler | None = None) -> DiffusionPolicy:
-        """Return a policy with copies of the networks, the averaged weights in them.
+        """Return a policy with copies of the networks that hold the averaged weights.
 
         Args:
             sampler: of as many training steps as the policy's; None for the policy's own.

@@ -1,4 +1,4 @@
-"""A diffusion policy with random weights that fits demonstrations, to be trained on them."""
+"""Construction of an untrained diffusion policy that fits the demonstrations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def untrained_policy(
     width: int = 64,
     seed: int = 0,
 ) -> DiffusionPolicy:
-    """Return a policy whose inputs, outputs and normaliser are those of demonstrations.
+    """Return an untrained policy with the demonstrations' inputs, outputs and normaliser.
 
     Args:
         demos: decide the sizes of state, action and images, and the normaliser.

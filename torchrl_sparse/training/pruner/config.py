@@ -1,4 +1,4 @@
-"""Options of the training of gates."""
+"""Options for training gates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Cost = Literal["blocks", "flops", "seconds"]
 
 @dataclass(frozen=True)
 class PrunerConfig:
-    """Options of a training; defaults as published, but for ``reuse``.
+    """Options of gate training; defaults as published, except ``reuse``.
 
     Attributes:
         objective: what the gates are to change little: ``"actions"``, the final actions of the pruned chain (SAG; static
@@ -114,7 +114,7 @@ class PrunerConfig:
             raise InputError(f"information: expected None without variety, got {self.information}")
 
     def temperature_at(self, progress: float) -> float:
-        """Return the temperature at a share of the training, 0 to 1.
+        """Return the temperature at a fraction of the training, 0 to 1.
 
         >>> PrunerConfig(temperature=4.0, final_temperature=0.25).temperature_at(0.5)
         1.0

@@ -1,4 +1,4 @@
-"""The planners that trained gates become."""
+"""Export of trained gates as planners."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["export_planner", "exported"]
 
 
 def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping[str, Any]) -> Path:
-    """Write the planner that was trained so far; return where.
+    """Write the planner from the training so far and return its path.
 
-    That is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
-    objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the
-    schedule of their mean mask, the ablation, beside it: ``fixed.json``.
+    The planner is a cache schedule for static gates, ``l2c.json``, or ``l2c_noise.json`` with Learning-to-Cache's own
+    objective. For gates that read the observation it is a folder ``pruner`` for `SAGPruner.from_pretrained`, with the schedule
+    of their mean mask, the ablation, beside it: ``fixed.json``.
 
     Args:
         trainer: the gates, and what they were trained for.
@@ -56,7 +56,7 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
 
 
 def exported(folder: str | Path) -> list[str]:
-    """Return the names under which a benchmark finds what `export_planner` wrote into ``folder``.
+    """Return the names by which a benchmark finds planners that `export_planner` wrote into ``folder``.
 
     >>> exported("assets/lift")
     ['l2c', 'l2c_noise']

@@ -1,4 +1,4 @@
-"""Where gates begin their training: fitted to given masks, or different for every observation."""
+"""Initialisation of gates before training: fitted to given masks, or different for every observation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fit_to_masks(
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Fit untrained gates to a mask, the same for all observations, as the start of their training.
+    """Fit untrained gates to observation-independent masks, as a start for their training.
 
     Gates that read the rate can be fitted to several masks, each at its own prune rate; with a single one, they know nothing
     of other rates.
@@ -76,7 +76,7 @@ def fit_to_masks(
 
 @torch.no_grad()
 def spread_logits(gates: PrunerNetwork, targets: TensorDict, spread: float, *, samples: int = 256) -> None:
-    """Have untrained gates begin with masks that differ between observations, in place.
+    """Change untrained gates in place so that their masks differ between observations.
 
     Initialised as usual, gates are next to blind. Published normalisers scale a whole state by one number, so that most of
     what tells two observations apart is far smaller than 1, and every layer makes it smaller. Once the logits of the cells have

@@ -1,4 +1,4 @@
-"""The gates that can be trained."""
+"""Trainable pruning gates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["GATES", "Gates", "make_gates"]
 
 
 class Gates(Protocol):
-    """A module whose logits are positive where pruning is preferred.
+    """Module whose logits are positive where pruning is preferred.
 
     Attributes:
         rate_input: whether the target prune rate is an input.
@@ -28,7 +28,7 @@ class Gates(Protocol):
     is_static: bool
 
     def prune_logits(self, cond: Tensor, rate: Tensor | None = None) -> Tensor:
-        """Return f32 [B, K, 3L] for encoded observations f32 [B, To, D] and, if it is an input, rates f32 [B, 1]."""
+        """Return f32 [B, K, 3L] for encoded observations f32 [B, To, D] and, if used, rates f32 [B, 1]."""
         ...
 
 
@@ -59,7 +59,7 @@ GATES: dict[str, Callable[..., nn.Module]] = {"sag": _sag, "l2c": _l2c}
 def make_gates(
     method: str, policy: DiffusionPolicy, *, rate_input: bool = False, seed: int = 0, **sizes: Any
 ) -> nn.Module:
-    """Return untrained gates for a policy, where it is.
+    """Return untrained gates for a policy, on its device.
 
     Args:
         method: a key of `GATES`: ``"sag"``, which reads the observation, or ``"l2c"``, which does not.

@@ -1,4 +1,4 @@
-"""The sparsity loss of SAG (arXiv:2601.12894, Section 3.3), and what blocks weigh in it."""
+"""SAG's sparsity loss (arXiv:2601.12894, Section 3.3), and the block weights in it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sparsity_loss(gate: Tensor, rate: Tensor, weight: Tensor, *, per_block: bool
 
 
 def mutual_information(logits: Tensor) -> Tensor:
-    """Return how much a batch's gates tell of its observations, in bits of a cell, 0 to 1, a scalar.
+    """Return the mutual information between gates and observations in a batch: bits per cell, 0 to 1, a scalar.
 
     ``H(mean_i p_i) - mean_i H(p_i)``, the mean over all cells after the first step, with ``p_i`` the probability that
     observation i prunes the cell: 0 if every observation prunes alike, 1 if each cell is pruned for half of them, surely.
@@ -59,7 +59,7 @@ def mutual_information(logits: Tensor) -> Tensor:
 
 
 def variety_reward(information: Tensor, asked: float | None) -> Tensor:
-    """Return the reward of masks that tell ``information`` bits of their observations, a scalar.
+    """Return the reward, a scalar, for masks with ``information`` bits about their observations.
 
     Information itself, if none is asked for. Its slope goes to 0 as gates come to prune alike, and then nothing holds them
     apart; with bits that are ``asked`` it is ``log2(information / asked)``, whose slope does not, and 0 from there on.
@@ -79,7 +79,7 @@ def _entropy(probability: Tensor) -> Tensor:
 
 
 def varying_share(masks: Tensor) -> Tensor:
-    """Return the share of the cells, of all K x 3L, in which the masks bool [N, K, 3L] do not all agree.
+    """Return the share of the K x 3L cells in which the masks bool [N, K, 3L] are not all equal.
 
     >>> varying_share(torch.tensor([[[False, False], [True, True]], [[False, False], [True, False]]])).item()
     0.25
@@ -88,12 +88,12 @@ def varying_share(masks: Tensor) -> Tensor:
 
 
 def weighted_rate(gate: Tensor, weight: Tensor) -> Tensor:
-    """Return the share of the cost that is pruned, f32 [B, 1]; see `sparsity_loss`."""
+    """Return the pruned share of the cost, f32 [B, 1]; see `sparsity_loss`."""
     return (gate.mean(dim=1) @ (weight / weight.sum()))[:, None]
 
 
 def block_weights(policy: DiffusionPolicy, cost: Cost) -> Tensor:
-    """Return the cost of each block, f32 [3L], as ``cost`` counts it."""
+    """Return the cost of each block, f32 [3L], in the measure ``cost``."""
     if cost == "blocks":
         return torch.ones(policy.num_blocks)
     costs = policy.block_costs()
@@ -105,7 +105,7 @@ def block_weights(policy: DiffusionPolicy, cost: Cost) -> Tensor:
 
 
 def rate_metrics(gate: Tensor, weight: Tensor) -> dict[str, Tensor]:
-    """Return prune rates, scalars: of all blocks, of the cost, and of each type of block; see `sparsity_loss`."""
+    """Return scalar prune rates: of all blocks, of the cost, and of each block type; see `sparsity_loss`."""
     by_type = gate.mean(dim=(0, 1)).view(-1, len(BLOCK_TYPES)).mean(dim=0)
     shares = {f"rate_{kind}": value for kind, value in zip(BLOCK_TYPES, by_type, strict=True)}
     return {"rate": gate.mean(), "rate_cost": weighted_rate(gate, weight).mean(), **shares}

@@ -1,4 +1,4 @@
-"""Observations that a pruned policy comes to by itself, for its calibration set."""
+"""Closed-loop observations of a pruned policy, for its calibration set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training of gates that decide where to prune: SAG's pruner (arXiv:2601.12894, Section 3.3) and L2C's static gates.
+"""Training of pruning gates: SAG's pruner (arXiv:2601.12894, Section 3.3) and L2C's static gates.
 
 The frozen policy answers observations of a small calibration set under the predicted mask, and the loss is
 
@@ -43,7 +43,7 @@ __all__ = ["PrunerTrainer", "mean_mask"]
 
 
 class PrunerTrainer(Trainer):
-    """Trains gates through a frozen policy.
+    """Trainer of gates through a frozen policy.
 
     Args:
         gates: :class:`~torchrl_sparse.blocks.sag.network.PrunerNetwork` or :class:`~torchrl_sparse.blocks.l2c.StaticGates`.
@@ -93,7 +93,7 @@ class PrunerTrainer(Trainer):
         )
 
     def batch_losses(self, index: Tensor) -> dict[str, Tensor]:
-        """Return the loss, its parts ``"fidelity"`` and ``"sparsity"``, and the prune rates of samples ``index``, i64 [B]."""
+        """Return the loss, its parts ``"fidelity"`` and ``"sparsity"``, and the prune rates for samples ``index``, i64 [B]."""
         batch = self.train_set[index]
         rate = self._draw_rates(len(batch))
         logits = self._logits(batch[keys.COND], rate)
@@ -117,8 +117,9 @@ class PrunerTrainer(Trainer):
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Return the error of the actions and the prune rates on held-out observations, with the masks as they will be
-        used, and how the masks vary over observations: their variance, and the share of the cells that ever differ."""
+        """Return the action error and prune rates on held-out observations, with the final hard masks. Also return how much
+        masks vary over observations: their variance, and the share of cells that ever differ.
+        """
         cond = self.held_out[keys.COND]
         masks = self._masks(cond)
         noise = self.policy.sample_noise(self.held_out[keys.SEED].squeeze(-1))
@@ -141,8 +142,9 @@ class PrunerTrainer(Trainer):
 
     @torch.no_grad()
     def fixed_mask(self) -> Tensor:
-        """Return the mean of the masks of all training observations, bool [K, 3L]: the cells that the gates prune most often,
-        as many as they prune on average. L2C's result, and SAG's ablation that does not read the observation."""
+        """Return the mean mask of all training observations, bool [K, 3L]: the cells pruned most often, as many as are pruned
+        on average. This is L2C's result, and SAG's ablation that does not read the observation.
+        """
         cond = self.train_set[keys.COND]
         masks = (self._masks(part) for part in cond.split(ANSWER_BATCH))
         return mean_mask(sum(mask.sum(dim=0) for mask in masks) / len(cond))
@@ -221,7 +223,7 @@ class PrunerTrainer(Trainer):
 
 
 def mean_mask(share: Tensor) -> Tensor:
-    """Return the mask that is nearest to many, bool [K, 3L]: the cells that are pruned most often, as many as are on average.
+    """Return the mask nearest to many masks, bool [K, 3L]: the cells pruned most often, as many as are pruned on average.
 
     Args:
         share: of the masks that prune each cell, f32 [K, 3L].

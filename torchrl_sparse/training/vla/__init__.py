@@ -1,4 +1,4 @@
-"""Training of vision-language-action policies, and calibration of their token budget."""
+"""Training of vision-language-action policies, and calibration of their token budgets."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Auxiliary stages for towers and a decoder that start from random weights: locating objects, and those that words refer to.
+"""Auxiliary training stages for randomly initialised towers and decoder: locate all objects, then those that words refer to.
 
 Published models begin with towers and a language model that were trained on pictures and texts of the internet. A small
 network without them tends to ignore its images: the arm's own pose predicts most of the next actions. Two stages before the
@@ -29,7 +29,7 @@ _LOCATE_WEIGHT = 0.3  # of the first stage's loss in the second
 
 @dataclass(frozen=True)
 class GroundingConfig:
-    """Optimiser steps of each stage.
+    """Numbers of optimiser steps per stage.
 
     Attributes:
         locate_steps: first steps of a training, in which objects are located from visual tokens, without the decoder.
@@ -51,7 +51,7 @@ class GroundingConfig:
 
 @dataclass(frozen=True)
 class ObjectPositions:
-    """Positions of the n objects of a scene, step by step, and the instruction that refers to each.
+    """Positions of a scene's n objects at each step, and the instruction that refers to each.
 
     Attributes:
         positions: f32 [N, n, 3].
@@ -77,7 +77,7 @@ class ObjectPositions:
             )
 
     def standardised(self) -> ObjectPositions:
-        """Return positions about zero, and of unit size along the axis on which they vary most.
+        """Return positions centred at zero, with unit size along the axis of largest variation.
 
         Raises:
             InputError: if they vary on none, as one object's that nothing moves: there is nothing to locate.
@@ -94,7 +94,7 @@ class ObjectPositions:
 
 
 class Grounding(nn.Module):
-    """The losses of both stages, and the linear layers that regress positions. They are no part of the policy.
+    """Losses of both stages, with linear position regressors that are not part of the policy.
 
     Args:
         policy: whose network is trained; its parameters are not this module's.
@@ -109,15 +109,15 @@ class Grounding(nn.Module):
         self.from_readout = nn.Linear(config.llm.dim, 3)
 
     def locate(self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor) -> Tensor:
-        """Return the L1 loss, a scalar, of ``positions`` f32 [B, n, 3] from the mean of each camera's visual tokens."""
+        """Return the L1 loss, a scalar, of ``positions`` f32 [B, n, 3] regressed from each camera's mean visual token."""
         return self._locate_loss(policy.network.visual_tokens(policy.crop_images(batch)), positions)
 
     def refer(
         self, policy: VLAPolicy, batch: TensorDictBase, positions: Tensor, instructions: Sequence[str]
     ) -> Tensor:
-        """Return the L1 loss, a scalar, of the position of an object drawn for each sample, from the actions' readout.
+        """Return the L1 loss, a scalar, of a randomly chosen object's position, regressed from the action readout.
 
-        A part of `locate`'s is added, so that vision does not forget it before the decoder has learnt to use it.
+        Part of the loss of `locate` is added, so that vision keeps what it learnt until the decoder uses it.
         """
         asked = torch.randint(len(instructions), (len(positions),))
         words = NonTensorStack(*[instructions[index] for index in asked.tolist()])

@@ -14,7 +14,7 @@ __all__ = ["VLALoss", "chunk_l1"]
 
 
 def chunk_l1(predicted: Tensor, target: Tensor, is_pad: Tensor | None = None) -> Tensor:
-    """Return the mean absolute difference of action chunks [B, H, A]; actions with ``is_pad``, bool [B, H], do not count.
+    """Return the mean absolute difference of action chunks [B, H, A], without actions where ``is_pad``, bool [B, H], is True.
 
     >>> import torch
     >>> target = torch.tensor([[[1.0], [9.0]]])
@@ -26,7 +26,7 @@ def chunk_l1(predicted: Tensor, target: Tensor, is_pad: Tensor | None = None) ->
 
 
 class VLALoss(LossModule):
-    """L1 loss of a `VLAPolicy`, on normalised actions.
+    """L1 loss of a `VLAPolicy` on normalised actions.
 
     Reads what the policy reads, the recorded chunk ``("vla_action", "chunk")`` f32 [B, H, A] in environment units, and, where
     it is there, ``"action_is_pad"`` bool [B, H] (as TorchRL's ``ActionChunkTransform`` writes both); writes ``"loss"``.
@@ -54,7 +54,7 @@ class VLALoss(LossModule):
         self.in_keys = [*policy.in_keys, keys.CHUNK, keys.IS_PAD]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return ``{"loss": scalar}`` of a batch [B].
+        """Return ``{"loss": scalar}`` for a batch [B].
 
         Raises:
             InputError: if the chunk does not have the policy's length and action size.

@@ -1,4 +1,4 @@
-"""Measuring what each number of a token pruner costs a policy, in action error or in success, to calibrate it.
+"""Calibration measurements of token pruners: action error or lost success at each token budget.
 
 `torchrl_sparse.methods.token_budget` chooses. The policy calls of recorded episodes are answered again under each number, in
 their order, so that what one call leaves for the next is there as in a rollout, and their actions are compared with the dense
@@ -39,7 +39,7 @@ def recorded_queries(
     make_env: Callable[..., EnvBase],
     seeds: Sequence[int],
 ) -> Iterator[list[TensorDictBase]]:
-    """Record the policy calls, each [], that ``actor`` makes of a dense policy in one episode per seed.
+    """Record the policy calls, each [], of a dense policy under ``actor``, in one episode per seed.
 
     Args:
         policy: whose inputs are recorded, with what pruners and controllers read beside them, and what a controller granted.
@@ -59,7 +59,7 @@ def demonstrated_queries(
     poses: Sequence[tuple[slice, slice]],
     control_freq: float = 20.0,
 ) -> Iterator[list[TensorDictBase]]:
-    """Take the same from demonstrations with images, one policy call each ``every`` steps; no simulator is needed.
+    """Build policy calls from demonstrations with images, one per ``every`` steps; needs no simulator.
 
     The hand's velocity, which demonstrations do not keep, is that of the step before each call, as `EndEffectorVelocity`'s;
     an episode's seed is its place in the file, so that a pruner that draws tokens draws the same ones each time.
@@ -100,7 +100,7 @@ def _rollout(actor: Actor, make_env: Callable[..., EnvBase], seed: int) -> Tenso
 def replay(
     policy: VLAPolicy, queries: Sequence[TensorDictBase], pruner: TokenPruner | None
 ) -> TensorDictBase:
-    """Answer an episode's policy calls in their order, each with what the one before left.
+    """Answer an episode's policy calls in order, each with the keys carried from the previous one.
 
     Returns:
         The policy's ``out_keys`` under ``pruner``, [Q].
@@ -123,7 +123,7 @@ def measure_errors(
     n_action_steps: int,
     on_episode: Callable[[], Any] = lambda: None,
 ) -> list[BudgetPoint]:
-    """Measure the mean action error of each pruner over all policy calls but the first of an episode.
+    """Measure the mean action error of each pruner over all policy calls except an episode's first.
 
     Args:
         policy: any; its own pruner plays no part.
@@ -163,7 +163,7 @@ def measure_success(
     pruners: Mapping[float, TokenPruner],
     on_episode: Callable[[], Any] = lambda: None,
 ) -> list[BudgetPoint]:
-    """Measure by how much each pruner's success rate is below the dense policy's, on the same initial states.
+    """Measure how much each pruner's success rate falls below the dense policy's on the same initial states.
 
     Args:
         make_actor: called with the policy under each pruner; makes its `ChunkExecutor`.

@@ -1,4 +1,4 @@
-"""Training a vision-language-action policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
+"""Training of a vision-language-action policy on demonstrations, see `torchrl_sparse.training.demonstrations`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = ["InstructedDemonstrations", "VLATrainer"]
 
 @dataclass(frozen=True)
 class InstructedDemonstrations:
-    """Demonstrations, each with the instruction that it follows.
+    """Demonstrations, each with its instruction.
 
     Attributes:
         episodes: with the policy's cameras, u8 [N, 3, h, w], the state f32 [N, Ds] and the action f32 [N, A] of each step.
@@ -58,7 +58,7 @@ class InstructedDemonstrations:
             )
 
     def windows(self, rows: Tensor, observed: Sequence) -> TensorDict:
-        """Return training samples [B] of windows ``rows`` i64 [B, H], whose first row is the present.
+        """Return training samples [B] for windows ``rows`` i64 [B, H], whose first row is the present.
 
         Args:
             rows: as from `Demonstrations.window_rows`; a row that repeats the one before is beyond the end.
@@ -79,7 +79,7 @@ class InstructedDemonstrations:
 
 
 class VLATrainer(DemonstrationTrainer):
-    """Trains a vision-language-action policy with the L1 loss on normalised action chunks.
+    """Trainer of a vision-language-action policy with the L1 loss on normalised action chunks.
 
     Args:
         policy: the policy, trained in place; its normaliser and tokenizer stay as they are.
@@ -129,7 +129,7 @@ class VLATrainer(DemonstrationTrainer):
         return grounding.refer(self.policy, batch, positions, objects.instructions)
 
     def make_lr_scheduler(self, optimizer: torch.optim.Optimizer) -> LambdaLR:
-        """Return a cosine, with a warm-up wherever parts begin to learn that did not before."""
+        """Return a cosine schedule with a warm-up whenever further parts start to learn."""
         stages = self.stages
         begins = (0, stages.locate_steps, stages.locate_steps + stages.refer_steps)
 
@@ -145,7 +145,7 @@ class VLATrainer(DemonstrationTrainer):
         return super().averaged()["network"]
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint holds; of a language model that is adapted, nothing: its file has it."""
+        """Return a checkpoint's content, without an adapted language model's weights, which are in its own file."""
         state = super().state()
         if self.policy.base is not None:
             own = {f"network.{name}" for name in trained_state(self.policy.network, self.policy.base)}
@@ -188,7 +188,7 @@ def _precision(device: torch.device, bf16: bool) -> Iterator[None]:
 
 
 def decay_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Return parameter groups for AdamW: matrices decay, vectors (biases, norms, scales) do not."""
+    """Return AdamW parameter groups: matrices decay; vectors (biases, norms, scales) do not."""
     parameters = trained_parameters(network)
     matrices = [parameter for parameter in parameters if parameter.ndim > 1]
     vectors = [parameter for parameter in parameters if parameter.ndim <= 1]

@@ -1,4 +1,4 @@
-"""A vision-language-action policy with random weights that fits demonstrations, to be trained on them."""
+"""Construction of an untrained vision-language-action policy that fits the demonstrations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def untrained_policy(
     base: str | Path | None = None,
     rank: int = 16,
 ) -> VLAPolicy:
-    """Return a policy whose inputs, outputs, words and normaliser are those of demonstrations.
+    """Return an untrained policy with the demonstrations' inputs, outputs, vocabulary and normaliser.
 
     Args:
         demos: decide the sizes of state, action and images, the words and the normaliser.
@@ -73,7 +73,7 @@ def check_sizes(
     rank: int | None,
     changes: Mapping[str, Any],
 ) -> None:
-    """Raise InputError for sizes that are asked for and that a policy to train on has not.
+    """Raise InputError for requested sizes that differ from those of the policy to train on.
 
     Args:
         policy: that is trained on.
