@@ -15,6 +15,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from torchrl_sparse.envs.period.control import ControlPeriod
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
 CONTROL_FREQ = 20
@@ -96,11 +97,12 @@ def _observe_when_asked(sim_env: Any) -> None:
 def _command_arms_alone(sim_env: Any) -> None:
     """Spare the simulator, in all substeps of a step but the first, what its robots' control finds unchanged there.
 
-    That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has.
+    That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has. The
+    torques and the physics are compiled where that is to the same bits, see `ControlPeriod`.
     """
     from robosuite.environments.robot_env import RobotEnv
 
-    load, act = sim_env._load_robots, sim_env._pre_action
+    load, act, period = sim_env._load_robots, sim_env._pre_action, ControlPeriod(sim_env)
 
     def load_robots() -> None:  # at each reset, but for one to a state that was saved
         with _robots_uncompiled():
@@ -109,7 +111,7 @@ def _command_arms_alone(sim_env: Any) -> None:
 
     def take_over() -> None:
         for robot in sim_env.robots:
-            robot.control = _arms_between_actions(robot)
+            robot.control = _arms_between_actions(robot, period)
 
     def pre_action(action: np.ndarray, policy_step: bool = False) -> None:
         if policy_step:
@@ -122,9 +124,11 @@ def _command_arms_alone(sim_env: Any) -> None:
     # A task in which something moves by itself has its own.
     if type(sim_env)._pre_action is RobotEnv._pre_action:
         sim_env._pre_action = pre_action
+    if period.exact:
+        sim_env.step = period.step
 
 
-def _arms_between_actions(robot: Any) -> Callable[..., None]:
+def _arms_between_actions(robot: Any, period: ControlPeriod) -> Callable[..., None]:
     """Return the robot's ``control``, which goes on as it was told to where the action is not a new one.
 
     It does not keep the robot: with it each reset's simulator would stay in memory until Python looks for cycles.
@@ -136,6 +140,8 @@ def _arms_between_actions(robot: Any) -> Callable[..., None]:
         robot = find()
         if policy_step:
             return follow(robot, action, policy_step=True)
+        if period.control(robot):
+            return
         for arm in robot.arms:
             controller = robot.part_controllers[arm]
             _look_once(controller)
