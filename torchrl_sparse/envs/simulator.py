@@ -15,6 +15,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from torchrl_sparse.envs.models import compile_what_changes
 from torchrl_sparse.envs.period.control import ControlPeriod
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
@@ -69,6 +70,7 @@ def make_simulator(
             reward_shaping=reward_shaping,
             control_freq=control_freq,
         )
+    compile_what_changes(sim_env)
     _observe_when_asked(sim_env)
     _command_arms_alone(sim_env)
     return sim_env
