@@ -192,12 +192,14 @@ def _tree(model: Any, body: int) -> slice:
 
 def _numbers(model: Any) -> dict[str, np.ndarray]:
     """Return views of a model's numbers by name, of the large ones those of bodies' trees alone."""
-    small = {name: getattr(model, name) for name in _small(type(model))}
+    small = {name: getattr(model, name) for name in _small()}
     of_bodies = int(model.body_bvhnum.sum())
     found = {name: value for name, value in small.items() if isinstance(value, np.ndarray)}
     return found | {name: getattr(model, name)[:of_bodies] for name in _TREE}
 
 
 @cache
-def _small(kind: Any) -> tuple[str, ...]:
-    return tuple(name for name in dir(kind) if not name.startswith(("_", *_LARGE)))
+def _small() -> tuple[str, ...]:
+    import mujoco
+
+    return tuple(name for name in dir(mujoco.MjModel) if not name.startswith(("_", *_LARGE)))

@@ -13,9 +13,10 @@ from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.conventions import check_convention, object_state
+from torchrl_sparse.envs.observing import OBJECTS, Observed
 from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
-from torchrl_sparse.envs.simulator import make_simulator
+from torchrl_sparse.envs.simulator import make_simulator, site_twist
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import (
@@ -125,6 +126,7 @@ class RobosuiteEnv(SeededEnv):
         self.sim_env = make_simulator(
             self.task, absolute=action_mode == "absolute", reward_shaping=reward_shaping
         )
+        self._observed = Observed(self.sim_env)
         self._describe()
 
     # -- specs ---------------------------------------------------------------------------------------------------------
@@ -258,11 +260,11 @@ class RobosuiteEnv(SeededEnv):
         self, state_keys: Sequence[str] | None = None, convention: Convention | None = None
     ) -> Mapping[str, np.ndarray]:
         """Return the parts of the state, or ``state_keys``, f64, by robosuite's names, in a given or its own convention."""
-        # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
-        self.sim_env._update_observables(force=True)
-        observed = self.sim_env._get_observations(force_update=True)
-        observed["object"] = object_state(self.task.name, observed, convention or self._convention)
         wanted = self.task.state_keys if state_keys is None else state_keys
+        observed = self._observed.read([OBJECTS if name == "object" else name for name in wanted])
+        if "object" in wanted:
+            objects = object_state(self.task.name, observed, convention or self._convention)
+            observed = {**observed, "object": objects}
         parts = {name: np.asarray(observed[name]) for name in wanted}
         return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
 
@@ -286,9 +288,7 @@ class RobosuiteEnv(SeededEnv):
 
     def _eef_velocity(self) -> np.ndarray:
         """Return the velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
-        data = self.sim_env.sim.data
-        twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in self._grip_sites()]
-        return np.concatenate([part for twist in twists for part in twist])
+        return np.concatenate([site_twist(self.sim_env.sim, site) for site in self._grip_sites()])
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
         """Return a u8 [height, width, 3] image of the current state, top row first. See `CameraRenderer` for errors."""

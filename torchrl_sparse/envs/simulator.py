@@ -179,6 +179,16 @@ def _look_once(controller: Any) -> None:
     controller.new_update = False
 
 
+def site_twist(sim: Any, name: str) -> np.ndarray:
+    """Return f64 [6], the velocity of a site as robosuite has it: m/s, then rad/s, world frame."""
+    import mujoco  # reads MUJOCO_GL
+
+    model, data = sim.model._model, sim.data._data
+    jacobians = np.zeros((2, 3, model.nv))
+    mujoco.mj_jacSite(model, data, *jacobians, sim.model.site_name2id(name))
+    return np.concatenate([each.dot(data.qvel) for each in jacobians])
+
+
 def controller_config(absolute: bool) -> dict:
     """Build one Panda's composite controller config, as robosuite takes it and demonstration files record it."""
     from robosuite.controllers import load_composite_controller_config
