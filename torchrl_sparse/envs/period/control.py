@@ -6,7 +6,7 @@ import ctypes
 import logging
 import weakref
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ class ControlPeriod:
         self._bound: list[weakref.ref] = []
         self._arms: list[_BoundArm] = []
         self._world = World()
-        self._checked = False
+        self._checked = self._looked = False
         self._keep: list[Any] = []
         if self._reason is not None:
             _tell(self._reason)
@@ -67,7 +67,9 @@ class ControlPeriod:
         env.timestep += 1
         sim, left = env.sim, int(env.control_timestep / env.model_timestep) - 1
         sim.step1()
+        self._look()
         env._pre_action(action, True)
+        self._looked = False
         ready = self._is_ready()
         sim.step2()
         if ready and not self._checked:
@@ -95,13 +97,44 @@ class ControlPeriod:
         """Command one robot's arms as robosuite does between actions; False if it is left to robosuite."""
         if not self._checked:
             return False
-        numbers = [number for number, arm in enumerate(self._arms) if arm.robot() is robot]
+        return self._command_arms(robot.composite_controller)
+
+    # -- the compiled part ---------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Spare controllers their look at the present state, where they would take one."""
+        if not (
+            self._checked and self._is_bound() and all(arm.controller().new_update for arm in self._arms)
+        ):
+            return
+        library().period_look(ctypes.byref(functions()), ctypes.byref(self._world))
+        for arm in self._arms:
+            arm.hand_over()
+            arm.controller().new_update = False
+        self._looked = True
+
+    def _run_controller(self, find: Callable[[], Any], enabled: dict[str, bool]) -> dict[str, np.ndarray]:
+        """Do what the ``run_controller`` of a composite controller does, in the first substep."""
+        composite = find()
+        if self._looked and all(enabled.values()):
+            for arm in self._arms:
+                arm.take_goal()
+            if self._command_arms(composite):
+                parts, arms = composite.part_controllers, composite.arms
+                for arm in arms:
+                    parts[arm].new_update = True
+                return {
+                    name: part.torques if name in arms else part.run_controller()
+                    for name, part in parts.items()
+                }
+        return type(composite).run_controller(composite, enabled)
+
+    def _command_arms(self, composite: Any) -> bool:
+        numbers = [number for number, arm in enumerate(self._arms) if arm.composite() is composite]
         done = all(self._command(number) for number in numbers)
         for number in numbers:
             self._arms[number].hand_over()
         return done
-
-    # -- the compiled part ---------------------------------------------------------------------------------------------
 
     @staticmethod
     def _whole(env: Any) -> bool:
@@ -167,6 +200,9 @@ class ControlPeriod:
         work = np.empty((model.nv, model.nv)), np.empty((6, model.nv))
         read = (data.site_xpos, data.site_xmat, data.qpos, data.qvel, data.qM, data.qfrc_bias)
         self._keep = [structures, *work]
+        for robot in env.robots:
+            composite = robot.composite_controller
+            composite.run_controller = partial(self._run_controller, weakref.ref(composite))
         self._world = World(
             *(model._address, data._address, model.nv, len(self._arms)),
             *(each.ctypes.data for each in (*read, model.actuator_ctrlrange, data.ctrl, *work)),
@@ -179,7 +215,7 @@ class _BoundArm:
 
     def __init__(self, robot: Any, arm: str):
         controller = robot.part_controllers[arm]
-        self.robot: Callable[[], Any] = weakref.ref(robot)  # who calls them is there
+        self.composite: Callable[[], Any] = weakref.ref(robot.composite_controller)  # who calls them is there
         self.controller: Callable[[], Any] = weakref.ref(controller)
         n = len(controller.qvel_index)
         self._site = robot.sim.model.site_name2id(controller.ref_name)

@@ -61,6 +61,7 @@ def library() -> Any:
         return f"{paths[0].name} was not built (install a C++17 compiler, then this package again)"
     try:
         found = ctypes.CDLL(str(path))
+        found.period_look.restype, found.period_look.argtypes = None, [c_void_p, c_void_p]
         found.period_control.restype, found.period_control.argtypes = c_int, [c_void_p, c_void_p, c_int64]
         found.period_advance.restype, found.period_advance.argtypes = c_int64, [c_void_p, c_void_p, c_int64]
         found.period_error.restype = c_char_p

@@ -246,6 +246,12 @@ bool control(const Functions& f, const World& w) {
 
 extern "C" {
 
+// Look at all arms in the present state, after mj_step1.
+__attribute__((visibility("default"))) void period_look(const Functions* f, const World* w) {
+    f->full_m(w->model, w->inertia, w->qm);
+    for (int64_t i = 0; i < w->arms; ++i) look(*f, *w, w->arm[i]);
+}
+
 // Write one arm's torques for the present state, after mj_step1; 0 where robosuite's own would raise.
 __attribute__((visibility("default"))) int period_control(const Functions* f, const World* w, int64_t arm) {
     f->full_m(w->model, w->inertia, w->qm);
