@@ -46,7 +46,12 @@ def import_robosuite() -> Any:
 
 
 def make_simulator(
-    task: RobosuiteTask, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
+    task: RobosuiteTask,
+    *,
+    absolute: bool,
+    reward_shaping: bool = False,
+    control_freq: int = 20,
+    compiled: bool = True,
 ) -> Any:
     """Make a state-only robosuite environment with Panda arms under OSC_POSE.
 
@@ -55,6 +60,7 @@ def make_simulator(
         absolute: command world-frame poses (position, rotation vector, gripper) instead of normalised deltas.
         reward_shaping: robosuite's dense reward.
         control_freq: actions a second.
+        compiled: False for robosuite's own substeps and models: the same bits, slower.
     """
     robosuite = import_robosuite()
     task.register()
@@ -70,9 +76,10 @@ def make_simulator(
             reward_shaping=reward_shaping,
             control_freq=control_freq,
         )
-    compile_what_changes(sim_env)
+    if compiled:
+        compile_what_changes(sim_env)
     _observe_when_asked(sim_env)
-    _command_arms_alone(sim_env)
+    _command_arms_alone(sim_env, compiled)
     return sim_env
 
 
@@ -96,7 +103,7 @@ def _observe_when_asked(sim_env: Any) -> None:
     sim_env._update_observables = update_if_forced
 
 
-def _command_arms_alone(sim_env: Any) -> None:
+def _command_arms_alone(sim_env: Any, compiled: bool) -> None:
     """Spare the simulator, in all substeps of a step but the first, what its robots' control finds unchanged there.
 
     That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has. The
@@ -104,7 +111,8 @@ def _command_arms_alone(sim_env: Any) -> None:
     """
     from robosuite.environments.robot_env import RobotEnv
 
-    load, act, period = sim_env._load_robots, sim_env._pre_action, ControlPeriod(sim_env)
+    load, act = sim_env._load_robots, sim_env._pre_action
+    period = ControlPeriod(sim_env) if compiled else None
 
     def load_robots() -> None:  # at each reset, but for one to a state that was saved
         with _robots_uncompiled():
@@ -126,11 +134,11 @@ def _command_arms_alone(sim_env: Any) -> None:
     # A task in which something moves by itself has its own.
     if type(sim_env)._pre_action is RobotEnv._pre_action:
         sim_env._pre_action = pre_action
-    if period.exact:
+    if period is not None and period.exact:
         sim_env.step = period.step
 
 
-def _arms_between_actions(robot: Any, period: ControlPeriod) -> Callable[..., None]:
+def _arms_between_actions(robot: Any, period: ControlPeriod | None) -> Callable[..., None]:
     """Return the robot's ``control``, which goes on as it was told to where the action is not a new one.
 
     It does not keep the robot: with it each reset's simulator would stay in memory until Python looks for cycles.
@@ -142,7 +150,7 @@ def _arms_between_actions(robot: Any, period: ControlPeriod) -> Callable[..., No
         robot = find()
         if policy_step:
             return follow(robot, action, policy_step=True)
-        if period.control(robot):
+        if period is not None and period.control(robot):
             return
         for arm in robot.arms:
             controller = robot.part_controllers[arm]
