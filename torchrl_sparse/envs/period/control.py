@@ -95,17 +95,16 @@ class ControlPeriod:
 
     def control(self, robot: Any) -> bool:
         """Command one robot's arms as robosuite does between actions; False if it is left to robosuite."""
-        if not self._checked:
-            return False
-        return self._command_arms(robot.composite_controller)
+        return self._checked and self._is_bound() and self._command_arms(robot.composite_controller)
 
     # -- the compiled part ---------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
         """Spare controllers their look at the present state, where they would take one."""
-        if not (
-            self._checked and self._is_bound() and all(arm.controller().new_update for arm in self._arms)
-        ):
+        self._looked = False
+        if not (self._checked and self._is_bound()):
+            return
+        if not all(arm.controller().new_update for arm in self._arms):
             return
         library().period_look(ctypes.byref(functions()), ctypes.byref(self._world))
         for arm in self._arms:
@@ -181,19 +180,23 @@ class ControlPeriod:
             _tell(self._reason)
 
     def _is_bound(self) -> bool:
-        now = [self._sim_env.sim, *(robot.composite_controller for robot in self._sim_env.robots)]
+        now = self._followed()
         return len(now) == len(self._bound) and all(
             ref() is each for ref, each in zip(self._bound, now, strict=True)
         )
+
+    def _followed(self) -> list[Any]:
+        """Return what a reset, or a user, may have replaced."""
+        composites = [robot.composite_controller for robot in self._sim_env.robots]
+        arms = [composite.part_controllers.get(arm) for composite in composites for arm in composite.arms]
+        return [self._sim_env.sim, *composites, *arms]
 
     def _bind(self) -> None:
         env, self._checked = self._sim_env, False
         self._reason = why_not_arms(env)
         if self._reason is not None:
             return _tell(self._reason)
-        self._bound = [
-            weakref.ref(each) for each in (env.sim, *(robot.composite_controller for robot in env.robots))
-        ]
+        self._bound = [weakref.ref(each) for each in self._followed()]
         model, data = env.sim.model._model, env.sim.data._data
         self._arms = [_BoundArm(robot, arm) for robot in env.robots for arm in robot.arms]
         structures = (Arm * len(self._arms))(*(arm.structure() for arm in self._arms))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from torchrl_sparse.evaluation.latency.measure import Machine
 from torchrl_sparse.evaluation.results.tables import markdown_table
+from torchrl_sparse.storage.json import read_json
 
-__all__ = ["WorldProfile", "WorldTimes", "format_world_profile"]
+__all__ = ["WorldProfile", "WorldTimes", "format_world_profile", "load_world_profile", "world_rows"]
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,31 @@ class WorldProfile:
 
 def format_world_profile(found: WorldProfile) -> str:
     """Return a table in Markdown below the line that says what it is."""
-    rows = [
+    told = f"Steps through a collector, one reset every {found.steps} of them, no policy; {found.machine.cpu}, process time."
+    return f"{told}\n\n{markdown_table(world_rows(found))}"
+
+
+def world_rows(found: WorldProfile) -> list[dict[str, str]]:
+    """Return a row per task, column -> text."""
+    return [
         {
             "task": task,
-            "steps/s, Python": f"{1 / times.python_step_s:.0f}",
-            "compiled": f"{1 / times.compiled_step_s:.0f}",
+            "steps/s, in Python": f"{1 / times.python_step_s:.0f}",
+            "steps/s, compiled": f"{1 / times.compiled_step_s:.0f}",
             "ratio": f"{times.python_step_s / times.compiled_step_s:.2f}",
-            "physics alone": f"{1 / times.physics_s:.0f}",
-            "reset, Python, ms": f"{1e3 * times.python_reset_s:.0f}",
-            "kept model, ms": f"{1e3 * times.compiled_reset_s:.0f}",
+            "steps/s, physics alone": f"{1 / times.physics_s:.0f}",
+            "reset, in Python, ms": f"{1e3 * times.python_reset_s:.0f}",
+            "reset, compiled, ms": f"{1e3 * times.compiled_reset_s:.0f}",
         }
         for task, times in found.tasks.items()
     ]
-    told = f"Steps through a collector, one reset every {found.steps} of them, no policy; {found.machine.cpu}, process time."
-    return f"{told}\n\n{markdown_table(rows)}"
+
+
+def load_world_profile(path: str | Path) -> WorldProfile:
+    """Read a ``world.json``.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        ValueError: if it is of another version or not as `WorldProfile` says.
+    """
+    return read_json(path, WorldProfile)
