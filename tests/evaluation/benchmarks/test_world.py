@@ -14,7 +14,7 @@ def test_a_task_is_measured_and_told(tmp_path):
     write_json(tmp_path / "world.json", found)
     assert load_world_profile(tmp_path / "world.json") == found
     (row,) = read_tables(tmp_path / "world.json")["world"].rows
-    assert row["task"] == "lift"
+    assert row["simulated task"] == "lift"
     told = format_world_profile(found)
     assert "| lift" in told
     assert found.machine.cpu in told

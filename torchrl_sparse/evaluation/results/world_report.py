@@ -57,7 +57,7 @@ def world_rows(found: WorldProfile) -> list[dict[str, str]]:
     """Return a row per task, column -> text."""
     return [
         {
-            "task": task,
+            "simulated task": task,
             "steps/s, in Python": f"{1 / times.python_step_s:.0f}",
             "steps/s, compiled": f"{1 / times.compiled_step_s:.0f}",
             "ratio": f"{times.python_step_s / times.compiled_step_s:.2f}",
