@@ -8,6 +8,7 @@ BIN := $(VENV)/bin
 install: $(VENV)/.installed
 
 NATIVE := torchrl_sparse/blocks/engine/native
+PERIOD := torchrl_sparse/envs/period/period.cpp
 HEADERS := $(wildcard $(NATIVE)/*.h)
 
 # pip cannot override robosuite's pin of mink, which Python 3.13 needs (see pyproject.toml): there uv installs.
@@ -19,7 +20,7 @@ endef
 
 # Of what is installed the tests import a quarter: Python compiles that when it first does, if it may write.
 unexport PYTHONDONTWRITEBYTECODE
-$(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS)
+$(VENV)/.installed: pyproject.toml setup.py $(NATIVE)/native.cpp $(HEADERS) $(PERIOD)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(call editable,.[dev])

@@ -1,7 +1,8 @@
-"""Builds the native engine. Everything else about the package is in pyproject.toml.
+"""Builds the native engine and the compiled substeps of robosuite. Everything else about the package is in pyproject.toml.
 
-The extension is optional: without a C++ compiler the package installs all the same and runs on its PyTorch engine. It is a
-plain shared library without Python's or PyTorch's headers. Instruction sets are chosen at run time, so there is no -march.
+The extensions are optional: without a C++ compiler the package installs all the same, runs on its PyTorch engine and steps
+robosuite in Python. They are plain shared libraries without Python's or PyTorch's headers. Instruction sets are chosen at run
+time, so there is no -march.
 """
 
 from pathlib import Path
@@ -28,6 +29,14 @@ NATIVE = Extension(
     optional=True,
 )
 
+# To the same bits as robosuite's Python: no product may be fused with a sum.
+PERIOD = Extension(
+    "torchrl_sparse.envs.period._period",
+    sources=["torchrl_sparse/envs/period/period.cpp"],
+    extra_compile_args=["-g0", "-std=c++17", "-O2", "-ffp-contract=off", "-fvisibility=hidden"],
+    optional=True,
+)
+
 # Recipes, and a policy to begin with, lie beside the package here and within it where a wheel brings them.
 BESIDE = {
     "torchrl_sparse.recipes": "recipes",
@@ -37,7 +46,7 @@ BESIDE = {
 }
 
 setup(
-    ext_modules=[NATIVE],
+    ext_modules=[NATIVE, PERIOD],
     packages=[*find_packages(include=["torchrl_sparse*"]), *BESIDE],
     package_dir=BESIDE,
     package_data={
@@ -46,6 +55,7 @@ setup(
             "evaluation/figures/*.jinja",
             "blocks/engine/native/*.[ch]*",
             "blocks/engine/native/CMakeLists.txt",
+            "envs/period/period.cpp",
         ],
         "torchrl_sparse.recipes": ["*.yaml"],
         "torchrl_sparse.recipes.sweeps": ["*.yaml"],

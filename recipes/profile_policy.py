@@ -1,13 +1,14 @@
-"""Find out where the time of one policy call goes.
+"""Find out where the time of one policy call goes, or of the simulated world between two.
 
     python recipes/profile_policy.py policy=assets/lift                                  # parts, threads and tail of a call
     python recipes/profile_policy.py policy=assets/lift tables=[engines] batches=[1,16]  # every engine against PyTorch eager
     python recipes/profile_policy.py queries=100000 hz=50 busy=1 library=build/tsp/libtsp.so   # what a control loop can rely on
     python recipes/profile_policy.py policy=assets/vla                  # parts of a VLA's call, and what pruning saves
     python recipes/profile_policy.py shape=openvla_oft device=cuda dtype=bfloat16        # untrained, of the published 7B shape
+    python recipes/profile_policy.py world=true                         # steps and resets of robosuite's tasks, no policy
 
-A diffusion policy leaves OUT/query.json with OUT/query_threads.png, and OUT/engine.json with a chart per batch; a VLA
-OUT/vla_latency.json with a chart. Of the tail every call counts: Ctrl-C ends it with those that there are.
+It leaves OUT/query.json, OUT/engine.json, OUT/vla_latency.json or OUT/world.json, and charts. Of the tail every call counts:
+Ctrl-C ends it with those that there are.
 """
 
 from __future__ import annotations
@@ -21,16 +22,17 @@ from torchrl_sparse.blocks.bac import BAC
 from torchrl_sparse.cli.recipe import recipe, refuse_unread
 from torchrl_sparse.cli.vla import is_vla, load_vla
 from torchrl_sparse.errors import InputError
-from torchrl_sparse.evaluation.benchmarks.engine_times import measure_engines
+from torchrl_sparse.evaluation.benchmarks.engine_times import profile_engines
 from torchrl_sparse.evaluation.benchmarks.policy_call import measure_call
 from torchrl_sparse.evaluation.benchmarks.vla_latency import measure_vla, token_pruners
-from torchrl_sparse.evaluation.figures.latency import plot_engine_times, plot_thread_scaling, plot_vla_times
+from torchrl_sparse.evaluation.benchmarks.world import measure_world
+from torchrl_sparse.evaluation.figures.latency import plot_thread_scaling, plot_vla_times
 from torchrl_sparse.evaluation.latency import engine_cases, vla_cases
 from torchrl_sparse.evaluation.latency.measure import describe_machine
 from torchrl_sparse.evaluation.latency.stages import untrained_policy
-from torchrl_sparse.evaluation.results.engine_report import SCHEMA, EngineResults, format_engine_table
 from torchrl_sparse.evaluation.results.query_report import format_query_profile
 from torchrl_sparse.evaluation.results.vla_report import format_vla_table
+from torchrl_sparse.evaluation.results.world_report import format_world_profile
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.threads import num_threads
 from torchrl_sparse.storage.json import write_json
@@ -48,11 +50,21 @@ def main(config: DictConfig) -> None:
         refuse_unread(config, ("policy", *_FILES), __file__, "beside a shape")
         if config.shape not in shapes:
             raise InputError(f"shape: expected one of {', '.join(shapes)}, got {config.shape!r}")
-    if config.shape in vla_cases.SHAPES or (config.shape is None and is_vla(config.policy)):
+    if config.world:
+        profile_world(config)
+    elif config.shape in vla_cases.SHAPES or (config.shape is None and is_vla(config.policy)):
         profile_vla(config)
     else:
         profile_diffusion(config)
     print(f"\nfiles are in {config.out}")
+
+
+def profile_world(config: DictConfig) -> None:
+    read = ("threads", "repeats", "warmup")
+    refuse_unread(config, [*{*config} - {*read, "out", "world"}], __file__, "of the world")
+    found = measure_world(**{name: config[name] for name in read})
+    write_json(Path(config.out, "world.json"), found)
+    print(f"\n{format_world_profile(found)}")
 
 
 def profile_diffusion(config: DictConfig) -> None:
@@ -75,24 +87,11 @@ def profile_diffusion(config: DictConfig) -> None:
         plot_thread_scaling(found.threads_s, found.machine, Path(config.out, "query_threads.png"))
         print(f"\n{format_query_profile(found)}")
     if "engines" in config.tables:
-        profile_engines(policy.to(config.device), config)
-
-
-def profile_engines(policy: DiffusionPolicy, config: DictConfig) -> None:
-    out, kept = Path(config.out), Path(config.policy.removesuffix(".ckpt"), "bac.json")
-    bac = BAC.from_pretrained(kept) if config.shape is None and kept.is_file() else None
-    results = EngineResults(SCHEMA, describe_machine(config.device, config.threads), {})
-    options = {name: config[name] for name in ("repeats", "warmup", "threads", "instruction_sets")}
-    for number, batch in enumerate(config.batches):
-        name = f"{config.shape or kept.parent.name}_b{batch}"
-        # Compiling takes minutes and changes nothing with the batch, so the first one shows it.
-        compiled = config.compile and number == 0
-        shape = measure_engines(policy, batch, bac=bac, name=name, compiled=compiled, **options)
-        results.shapes[name] = shape
-        # After each, so that a run that is stopped leaves what it has.
-        write_json(out / "engine.json", results)
-        plot_engine_times(name, shape, results.machine, out / f"engine_{name}.png")
-        print(f"\n{format_engine_table(name, shape)}")
+        kept = Path(config.policy.removesuffix(".ckpt"), "bac.json")
+        bac = BAC.from_pretrained(kept) if config.shape is None and kept.is_file() else None
+        options = {name: config[name] for name in (*_ENGINES, "repeats", "warmup", "threads")}
+        options |= {"name": config.shape or kept.parent.name, "bac": bac}
+        profile_engines(policy.to(config.device), config.out, **options)
 
 
 def profile_vla(config: DictConfig) -> None:

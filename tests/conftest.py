@@ -28,7 +28,11 @@ FULL = (
     "test_import.py", "test_package.py", "test_pages.py", "test_recipes.py", "test_site.py",
 )  # fmt: skip
 """Below `tests`, what the quick tier leaves out: nearly all time of the suite."""
-QUICK = ("options/test_benchmark.py", "options/test_train_policy.py")  # two recipes
+QUICK = (
+    "options/test_benchmark.py",
+    "options/test_train_policy.py",
+    "envs/test_period.py",
+)  # two recipes, and steps
 
 
 @pytest.hookimpl(tryfirst=True)

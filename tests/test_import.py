@@ -50,7 +50,7 @@ for name in ("transformers", "tokenizers"):
     sys.modules[name] = None  # any import of it fails
 import torchrl_sparse
 for module in pkgutil.walk_packages(torchrl_sparse.__path__, "torchrl_sparse."):
-    if not module.name.endswith("._native"):  # the compiled library is no module of Python
+    if not module.name.endswith(("._native", "._period")):  # compiled libraries are no modules of Python
         importlib.import_module(module.name)
 try:
     torchrl_sparse.VLAPolicy.from_pretrained("assets/vla")

@@ -11,6 +11,7 @@ pytest.importorskip("transformers")
 from tests.options.harness import OptionTests, Row, returning
 from torchrl_sparse import DiffusionPolicy, Sampler
 from torchrl_sparse.evaluation.latency.vla_cases import make_policy
+from torchrl_sparse.evaluation.results.world_report import WorldTimes
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
@@ -61,6 +62,7 @@ class TestOptions(OptionTests):
         "torch.compile": lambda function, *_, **__: function,
         "torchrl_sparse.evaluation.results.engine_report.measure_multiply_adds": returning(1e9),
         f"{VLA}.product_calls": returning({}),
+        "torchrl_sparse.evaluation.benchmarks.world._measure": returning(WorldTimes(*[1.0] * 5)),
         LOADED: lambda *_, **__: make_policy("toy"),
         **dict.fromkeys(("plot_engine_times", "plot_thread_scaling", "plot_vla_times"), returning(None)),
     }
@@ -102,6 +104,10 @@ class TestOptions(OptionTests):
             Row("published.chunk_size", "5", told(LOADED, "chunk_size")),
             Row("task", "libero_goal", told(LOADED, "unnorm_key")),
             *AS_SHIPPED, "policy=openvla", "alphas=[1]", "shares=[]",
+        ],
+        [
+            Row("world", "true", lambda run: len(found("world.json", "tasks")(run) or {}), 4),
+            *AS_SHIPPED, "policy=${shipped:assets/lift}",
         ],
     )  # fmt: skip
 

@@ -132,7 +132,7 @@ OPTIONS: dict[str, Any] = {
     "budget_ms": Positive | None,
     "latency_repeats": Count,
     "repeats": Count,
-    **dict.fromkeys(("compile", "instruction_sets", "calibrated"), bool),
+    **dict.fromkeys(("compile", "instruction_sets", "calibrated", "world"), bool),
     "tables": Annotated[list[Literal["call", "engines"]], Field(min_length=1)],
     "batches": Annotated[list[Count], Field(min_length=1)],
     **dict.fromkeys(("shape", "instruction", "profile_policy.task"), Word | None),

@@ -13,9 +13,10 @@ from torchrl.data import Bounded, NonTensor, Unbounded
 
 from torchrl_sparse import keys
 from torchrl_sparse.envs.conventions import check_convention, object_state
+from torchrl_sparse.envs.observing import OBJECTS, Observed
 from torchrl_sparse.envs.rendering import Cameras
 from torchrl_sparse.envs.seeded import SeededEnv
-from torchrl_sparse.envs.simulator import make_simulator
+from torchrl_sparse.envs.simulator import make_simulator, site_twist
 from torchrl_sparse.envs.tasks import find_robosuite_task
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import (
@@ -67,6 +68,7 @@ class RobosuiteEnv(SeededEnv):
         instruction: write ``"language_instruction"``; True for the episode's own words. Words of your own are written as
             they are; for a task with several instructions they have to be one of those, and that one counts in every episode.
         reward_shaping: robosuite's dense reward instead of 1 on success.
+        compiled: False for robosuite's own substeps and models: the same bits, slower.
 
     Raises:
         InputError: for an unknown task, action mode or instruction, an ``image_size`` without a camera, ``seen_frames`` below
@@ -76,8 +78,6 @@ class RobosuiteEnv(SeededEnv):
         >>> env = RobosuiteEnv("Lift", seeds=[7])
         >>> env.reset()["observation", "state"].shape
         torch.Size([19])
-        >>> env.rollout(3)["next", "success"].shape
-        torch.Size([3, 1])
     """
 
     def __init__(
@@ -97,6 +97,7 @@ class RobosuiteEnv(SeededEnv):
         seen_frames: int | None = None,
         instruction: bool | str = False,
         reward_shaping: bool = False,
+        compiled: bool = True,
         device: torch.device | str = "cpu",
     ):
         if action_mode not in ("absolute", "delta"):
@@ -122,9 +123,9 @@ class RobosuiteEnv(SeededEnv):
         if isinstance(instruction, str) and self.task.has_choice:
             self.task.check_instruction(instruction)
         self._restored_xml: str | None = None
-        self.sim_env = make_simulator(
-            self.task, absolute=action_mode == "absolute", reward_shaping=reward_shaping
-        )
+        options = {"absolute": action_mode == "absolute", "reward_shaping": reward_shaping}
+        self.sim_env = make_simulator(self.task, compiled=compiled, **options)
+        self._observed = Observed(self.sim_env)
         self._describe()
 
     # -- specs ---------------------------------------------------------------------------------------------------------
@@ -258,11 +259,11 @@ class RobosuiteEnv(SeededEnv):
         self, state_keys: Sequence[str] | None = None, convention: Convention | None = None
     ) -> Mapping[str, np.ndarray]:
         """Return the parts of the state, or ``state_keys``, f64, by robosuite's names, in a given or its own convention."""
-        # robosuite makes relative poses from the poses of the update before, so the first pass may hold stale ones.
-        self.sim_env._update_observables(force=True)
-        observed = self.sim_env._get_observations(force_update=True)
-        observed["object"] = object_state(self.task.name, observed, convention or self._convention)
         wanted = self.task.state_keys if state_keys is None else state_keys
+        observed = self._observed.read([OBJECTS if name == "object" else name for name in wanted])
+        if "object" in wanted:
+            objects = object_state(self.task.name, observed, convention or self._convention)
+            observed = {**observed, "object": objects}
         parts = {name: np.asarray(observed[name]) for name in wanted}
         return {k: downward_quaternion(v) if k.endswith("eef_quat_site") else v for k, v in parts.items()}
 
@@ -286,9 +287,7 @@ class RobosuiteEnv(SeededEnv):
 
     def _eef_velocity(self) -> np.ndarray:
         """Return the velocity of each arm's grip site as the simulator has it: m/s, then rad/s, world frame."""
-        data = self.sim_env.sim.data
-        twists = [(data.get_site_xvelp(site), data.get_site_xvelr(site)) for site in self._grip_sites()]
-        return np.concatenate([part for twist in twists for part in twist])
+        return np.concatenate([site_twist(self.sim_env.sim, site) for site in self._grip_sites()])
 
     def render(self, camera: str = "frontview", height: int = 256, width: int = 256) -> np.ndarray:
         """Return a u8 [height, width, 3] image of the current state, top row first. See `CameraRenderer` for errors."""

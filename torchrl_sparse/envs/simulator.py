@@ -15,6 +15,8 @@ from unittest.mock import patch
 
 import numpy as np
 
+from torchrl_sparse.envs.models import compile_what_changes
+from torchrl_sparse.envs.period.control import ControlPeriod
 from torchrl_sparse.envs.tasks import RobosuiteTask
 
 CONTROL_FREQ = 20
@@ -44,7 +46,12 @@ def import_robosuite() -> Any:
 
 
 def make_simulator(
-    task: RobosuiteTask, *, absolute: bool, reward_shaping: bool = False, control_freq: int = 20
+    task: RobosuiteTask,
+    *,
+    absolute: bool,
+    reward_shaping: bool = False,
+    control_freq: int = 20,
+    compiled: bool = True,
 ) -> Any:
     """Make a state-only robosuite environment with Panda arms under OSC_POSE.
 
@@ -53,6 +60,7 @@ def make_simulator(
         absolute: command world-frame poses (position, rotation vector, gripper) instead of normalised deltas.
         reward_shaping: robosuite's dense reward.
         control_freq: actions a second.
+        compiled: False for robosuite's own substeps and models: the same bits, slower.
     """
     robosuite = import_robosuite()
     task.register()
@@ -68,8 +76,10 @@ def make_simulator(
             reward_shaping=reward_shaping,
             control_freq=control_freq,
         )
+    if compiled:
+        compile_what_changes(sim_env)
     _observe_when_asked(sim_env)
-    _command_arms_alone(sim_env)
+    _command_arms_alone(sim_env, compiled)
     return sim_env
 
 
@@ -93,14 +103,16 @@ def _observe_when_asked(sim_env: Any) -> None:
     sim_env._update_observables = update_if_forced
 
 
-def _command_arms_alone(sim_env: Any) -> None:
+def _command_arms_alone(sim_env: Any, compiled: bool) -> None:
     """Spare the simulator, in all substeps of a step but the first, what its robots' control finds unchanged there.
 
-    That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has.
+    That is all but the torques of the arms: the gripper's command, where the base stands, how many numbers an action has. The
+    torques and the physics are compiled where that is to the same bits, see `ControlPeriod`.
     """
     from robosuite.environments.robot_env import RobotEnv
 
     load, act = sim_env._load_robots, sim_env._pre_action
+    period = ControlPeriod(sim_env) if compiled else None
 
     def load_robots() -> None:  # at each reset, but for one to a state that was saved
         with _robots_uncompiled():
@@ -109,7 +121,7 @@ def _command_arms_alone(sim_env: Any) -> None:
 
     def take_over() -> None:
         for robot in sim_env.robots:
-            robot.control = _arms_between_actions(robot)
+            robot.control = _arms_between_actions(robot, period)
 
     def pre_action(action: np.ndarray, policy_step: bool = False) -> None:
         if policy_step:
@@ -122,9 +134,11 @@ def _command_arms_alone(sim_env: Any) -> None:
     # A task in which something moves by itself has its own.
     if type(sim_env)._pre_action is RobotEnv._pre_action:
         sim_env._pre_action = pre_action
+    if period is not None and period.exact:
+        sim_env.step = period.step
 
 
-def _arms_between_actions(robot: Any) -> Callable[..., None]:
+def _arms_between_actions(robot: Any, period: ControlPeriod | None) -> Callable[..., None]:
     """Return the robot's ``control``, which goes on as it was told to where the action is not a new one.
 
     It does not keep the robot: with it each reset's simulator would stay in memory until Python looks for cycles.
@@ -136,6 +150,8 @@ def _arms_between_actions(robot: Any) -> Callable[..., None]:
         robot = find()
         if policy_step:
             return follow(robot, action, policy_step=True)
+        if period is not None and period.control(robot):
+            return
         for arm in robot.arms:
             controller = robot.part_controllers[arm]
             _look_once(controller)
@@ -169,6 +185,16 @@ def _look_once(controller: Any) -> None:
     mujoco.mj_fullM(model, inertia, data.qM)
     controller.mass_matrix = inertia[joints, :][:, joints]
     controller.new_update = False
+
+
+def site_twist(sim: Any, name: str) -> np.ndarray:
+    """Return f64 [6], the velocity of a site as robosuite has it: m/s, then rad/s, world frame."""
+    import mujoco  # reads MUJOCO_GL
+
+    model, data = sim.model._model, sim.data._data
+    jacobians = np.zeros((2, 3, model.nv))
+    mujoco.mj_jacSite(model, data, *jacobians, sim.model.site_name2id(name))
+    return np.concatenate([each.dot(data.qvel) for each in jacobians])
 
 
 def controller_config(absolute: bool) -> dict:

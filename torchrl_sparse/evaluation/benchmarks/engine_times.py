@@ -2,27 +2,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from torchrl_sparse.blocks.bac import BAC
+from torchrl_sparse.evaluation.figures.latency import plot_engine_times
 from torchrl_sparse.evaluation.latency.engine_cases import EngineCase
 from torchrl_sparse.evaluation.latency.first_calls import first_calls
-from torchrl_sparse.evaluation.latency.measure import measure_latency
+from torchrl_sparse.evaluation.latency.measure import describe_machine, measure_latency
 from torchrl_sparse.evaluation.latency.stages import example_query, stage_seconds
-from torchrl_sparse.evaluation.results.engine_report import EngineShape, shape_results
+from torchrl_sparse.evaluation.results.engine_report import (
+    SCHEMA,
+    EngineResults,
+    EngineShape,
+    format_engine_table,
+    shape_results,
+)
 from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.runtime.progress import progress
 from torchrl_sparse.runtime.threads import num_threads
+from torchrl_sparse.storage.json import write_json
 
-__all__ = ["measure_engines"]
+__all__ = ["measure_engines", "profile_engines"]
 
 _WHOLE = (
     "dense",
     "ddim10",
     "ddim2",
 )  # kinds of policy calls of which whole calls of a policy with cameras are timed
+
+
+def profile_engines(
+    policy: DiffusionPolicy,
+    out: str | Path,
+    *,
+    name: str,
+    batches: Sequence[int],
+    compile: bool,
+    **options: Any,
+) -> None:
+    """Measure, print and draw every engine at each batch; ``engine.json`` in ``out`` is written after each.
+
+    Args:
+        policy: on the device of the engines.
+        out: folder of the files.
+        name: of the policy or the shape.
+        batches: rows of a query.
+        compile: also time the eager baseline under torch.compile, at the first batch.
+        options: of `measure_engines`.
+    """
+    results = EngineResults(SCHEMA, describe_machine(str(policy.device), options["threads"]), {})
+    for number, batch in enumerate(batches):
+        at = f"{name}_b{batch}"
+        # Compiling takes minutes and changes nothing with the batch, so the first one shows it.
+        shape = measure_engines(policy, batch, name=at, compiled=compile and number == 0, **options)
+        results.shapes[at] = shape
+        # After each, so that a run that is stopped leaves what it has.
+        write_json(Path(out, "engine.json"), results)
+        plot_engine_times(at, shape, results.machine, Path(out, f"engine_{at}.png"))
+        print(f"\n{format_engine_table(at, shape)}")
 
 
 def measure_engines(

@@ -20,6 +20,7 @@ from torchrl_sparse.evaluation.results.vla_report import (
     vla_part_rows,
     vla_product_rows,
 )
+from torchrl_sparse.evaluation.results.world_report import load_world_profile, world_rows
 
 __all__ = ["READERS", "Row", "Table", "make_table", "read_tables"]
 
@@ -73,6 +74,10 @@ def _vla(path: Path) -> dict[str, Table]:
     return {name: make_table(results.shape.name, of_one) for name, of_one in rows.items() if of_one}
 
 
+def _world(path: Path) -> dict[str, Table]:
+    return {"world": make_table("robosuite", world_rows(load_world_profile(path)))}
+
+
 def _aggregate(path: Path) -> dict[str, Table]:
     results = load_aggregate(path)
     table = make_table(", ".join(results.tasks), aggregate_rows(results))
@@ -89,5 +94,6 @@ READERS = {
     "engine": _engine,
     "query": _query,
     "vla_latency": _vla,
+    "world": _world,
 }
 """What the name of a file begins with -> reader of its tables."""
