@@ -58,7 +58,7 @@ def test_the_second_is_told_who_holds_it_and_leaves_nothing_behind(tmp_path, hol
 
 def test_the_same_process_has_to_wait_its_turn_too(tmp_path):
     with lock_output(tmp_path):
-        refused(tmp_path, f"held by process {os.getpid()} ")
+        refused(tmp_path, f"locked by process {os.getpid()} ")
         with lock_output(tmp_path / "other"):
             pass
     with lock_output(tmp_path):
@@ -95,4 +95,4 @@ def test_only_what_the_block_wrote_stays(tmp_path, is_file):
 def test_a_lock_that_says_nothing_is_held_all_the_same(tmp_path):
     with lock_output(tmp_path):
         (tmp_path / ".lock").write_text("{")
-        refused(tmp_path, "held by another process")
+        refused(tmp_path, "locked by another process")

@@ -184,7 +184,7 @@ def test_table_covers_the_methods_that_ran():
     assert "bac" not in text
 
 
-def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_look():
+def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_analysis():
     design = Design(40, analyses=2)
     dense, slow = run([1, 1, 1, 0] * 10), run([1, 0, 1, 0] * 5)
     results = build({"dense": dense, "slow": slow}, design)
@@ -194,7 +194,7 @@ def test_a_method_that_stopped_is_compared_on_its_own_seeds_at_the_level_of_its_
     assert entry.paired_vs_dense.ci95 == tango_interval(0, 5, 20, level)
     ours, theirs = [30, 60, 30, 60] * 5, [30, 30, 30, 60] * 5
     assert entry.time_vs_dense.ci95 == time_ratio(ours, theirs, 60, confidence=level).ci95
-    assert "looked at 2 times up to 40" in format_table(results)
+    assert "with 2 interim analyses up to 40" in format_table(results)
 
 
 def test_worse_is_said_whatever_the_margin():
