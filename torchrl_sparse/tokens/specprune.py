@@ -226,6 +226,9 @@ class SpecPrune(TokenPruner):
     def layers_scored(self, num_layers: int) -> set[int]:
         return {*range(_SPECULATION), *self._dynamic_layers, *self._carry_layers}
 
+    def layers_watched(self, num_layers: int) -> set[int]:
+        return set()
+
     def begin(self, td: TensorDictBase) -> None:
         """Compute what is known before the decoder runs: the budgets, the carried set, and the changed set."""
         alike, first = compare_frames(td, self.spec, self.options.look_back)
