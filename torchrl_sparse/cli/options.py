@@ -144,7 +144,6 @@ OPTIONS: dict[str, Any] = {
     "library": Word | None,
     "engine": Word,
     "profile_policy.engine": Literal["auto", "native", "native_bf16", "native_int8", "openvino", "torch"],
-    "benchmark_vla.engine": Literal["auto", "openvino", "torch"],
     "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"] | None,
     # cameras

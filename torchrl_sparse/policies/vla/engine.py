@@ -42,7 +42,7 @@ def check_vla_engine(name: str) -> None:
 
 
 class VLAEngineSlot:
-    """Holds the engine of a VLA: made when it is first needed, and anew when weights or the number of threads change.
+    """Holds the engine of a VLA: made when it is first needed, and again when weights or the number of threads change.
 
     Copies and pickles carry the choice, not the engine.
 
@@ -99,7 +99,7 @@ class VLAEngineSlot:
         return text + "".join(f" (not {other}: {reason})" for other, reason in why_not.items())
 
     def refresh(self) -> None:
-        """Make the engine anew in the next call, from the weights that the network has then."""
+        """Make the engine again in the next call, from the weights that the network has then."""
         self._made = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -165,5 +165,5 @@ class RunsInEngine:
         return self._slot.describe(self.network)
 
     def refresh(self) -> None:
-        """Read all weights anew in the next call, after writes to them that `WeightWatch` does not see."""
+        """Read all weights again in the next call, after writes to them that `WeightWatch` does not see."""
         self._slot.refresh()
