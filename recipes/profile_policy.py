@@ -95,7 +95,7 @@ def profile_diffusion(config: DictConfig) -> None:
 
 
 def profile_vla(config: DictConfig) -> None:
-    refuse_unread(config, ("tables", *_CALL, *_ENGINES), __file__, "of a VLA")
+    refuse_unread(config, ("tables", *sorted({*_CALL} - {"engine"}), *_ENGINES), __file__, "of a VLA")
     if config.shape is None:
         refuse_unread(config, ("dtype",), __file__, "of a trained policy")
     with num_threads(config.threads), torch.no_grad():
@@ -104,6 +104,7 @@ def profile_vla(config: DictConfig) -> None:
         else:
             dtype = getattr(torch, config.dtype or "float32")
             policy = vla_cases.make_policy(config.shape, dtype=dtype, device=config.device)
+            policy.engine = config.engine
         pruners = token_pruners(policy, config.alphas, config.shares, config.equal_to)
         case = vla_cases.VLACase(policy, pruners, config.instruction)
         rounds = {"repeats": config.repeats, "warmup": config.warmup}

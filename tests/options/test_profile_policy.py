@@ -103,6 +103,7 @@ class TestOptions(OptionTests):
             Row("heads", "[4,2,4]", told(LOADED, "heads")),
             Row("published.chunk_size", "5", told(LOADED, "chunk_size")),
             Row("task", "libero_goal", told(LOADED, "unnorm_key")),
+            Row("engine", "torch", told(LOADED, "engine"), "torch"),
             *AS_SHIPPED, "policy=openvla", "alphas=[1]", "shares=[]",
         ],
         [

@@ -152,6 +152,7 @@ class TestBenchmark(OptionTests):
     groups = (
         [
             *LOADED,
+            Row("engine", "torch", said("engine")),
             Row("calibrated", "false", lambda run: "alpha" in settings(run)["specprune"]),
             Row("specprune.keep_share", "0.95", lambda run: settings(run)["specprune"].get("keep_share")),
             *controller_rows(lambda run: settings(run)["controller"]),

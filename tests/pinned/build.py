@@ -121,7 +121,7 @@ def _at_step(query: TensorDict, seed: int, step: int) -> TensorDict:
 
 @cache
 def _vla(folder: Path) -> VLAPolicy:
-    return VLAPolicy.from_pretrained(folder)
+    return VLAPolicy.from_pretrained(folder, engine="torch")
 
 
 def vla_actor(folder: Path, name: str, recorded: Sequence[TensorDictBase], kept: float) -> ChunkExecutor:

@@ -143,7 +143,7 @@ OPTIONS: dict[str, Any] = {
     "busy": Whole,
     "library": Word | None,
     "engine": Word,
-    "profile_policy.engine": Literal["auto", "native", "native_bf16", "native_int8"],
+    "profile_policy.engine": Literal["auto", "native", "native_bf16", "native_int8", "openvino", "torch"],
     "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"] | None,
     # cameras

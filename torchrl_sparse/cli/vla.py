@@ -48,4 +48,5 @@ def load_vla(config: DictConfig, data_set: str | None) -> VLAPolicy:
     given = {name: value for name, value in options.items() if value is not None}
     if is_openvla_oft(config.policy):
         given["unnorm_key"] = data_set
-    return VLAPolicy.from_pretrained(config.policy, base=config.get("base"), **given)
+    engine = config.get("engine", "auto")
+    return VLAPolicy.from_pretrained(config.policy, base=config.get("base"), engine=engine, **given)

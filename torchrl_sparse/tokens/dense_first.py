@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -50,6 +52,9 @@ class DenseFirst(TokenPruner):
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return self.inner.layers_scored(num_layers)
+
+    def layers_watched(self, num_layers: int) -> Set[int]:
+        return self.inner.layers_watched(num_layers)
 
     def begin(self, td: TensorDictBase) -> None:
         self.inner.begin(td)

@@ -81,6 +81,9 @@ class EfficientVLAPruner(TokenPruner):
     def layers_scored(self, num_layers: int) -> set[int]:
         return {self._LAYER}
 
+    def layers_watched(self, num_layers: int) -> set[int]:
+        return set()
+
     def layers_skipped(self, num_layers: int) -> set[int]:
         return set(self.skipped)
 

@@ -56,6 +56,9 @@ class FastVPruner(TokenPruner):
     def layers_scored(self, num_layers: int) -> set[int]:
         return {self._scaled(num_layers) - 1}
 
+    def layers_watched(self, num_layers: int) -> set[int]:
+        return set()
+
     def score_rows(self, state: LayerState) -> Tensor:
         return last_text_token(state.kind, state.alive)
 

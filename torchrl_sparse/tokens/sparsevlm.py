@@ -123,6 +123,9 @@ class SparseVLMPruner(TokenPruner):
     def layers_scored(self, num_layers: int) -> set[int]:
         return set(scaled_layers(self.layers, _DEPTH, num_layers))
 
+    def layers_watched(self, num_layers: int) -> set[int]:
+        return set()
+
     def before_layers(self, state: LayerState) -> None:
         if self.raters == "embeddings":  # kept by position, as the sequence becomes shorter
             chosen = state.alive.new_zeros(len(state.alive), int(state.positions.max()) + 1)

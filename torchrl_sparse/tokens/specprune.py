@@ -202,9 +202,7 @@ class SpecPrune(TokenPruner):
         for name in ("keep_share", "wrist_share", "beta"):
             check_share(name, getattr(self.options, name))
         if not (self.options.carry or self.options.changed or self.options.local):
-            raise InputError(
-                "SpecPrune: expected one of carry, changed and local, got none of them: nothing would stay"
-            )
+            raise InputError("SpecPrune: expected one of carry, changed and local, got none: nothing stays")
         self.look_back = self.options.look_back
         past = past_frame_keys(self.look_back)
         self.in_keys = [*FRAME_KEYS, *past, keys.TOKEN_BUDGET]
@@ -225,6 +223,9 @@ class SpecPrune(TokenPruner):
 
     def layers_scored(self, num_layers: int) -> set[int]:
         return {*range(_SPECULATION), *self._dynamic_layers, *self._carry_layers}
+
+    def layers_watched(self, num_layers: int) -> set[int]:
+        return set()
 
     def begin(self, td: TensorDictBase) -> None:
         """Compute what is known before the decoder runs: the budgets, the carried set, and the changed set."""
@@ -263,9 +264,7 @@ class SpecPrune(TokenPruner):
         self._accumulate(index, state, state.scores)
         if index < _SPECULATION:
             return self._speculate(index, state)
-        if index in self._dynamic_layers:
-            return self._prune_further(state)
-        return None
+        return self._prune_further(state) if index in self._dynamic_layers else None
 
     def _accumulate(self, index: int, state: LayerState, scores: Tensor) -> None:
         """Eqs. 7 to 10, and the score to carry."""

@@ -116,16 +116,19 @@ class VLACase:
 
     def parts(self) -> dict[str, Callable[[], Any]]:
         """Return the parts of a dense policy call, without reading and assembling inputs: name -> call."""
-        network, sequence = self.network, self.sequence()
-        images = torch.cat([self._dense[1][camera] for camera in network.config.cameras])
-        features = network.vision(images)
+        network, sequence, engine = self.network, self.sequence(), self._dense[0].current_engine()
+        images = torch.stack([self._dense[1][camera] for camera in network.config.cameras], 1)
         readout = sequence.hidden[:, : network.config.num_slots].contiguous()
-        return {
-            "vision towers": lambda: network.vision(images),
-            "projector": lambda: network.projector(features),
-            "decoder layers": lambda: network.decoder(sequence),
-            "action head": lambda: network.head(readout),
+        later = {
+            "decoder layers": lambda: network.decoder(sequence, run=engine.run_layers),
+            "action head": lambda: engine.read_actions(readout),
         }
+        if engine is not network:
+            return {"vision towers and projector": lambda: engine.visual_tokens(images), **later}
+        frames = images.flatten(0, 1)
+        features = network.vision(frames)
+        towers = {"vision towers": lambda: network.vision(frames)}
+        return towers | {"projector": lambda: network.projector(features)} | later
 
     def record(self, name: str) -> _Recorder:
         """Record the pruner's inputs in a method's policy call."""

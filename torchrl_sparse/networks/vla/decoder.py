@@ -7,7 +7,9 @@ for scores, the few rows they name are multiplied with the keys once more beside
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,9 +19,37 @@ from torchrl_sparse.networks.vla import backbones
 from torchrl_sparse.networks.vla.config import VLAConfig
 from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState
 
-__all__ = ["BidirectionalLlama", "Decoded", "pack", "row_attention", "visual_scores"]
+__all__ = [
+    "BidirectionalLlama",
+    "Decoded",
+    "Ran",
+    "Rotary",
+    "RunLayers",
+    "pack",
+    "row_attention",
+    "visual_scores",
+]
 
 _PER_TOKEN = ("hidden", "positions", "kind", "task")
+Rotary = tuple[Tensor, Tensor]
+
+
+class Ran(NamedTuple):
+    """What a stretch of layers leaves; all but ``hidden`` mean something only where its last layer is scored.
+
+    Attributes:
+        hidden: [B, S, d], its output.
+        before: [B, S, d], the input of its last layer.
+        query, key: [B, heads, S, head_dim], of its last layer.
+    """
+
+    hidden: Tensor
+    before: Tensor
+    query: Tensor
+    key: Tensor
+
+
+RunLayers = Callable[[Sequence[int], Tensor, Rotary, "Tensor | None", bool], Ran]
 
 
 @dataclass
@@ -62,51 +92,92 @@ class BidirectionalLlama(nn.Module):
             )
         )
         self.llama.rotary_emb = nn.Identity()  # angles are computed here
-        self._head_dim = config.llm.dim // config.llm.heads
+        self.head_dim = config.llm.dim // config.llm.heads
         self._rope_base = config.rope_base
 
     def embed(self, ids: Tensor) -> Tensor:
         """Return the embeddings [..., d] of token ids i64 [...]."""
         return self.llama.embed_tokens(ids)
 
-    def forward(self, state: LayerState, hooks: LayerHooks | None = None) -> Decoded:
+    def forward(
+        self, state: LayerState, hooks: LayerHooks | None = None, run: RunLayers | None = None
+    ) -> Decoded:
         """Run all layers on ``state.hidden``, without the tokens that ``state.alive`` excludes.
 
         Args:
             state: the whole sequence.
-            hooks: called around each layer; None is dense.
+            hooks: called around layers; None is dense.
+            run: what runs the layers between two calls of ``hooks``; by default `run_layers`.
         """
-        layers, hooks = self.llama.layers, LayerHooks() if hooks is None else hooks
-        scored_layers, skipped = hooks.layers_scored(len(layers)), hooks.layers_skipped(len(layers))
+        hooks, run = LayerHooks() if hooks is None else hooks, self.run_layers if run is None else run
+        num_layers = len(self.llama.layers)
+        scored_layers, skipped = hooks.layers_scored(num_layers), hooks.layers_skipped(num_layers)
         state, mask = pack(state, state.alive)
         hooks.before_layers(state)
-        rotary, lengths, seen = self._rotary(state), state.alive.sum(1), state.visual_alive
-        tokens, depth, scored = [], [], torch.zeros_like(lengths)
-        for index, layer in enumerate(layers):
-            if index in skipped:
-                tokens.append(torch.zeros_like(lengths))
-                continue
-            tokens.append(lengths)
-            depth.append(seen)
-            state = replace(state, layer=index, scores=None, attention=None)
-            rows = hooks.score_rows(state) if index in scored_layers else None
-            state.hidden, query, key = _run_layer(layer, state.hidden, rotary, mask, self._head_dim)
-            if rows is not None:
-                state.attention, state.scores = visual_scores(state, query, key, rows)
+        table = self._angles(int(state.positions.max()) + 1, state.hidden)
+        rotary, lengths, seen = _at(table, state.positions), state.alive.sum(1), state.visual_alive
+        depth, scored = torch.zeros_like(seen, dtype=torch.int64), torch.zeros_like(lengths)
+        tokens = lengths.new_zeros(num_layers, len(lengths))
+        for layers in _stretches(num_layers, skipped, scored_layers | hooks.layers_watched(num_layers)):
+            tokens[list(layers)] = lengths
+            depth = depth + seen * len(layers)
+            index, is_scored = layers[-1], layers[-1] in scored_layers
+            ran = run(layers, state.hidden, rotary, mask, is_scored)
+            state = replace(state, layer=index, hidden=ran.before, scores=None, attention=None)
+            if is_scored:
+                rows = hooks.score_rows(state)
+                state.attention, state.scores = visual_scores(state, ran.query, ran.key, rows)
                 scored = scored + rows.sum(1) * lengths
+            state.hidden = ran.hidden
             keep = hooks.after_layer(index, state)
             if keep is not None:
                 state, mask = pack(state, state.alive & (keep | ~state.is_visual))
-                rotary, lengths, seen = self._rotary(state), state.alive.sum(1), state.visual_alive
-        depth = torch.stack(depth).sum(0) if depth else torch.zeros_like(seen, dtype=torch.int64)
-        return Decoded(self.llama.norm(state.hidden), lengths, torch.stack(tokens, 1), depth, scored)
+                rotary, lengths = _at(table, state.positions), state.alive.sum(1)
+                seen = state.visual_alive
+        return Decoded(self.llama.norm(state.hidden), lengths, tokens.T, depth, scored)
 
-    def _rotary(self, state: LayerState) -> tuple[Tensor, Tensor]:
-        """Return cosine and sine, [B, S, head_dim] each, of the original positions (arXiv:2104.09864), computed in f32."""
-        exponent = torch.arange(0, self._head_dim, 2, device=state.hidden.device, dtype=torch.float32)
-        angle = state.positions[..., None].float() * self._rope_base ** (-exponent / self._head_dim)
+    def run_layers(
+        self, layers: Sequence[int], hidden: Tensor, rotary: Rotary, mask: Tensor | None, scored: bool
+    ) -> Ran:
+        """Run some layers one after the other; nothing reads or prunes what lies between them.
+
+        Args:
+            layers: their indices, at least one.
+            hidden: [B, S, d], input of the first.
+            rotary: cosine and sine, [B, S, head_dim] each.
+            mask: bool [B, 1, 1, S], what attention may see; None is everything.
+            scored: whether queries, keys and the input of the last layer are wanted.
+        """
+        return run_stretch(
+            [self.llama.layers[index] for index in layers], hidden, rotary, mask, self.head_dim
+        )
+
+    def _angles(self, count: int, like: Tensor) -> Rotary:
+        """Return cosine and sine, [count, head_dim] each, of all positions (arXiv:2104.09864), computed in f32."""
+        exponent = torch.arange(0, self.head_dim, 2, device=like.device, dtype=torch.float32)
+        positions = torch.arange(count, device=like.device)
+        angle = positions[:, None].float() * self._rope_base ** (-exponent / self.head_dim)
         angle = torch.cat([angle, angle], dim=-1)
-        return angle.cos().to(state.hidden.dtype), angle.sin().to(state.hidden.dtype)
+        return angle.cos().to(like.dtype), angle.sin().to(like.dtype)
+
+
+def _at(table: Rotary, positions: Tensor) -> Rotary:
+    """Return cosine and sine, [B, S, head_dim] each, of the original positions."""
+    cos, sin = table
+    return cos[positions], sin[positions]
+
+
+def _stretches(num_layers: int, skipped: Set[int], ends: Set[int]) -> Iterator[tuple[int, ...]]:
+    """Cut the layers that run behind each of ``ends``."""
+    stretch: list[int] = []
+    for index in range(num_layers):
+        if index not in skipped:
+            stretch.append(index)
+            if index in ends:
+                yield tuple(stretch)
+                stretch = []
+    if stretch:
+        yield tuple(stretch)
 
 
 def pack(state: LayerState, alive: Tensor) -> tuple[LayerState, Tensor | None]:
@@ -144,12 +215,18 @@ def row_attention(query: Tensor, key: Tensor, rows: Tensor, alive: Tensor) -> Te
         >>> row_attention(query, key, rows, torch.ones_like(rows)).sum(-1).allclose(torch.ones(1, 2))
         True
     """
-    counts = rows.sum(1)
-    longest = int(counts.max())
-    index = (~rows).int().argsort(dim=1, stable=True)[:, :longest]
+    single = len(rows) == 1  # has nothing to be padded to
+    if single:
+        index = rows.nonzero()[:, 1][None]
+    else:
+        counts = rows.sum(1)
+        longest = int(counts.max())
+        index = (~rows).int().argsort(dim=1, stable=True)[:, :longest]
     picked = query.gather(2, index[:, None, :, None].expand(-1, query.shape[1], -1, query.shape[3]))
     logits = picked @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
     logits = logits.float().masked_fill(~alive[:, None, None], -torch.inf)
+    if single:
+        return logits.softmax(-1).mean(1)
     real = torch.arange(longest, device=rows.device) < counts[:, None]
     return logits.softmax(-1).mean(1) * real[..., None]
 
@@ -168,6 +245,16 @@ def visual_scores(state: LayerState, query: Tensor, key: Tensor, rows: Tensor) -
     attention = weights.new_zeros(*weights.shape[:2], state.num_visual + 1)
     attention = attention.scatter(2, ids[:, None].expand_as(weights), weights)[..., :-1]
     return attention, attention.sum(1) / rows.sum(1, keepdim=True).clamp(min=1)
+
+
+def run_stretch(
+    layers: Iterable[nn.Module], hidden: Tensor, rotary: Rotary, mask: Tensor | None, head_dim: int
+) -> Ran:
+    """Run some of Llama's layers, see `BidirectionalLlama.run_layers`."""
+    for layer in layers:
+        before = hidden
+        hidden, query, key = _run_layer(layer, before, rotary, mask, head_dim)
+    return Ran(hidden, before, query, key)
 
 
 def _run_layer(

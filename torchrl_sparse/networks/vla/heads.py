@@ -43,7 +43,7 @@ class L1ActionHead(nn.Module):
 
     def forward(self, readout: Tensor) -> Tensor:
         """Return the actions [B, H, A] for decoder outputs [B, H * A, llm.dim]."""
-        x = readout.reshape(len(readout), self.chunk_size, -1)
+        x = readout.unflatten(1, (self.chunk_size, -1)).flatten(2)
         x = functional.relu(self.fc1(self.layer_norm1(x)))
         for block in self.blocks:
             x = x + block(x)

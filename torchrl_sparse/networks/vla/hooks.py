@@ -6,7 +6,7 @@ The decoder calls one `LayerHooks` object around every layer::
     for layer in range(num_layers):              # but those in hooks.layers_skipped(num_layers)
         rows = hooks.score_rows(state)           # only where layer is in hooks.layers_scored(num_layers)
         ...                                      # the decoder layer, with fused attention everywhere
-        keep = hooks.after_layer(layer, state)   # bool [B, S] or None
+        keep = hooks.after_layer(layer, state)   # only where layer is watched or scored; bool [B, S] or None
 
 **Guarantees of the model.** BOS, proprio, text, action and stop tokens survive whatever a mask says. Tokens keep their
 original positions. Rows may keep different tokens: they are gathered to the front, padded to the longest row, and padding is
@@ -18,8 +18,10 @@ The N visual tokens are camera-major: all patches of the primary camera, row by 
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -83,7 +85,8 @@ class VisualSpec:
 class LayerState:
     """The decoder's sequence around one layer; S is its current length, N the number of visual tokens before any pruning.
 
-    `LayerHooks.score_rows` is given the input of the layer, `LayerHooks.after_layer` its output.
+    `LayerHooks.score_rows` is given the input of the layer, `LayerHooks.after_layer` its output, and what is known of
+    which tokens are visual is computed once for both: of a state only ``hidden`` may be exchanged.
 
     Attributes:
         layer: index of the decoder layer, from 0.
@@ -112,7 +115,7 @@ class LayerState:
     scores: Tensor | None = None
     attention: Tensor | None = None
 
-    @property
+    @cached_property
     def is_visual(self) -> Tensor:
         """bool [B, S]: alive visual tokens."""
         return self.alive & ((self.kind == TokenKind.PRIMARY) | (self.kind == TokenKind.WRIST))
@@ -122,7 +125,7 @@ class LayerState:
         """i64 [B, S]: ids 0..N-1 of visual tokens; meaningless elsewhere, see `is_visual`."""
         return self.positions - 1
 
-    @property
+    @cached_property
     def visual_alive(self) -> Tensor:
         """bool [B, N]: visual tokens that have not been dropped."""
         ids = torch.where(self.is_visual, self.visual_ids, self.num_visual)
@@ -153,6 +156,15 @@ class LayerHooks:
     def layers_skipped(self, num_layers: int) -> set[int]:
         """Return the decoder layers replaced by the identity; `after_layer` is not called for them."""
         return set()
+
+    def layers_watched(self, num_layers: int) -> Set[int]:
+        """Return the decoder layers behind which `after_layer` is called besides the scored ones.
+
+        All of them where a method defines `after_layer` and does not say. Layers between two that are watched or scored
+        run as one, so that naming few makes an engine faster.
+        """
+        defined = type(self).after_layer is not LayerHooks.after_layer
+        return set(range(num_layers)) if defined else set()
 
     def before_layers(self, state: LayerState) -> None:
         """Inspect the sequence before the first layer; ``hidden`` holds the embeddings."""

@@ -7,22 +7,38 @@ last prompt token and all slots but the last.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_sparse.networks.vla.config import VLAConfig
-from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, Decoded
+from torchrl_sparse.networks.vla.decoder import BidirectionalLlama, Decoded, Ran, Rotary
 from torchrl_sparse.networks.vla.heads import L1ActionHead, ProprioProjector
 from torchrl_sparse.networks.vla.hooks import LayerHooks, LayerState, TokenKind
 from torchrl_sparse.networks.vla.text import BOS_ID, STOP_ID, Prompts
 from torchrl_sparse.networks.vla.vision import FusedProjector, VisionTowers
 
-__all__ = ["VLANetwork", "make_network", "network_of"]
+__all__ = ["VLAEngine", "VLANetwork", "make_network", "network_of"]
+
+
+class VLAEngine(Protocol):
+    """Computes the parts of a `VLANetwork` that cost time, as the network itself does, up to rounding.
+
+    Methods are those of the network; what they return is the caller's.
+    """
+
+    def visual_tokens(self, images: Tensor) -> Tensor: ...
+
+    def run_layers(
+        self, layers: Sequence[int], hidden: Tensor, rotary: Rotary, mask: Tensor | None, scored: bool
+    ) -> Ran: ...
+
+    def read_actions(self, readout: Tensor) -> Tensor: ...
 
 
 class VLANetwork(nn.Module):
@@ -59,6 +75,7 @@ class VLANetwork(nn.Module):
         keep_mask: Tensor | None = None,
         hooks: LayerHooks | None = None,
         td: TensorDictBase | None = None,
+        engine: VLAEngine | None = None,
     ) -> tuple[Tensor, Decoded]:
         """Return actions [B, H, A], f32, and the decoder's output.
 
@@ -69,16 +86,28 @@ class VLANetwork(nn.Module):
             keep_mask: bool [B, N], the visual tokens that enter the decoder; all by default.
             hooks: called around each layer of the decoder; None is dense.
             td: the policy call that ``hooks`` are shown, [B].
+            engine: what computes the network's parts; by default this module.
         """
+        engine = self if engine is None else engine
         td = TensorDict({}, [len(images)], device=images.device) if td is None else td
-        visual = self.visual_tokens(images)
+        visual = engine.visual_tokens(images)
         sequence = self._sequence(visual, state, prompts, keep_mask, td)
-        decoded = replace(self.decoder(sequence, hooks), visual=visual)
-        return self.head(self.readout(decoded)).float(), decoded
+        decoded = replace(self.decoder(sequence, hooks, engine.run_layers), visual=visual)
+        return engine.read_actions(self.readout(decoded)).float(), decoded
 
     def visual_tokens(self, images: Tensor) -> Tensor:
         """Return the visual tokens [B, N, d] of images u8 [B, cameras, 3, h, w], camera by camera."""
         return self.projector(self.vision(images.flatten(0, 1))).unflatten(0, images.shape[:2]).flatten(1, 2)
+
+    def run_layers(
+        self, layers: Sequence[int], hidden: Tensor, rotary: Rotary, mask: Tensor | None, scored: bool
+    ) -> Ran:
+        """Run a stretch of the decoder's layers, see `BidirectionalLlama.run_layers`."""
+        return self.decoder.run_layers(layers, hidden, rotary, mask, scored)
+
+    def read_actions(self, readout: Tensor) -> Tensor:
+        """Return the actions [B, H, A] for decoder outputs [B, H * A, d]."""
+        return self.head(readout)
 
     def _sequence(
         self, visual: Tensor, state: Tensor, prompts: Prompts, keep_mask: Tensor | None, td: TensorDictBase

@@ -7,12 +7,26 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.carried import dense
 from torchrl_sparse.errors import InputError
 
-__all__ = ["read_images", "read_instructions", "read_keep_mask", "read_state"]
+__all__ = ["read_images", "read_instructions", "read_keep_mask", "read_query", "read_state"]
+
+
+def read_query(td: TensorDictBase, policy: TensorDictModuleBase) -> TensorDictBase:
+    """Return what ``policy`` reads, [B].
+
+    Raises:
+        InputError: if there is no row.
+    """
+    rows = td.batch_size.numel()
+    if not rows:
+        raise InputError(f"batch: expected at least one policy call, got batch size {list(td.batch_size)}")
+    return dense(td.select(*policy.in_keys, strict=False), policy).reshape(rows)
 
 
 def read_images(td: TensorDictBase, cameras: Sequence[NestedKey], size: int) -> Tensor:

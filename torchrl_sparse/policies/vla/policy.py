@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.modules.vla import VLAWrapperBase
 
 from torchrl_sparse import keys
-from torchrl_sparse.carried import dense
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.vla.adapters import fold_adapters
 from torchrl_sparse.networks.vla.config import VLAConfig
@@ -23,7 +22,14 @@ from torchrl_sparse.networks.vla.network import VLANetwork
 from torchrl_sparse.networks.vla.normalize import QuantileNormalizer
 from torchrl_sparse.networks.vla.text import InstructionTokenizer, WordTokenizer
 from torchrl_sparse.networks.vla.vision import center_crop
-from torchrl_sparse.policies.vla.inputs import read_images, read_instructions, read_keep_mask, read_state
+from torchrl_sparse.policies.vla.engine import RunsInEngine, VLAEngineSlot
+from torchrl_sparse.policies.vla.inputs import (
+    read_images,
+    read_instructions,
+    read_keep_mask,
+    read_query,
+    read_state,
+)
 from torchrl_sparse.policies.vla.sizes import VLASizes
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.published.openvla_oft import Unsaid, is_openvla_oft, read_openvla_oft
@@ -34,7 +40,7 @@ from torchrl_sparse.tokens.base import TokenPruner
 __all__ = ["VLAPolicy"]
 
 
-class VLAPolicy(VLASizes, VLAWrapperBase):
+class VLAPolicy(VLASizes, RunsInEngine, VLAWrapperBase):
     """A vision-language-action policy of the OpenVLA-OFT architecture (arXiv:2502.19645).
 
     Reads the images of ``config.cameras``, u8 [*B, 3, image_size, image_size], upright; ``("observation", "state")``, f32
@@ -46,6 +52,8 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         network: the network.
         normalizer: of states and actions; by default they stay as they are.
         tokenizer: of instructions; by default one that knows the words of the prompt alone, and spells all others.
+        engine: what computes the network, see `VLAEngineSlot`: ``"openvino"`` (an extra), ``"torch"``, or ``"auto"``, the first
+            that applies. Actions are the same up to rounding. Where gradients may be asked for it is always PyTorch.
 
     Attributes:
         source: what it was trained for.
@@ -55,8 +63,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     Raises:
         KeyError: if a camera or the state is missing; the message names the key and those that are there.
         TypeError: if an instruction is not text.
-        InputError: if the batch is empty, an image, the state or a mask has a wrong shape or type, or the tokenizer has more
-            ids than the network.
+        InputError: if the batch is empty, an entry has a wrong shape or type, or the tokenizer more ids than the network.
 
     Examples:
         >>> policy = VLAPolicy(VLANetwork(VLAConfig.tiny()))
@@ -72,6 +79,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         network: VLANetwork,
         normalizer: QuantileNormalizer | None = None,
         tokenizer: InstructionTokenizer | None = None,
+        engine: str = "auto",
     ):
         config = network.config
         primary, *others = config.cameras
@@ -83,16 +91,13 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             wrist_image_key=others[0] if others else None,
         )
         self.network = network
-        self.normalizer = (
-            QuantileNormalizer.identity(config.state_dim, config.action_dim)
-            if normalizer is None
-            else normalizer
-        )
+        self.normalizer = normalizer or QuantileNormalizer.identity(config.state_dim, config.action_dim)
         self.tokenizer = WordTokenizer(()) if tokenizer is None else tokenizer
         if self.tokenizer.vocab_size > config.vocab_size:
             raise InputError(
                 f"tokenizer: expected at most vocab_size={config.vocab_size} ids, got {self.tokenizer.vocab_size}"
             )
+        self._slot = VLAEngineSlot(engine)
         self.pruner, self.source = None, VLASource()
         self.base: AdaptedBase | None = None
         self.eval()
@@ -119,6 +124,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         """
         policy = VLAPolicy(self.network, self.normalizer, self.tokenizer)
         policy.pruner, policy.source, policy.base = pruner, self.source, self.base
+        policy._slot = self._slot  # what is compiled serves both
         return policy
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -134,9 +140,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         pruner = getattr(self, "_pruner", None)
         wrist = self.tensor_keys.wrist_image
         read, written = (pruner.in_keys, pruner.out_keys) if pruner else ((), ())
-        masked = (
-            [] if keys.KEEP_MASK in written else [keys.KEEP_MASK]
-        )  # a pruner's own mask is new at every policy call
+        masked = [] if keys.KEEP_MASK in written else [keys.KEEP_MASK]  # a pruner's own is new at every call
         reads = [*([] if wrist is None else [wrist]), *masked, *read]
         writes = [keys.TOKEN_DEPTH, keys.KEPT, *written]
         self.in_keys = list(dict.fromkeys([*self.in_keys, *reads]))
@@ -149,25 +153,16 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
     ) -> TensorDictBase:
         device = next(self.network.parameters()).device
         start = synchronised_clock(device)
-        query = self._flatten(tensordict)
+        query = read_query(tensordict, self)
         actions, decoded = self.predict(query)
         answer = self._answer(query, actions, decoded)
         answer.set(keys.LATENCY, torch.full_like(answer.get(keys.FLOPS), synchronised_clock(device) - start))
         return self._output_tensordict(tensordict, answer.reshape(tensordict.batch_size), tensordict_out)
 
     def _predict_chunk(self, tensordict: TensorDictBase) -> Tensor:
-        query = self._flatten(tensordict)
+        query = read_query(tensordict, self)
         chunk = self.normalizer.unnormalize_action(self.predict(query)[0])
         return chunk.reshape(*tensordict.batch_size, *chunk.shape[1:])
-
-    def _flatten(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return what a policy call reads, [B]."""
-        rows = tensordict.batch_size.numel()
-        if not rows:
-            raise InputError(
-                f"batch: expected at least one policy call, got batch size {list(tensordict.batch_size)}"
-            )
-        return dense(tensordict.select(*self.in_keys, strict=False), self).reshape(rows)
 
     def predict(self, query: TensorDictBase) -> tuple[Tensor, Decoded]:
         """Return normalised actions f32 [B, H, A] and the decoder's output for a call [B]; a pruner writes into ``query``."""
@@ -184,6 +179,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             keep_mask=read_keep_mask(query, config.num_visual),
             hooks=self.pruner,
             td=query,
+            engine=self.current_engine(),
         )
         if self.pruner is not None:
             self.pruner.end(query)
@@ -227,6 +223,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         config: VLAConfig | None = None,
         base: str | Path | None = None,
         fold: bool = True,
+        engine: str = "auto",
         **published: Any,
     ) -> VLAPolicy:
         """Load a folder written by `save_pretrained` or published for OpenVLA-OFT. Nothing in the files is executed.
@@ -236,6 +233,7 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             config: the architecture that it must hold, for instance with two cameras; any by default.
             base: file of the language model that the policy adapts, where it does.
             fold: adapters are added to the weights that they adapt, to use the policy; False to train it further.
+            engine: see the class.
             published: arguments of `from_openvla_oft`, which only such a folder takes.
 
         Raises:
@@ -245,11 +243,11 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         if unread := ours if (released := is_openvla_oft(path)) else published:
             raise InputError(f"{', '.join(unread)}: expected none for {path}, whose own files tell")
         if released:
-            return cls.from_openvla_oft(path, **published)
+            return cls.from_openvla_oft(path, engine=engine, **published)
         stored = read_vla(Path(path), config, None if base is None else Path(base))
         if stored.base is not None and fold:
             stored = replace(stored, network=fold_adapters(stored.network), base=None)
-        return cls._assemble(stored)
+        return cls._assemble(stored, engine)
 
     @classmethod
     def from_openvla_oft(
@@ -263,18 +261,19 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
         normalization: Normalization = "bounds_q99",
         center_crop: bool = True,
         dtype: torch.dtype | None = None,
+        engine: str = "auto",
     ) -> VLAPolicy:
         """Load a published OpenVLA-OFT checkpoint, a folder as on the Hugging Face hub. Nothing in its files is executed.
 
         The policy reads upright images of the published size and crops them itself. What the published evaluation did to
-        LIBERO's images before that belongs to the environment, see `torchrl_sparse.envs.instructed.instructed_env`: a turn by
-        180 degrees, and JPEG and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers.
+        LIBERO's images before that belongs to `torchrl_sparse.envs.instructed.instructed_env`: a turn by 180 degrees, and JPEG
+        and Lanczos on the way to 224 pixels. The state is position, axis-angle and both fingers.
 
         Weights stay in the shards, of which the system reads what is used and keeps what there is room for, unless another
         ``dtype`` is asked for or the policy goes to another device. So the files have to stay as they are.
 
         Args:
-            path: the folder, see `torchrl_sparse.storage.published.openvla_oft`.
+            path: the folder, see `torchrl_sparse.storage.published.openvla_oft`; ``engine``: see the class.
             unnorm_key: the data set whose statistics normalise, such as ``"libero_spatial"`` (``"_no_noops"`` is added where
                 the file has it so); not needed where the file has one only.
             cameras: images that the checkpoint was trained with, 1 or 2; its files do not say.
@@ -291,10 +290,11 @@ class VLAPolicy(VLASizes, VLAWrapperBase):
             >>> policy = VLAPolicy.from_openvla_oft("checkpoint", unnorm_key="libero_spatial")  # doctest: +SKIP
         """
         unsaid = Unsaid(cameras, heads, chunk_size, normalization, center_crop)
-        return cls._assemble(read_openvla_oft(Path(path), unnorm_key=unnorm_key, unsaid=unsaid, dtype=dtype))
+        stored = read_openvla_oft(Path(path), unnorm_key=unnorm_key, unsaid=unsaid, dtype=dtype)
+        return cls._assemble(stored, engine)
 
     @classmethod
-    def _assemble(cls, stored: StoredVLA) -> VLAPolicy:
-        policy = cls(stored.network, stored.normalizer, stored.tokenizer)
+    def _assemble(cls, stored: StoredVLA, engine: str) -> VLAPolicy:
+        policy = cls(stored.network, stored.normalizer, stored.tokenizer, engine)
         policy.source, policy.base = stored.source, stored.base
         return policy
