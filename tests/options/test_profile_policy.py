@@ -16,6 +16,7 @@ from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusio
 from torchrl_sparse.networks.normalize import Normalizer
 
 CALL = "torchrl_sparse.evaluation.benchmarks.policy_call"
+ENGINES = "torchrl_sparse.evaluation.benchmarks.engine_times"
 VLA = "torchrl_sparse.evaluation.benchmarks.vla_latency"
 TIMED = "torchrl_sparse.evaluation.latency.profile.measure_latency"
 LOADED = "torchrl_sparse.cli.vla.VLAPolicy.from_pretrained"
@@ -64,7 +65,9 @@ class TestOptions(OptionTests):
         f"{VLA}.product_calls": returning({}),
         "torchrl_sparse.evaluation.benchmarks.world._measure": returning(WorldTimes(*[1.0] * 5)),
         LOADED: lambda *_, **__: make_policy("toy"),
-        **dict.fromkeys(("plot_engine_times", "plot_thread_scaling", "plot_vla_times"), returning(None)),
+        **dict.fromkeys(
+            (f"{ENGINES}.plot_engine_times", "plot_thread_scaling", "plot_vla_times"), returning(None)
+        ),
     }
     groups = (
         [
