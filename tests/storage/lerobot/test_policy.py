@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -10,7 +11,7 @@ from tensordict import TensorDict
 from tests.lerobot_answers import MOST, TASKS, error, observations
 from tests.refusals import refused
 from tests.storage.lerobot.conftest import FIXTURES, NAMES
-from torchrl_sparse import DiffusionPolicy, Sampler
+from torchrl_sparse import ChunkExecutor, DiffusionPolicy, Sampler
 from torchrl_sparse.blocks.uniform import Uniform
 
 pytestmark = pytest.mark.filterwarnings("ignore:num_inference_steps=3")
@@ -137,6 +138,16 @@ def test_images_of_whole_numbers_are_those_of_shares():
     as_bytes = TensorDict({"history": {"state": state, "top": images, "wrist": images}}, [1])
     as_shares = TensorDict({"history": {"state": state, "top": images / 255, "wrist": images / 255}}, [1])
     assert torch.equal(policy(as_bytes)["diffusion", "cond"], policy(as_shares)["diffusion", "cond"])
+
+
+def test_it_acts_on_plain_observations_of_its_own_cameras():
+    policy = DiffusionPolicy.from_lerobot(FIXTURES / "flow", task="pick it")
+    actor = ChunkExecutor(policy, n_action_steps=policy.source["n_action_steps"])
+    image = np.zeros((18, 20, 3), np.uint8)
+    observation = {"state": policy.normalizer.state_shift.numpy(), "top": image, "wrist": image}
+    assert actor.act(observation).shape == (3,)
+    with refused("top"):
+        actor.act(observation | {"top": image.astype(np.float32)})
 
 
 def change(file, **entries):
