@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-rest test-all lint docs install sanitize torture findings
+.PHONY: demo test test-rest test-all test-peers lint docs install sanitize torture findings
 
 install: $(VENV)/.installed
 
@@ -41,6 +41,18 @@ test-rest: $(VENV)/.ray
 	$(PYTEST) -m "full and not slow"
 
 test-all: test test-rest
+
+# Against other people's packages, each in an environment of its own: LeRobot needs Python 3.12 and numpy 2.
+PEER_PYTHON ?= python3.12
+LEROBOT := .venv-lerobot
+$(LEROBOT)/.installed: tests/peers/lerobot/requirements.txt
+	$(PEER_PYTHON) -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
+	$(LEROBOT)/bin/python -m pip install --quiet --requirement $<
+	touch $@
+
+test-peers: install $(LEROBOT)/.installed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 0 tests/peers
 
 $(VENV)/.ray: $(VENV)/.installed
 	$(call editable,.[ray])

@@ -28,7 +28,8 @@ constant                          shape, dtype           meaning
 ``FRAME_FEATURES``                f32 [*B, To, F]        features of the cameras' frames, the first columns of ``COND``
 ``SEED``                          i64 [*B, 1]            seeds all noise of one call, the initial and the per-step noise
 ``PRUNE_MASK``                    bool [*B, K, 3L]       True = pruned; axis K in execution order; column
-                                                         ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes
+                                                         ``3 * layer + {0: SA, 1: CA, 2: FFN}``; row 0 never prunes.
+                                                         Without cross-attention 2L, {0: SA, 1: FFN}
 ``PRUNE_RATE``                    f32 [*B, 1]            prune rate that a rate-conditioned pruner is asked for
 ``START``                         f32 [*B, H, A]         normalised actions that a call begins from, if not from noise
 ``NUM_STEPS``                     i64 [*B, 1]            denoising steps that a call takes, the sampler's last; K from noise

@@ -42,7 +42,6 @@ __all__ = [
 ]
 
 Objective = Literal["anchor", "consecutive"]
-_FFN = BLOCK_TYPES.index("FFN")
 
 
 def acs(similarity: Tensor, num_updates: int, objective: Objective = "anchor") -> tuple[int, ...]:
@@ -120,6 +119,7 @@ def bubbling_union(
     schedules: Sequence[Sequence[int]],
     errors: Tensor | Sequence[float],
     top_k: int = 5,
+    types: Sequence[str] = BLOCK_TYPES,
 ) -> tuple[tuple[int, ...], ...]:
     """Compute the blocks of highest error whenever a downstream FFN is computed (BUA).
 
@@ -131,6 +131,7 @@ def bubbling_union(
         schedules: computed steps of the 3L blocks in column order.
         errors: error scores [3L], see :func:`~torchrl_sparse.blocks.calibration.block_error`.
         top_k: size of U; 0 changes nothing.
+        types: blocks of a layer.
 
     Returns:
         the new schedules, in column order.
@@ -142,14 +143,14 @@ def bubbling_union(
         >>> bubbling_union([[0, 1], [0, 2], [0, 3]], errors=[9.0, 0.0, 1.0], top_k=1)
         ((0, 1, 3), (0, 2), (0, 3))
     """
-    if len(schedules) != len(errors) or len(schedules) % len(BLOCK_TYPES):
+    if len(schedules) != len(errors) or len(schedules) % len(types):
         raise InputError(
-            f"errors: expected one score per schedule (3L), got {len(errors)} for {len(schedules)} schedules"
+            f"errors: expected one score per schedule ({len(types)}L), got {len(errors)} for {len(schedules)} schedules"
         )
     merged = [set(steps) for steps in schedules]
     for block in upstream_blocks(errors, top_k):
-        own_ffn = block - block % len(BLOCK_TYPES) + _FFN
-        merged[block] = merged[block].union(*merged[own_ffn :: len(BLOCK_TYPES)])
+        own_ffn = block - block % len(types) + types.index("FFN")
+        merged[block] = merged[block].union(*merged[own_ffn :: len(types)])
     return tuple(tuple(sorted(steps)) for steps in merged)
 
 
@@ -217,8 +218,9 @@ def bac_schedule(
     alone = bac_blockwise_schedule(
         calibration, num_updates, policy=policy, objective=objective, force_last=force_last
     )
-    steps = bubbling_union(alone.computed_steps, calibration.errors, top_k)
-    upstream = [block_name(block) for block in upstream_blocks(calibration.errors, top_k)]
+    steps = bubbling_union(alone.computed_steps, calibration.errors, top_k, calibration.block_types)
+    types = calibration.block_types
+    upstream = [block_name(block, types) for block in upstream_blocks(calibration.errors, top_k)]
     settings = {**alone.settings, "top_k": top_k, "upstream_blocks": upstream}
     return _schedule("bac", calibration, policy, steps, settings)
 
@@ -267,8 +269,9 @@ def _schedule(
         method,
         policy,
         num_steps,
-        num_blocks // len(BLOCK_TYPES),
+        num_blocks // len(calibration.block_types),
         tuple(steps),
         calibration.sampler,
         settings=settings,
+        block_types=calibration.block_types,
     )

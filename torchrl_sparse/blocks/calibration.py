@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import BLOCK_TYPES, Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["Calibration", "block_error", "calibrate", "feature_similarity"]
 
@@ -60,16 +60,18 @@ class Calibration:
         errors: f64 [3L], see :func:`block_error`.
         num_samples: policy calls that were averaged.
         sampler: name of the sampler that denoised them; the schedules made from this are for it.
+        block_types: blocks of a layer of its network.
     """
 
     similarity: Tensor
     errors: Tensor
     num_samples: int
     sampler: str = "ddpm"
+    block_types: tuple[str, ...] = BLOCK_TYPES
 
 
 @torch.no_grad()
-def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor) -> Calibration:
+def calibrate(network: Denoiser, sampler: Sampler, noise: Tensor, cond: Tensor) -> Calibration:
     """Record the block outputs of dense policy calls. The paper uses a single call; several average out its noise.
 
     Args:
@@ -106,4 +108,5 @@ def calibrate(network: TransformerForDiffusion, sampler: Sampler, noise: Tensor,
         blocks = recorder.features()
         similarity = similarity + torch.stack([feature_similarity(block) for block in blocks])
         errors = errors + torch.stack([block_error(block) for block in blocks])
-    return Calibration(similarity / len(cond), errors / len(cond), len(cond), sampler.name)
+    means = similarity / len(cond), errors / len(cond)
+    return Calibration(*means, len(cond), sampler.name, network.block_types)

@@ -20,8 +20,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["StaticGates", "noise_errors"]
 
@@ -52,7 +52,7 @@ class StaticGates(nn.Module):
 
 
 def noise_errors(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     clean: Tensor,
     noise: Tensor,
@@ -77,6 +77,7 @@ def noise_errors(
         f32 [B, H, A], differentiable in ``gate``.
 
     Examples:
+        >>> from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
         >>> network = TransformerForDiffusion(
         ...     input_dim=7, output_dim=7, horizon=4, n_obs_steps=2, cond_dim=5, n_layer=1, n_emb=16
         ... ).eval()
@@ -87,18 +88,18 @@ def noise_errors(
     timesteps = sampler.timesteps.to(cond.device)[step - 1 : step + 1]
     with torch.no_grad():
         before = sampler.add_noise(clean, noise[:, 0], timesteps[0].expand(len(clean)))
-        eps, cached = _predict(network, before, int(timesteps[0]), cond)
+        eps, cached = _predict(network, before, timesteps[0].item(), cond)
         cleans = sampler.remember((), eps, step - 1, before) * 2
         sample = sampler.step(eps, step - 1, before, noise[:, 1], cleans)
-        expected, _ = _predict(network, sample, int(timesteps[1]), cond)
-    actual, _ = _predict(network, sample, int(timesteps[1]), cond, cached, gate[..., None, None])
+        expected, _ = _predict(network, sample, timesteps[1].item(), cond)
+    actual, _ = _predict(network, sample, timesteps[1].item(), cond, cached, gate[..., None, None])
     return actual - expected
 
 
 def _predict(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sample: Tensor,
-    timestep: int,
+    timestep: float,
     cond: Tensor,
     cached: list[Tensor] | None = None,
     gate: Tensor | None = None,

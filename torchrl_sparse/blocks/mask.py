@@ -4,6 +4,7 @@ A mask is bool [*B, K, 3L] with **True = pruned** (the symbol M of SAG, arXiv:26
 calls of the network in execution order: step 0 is the first, noisiest call. (The BAC paper, arXiv:2506.13456,
 counts diffusion timesteps, which run down; ``Sampler.timesteps[step]`` translates.) The column names
 the block: ``3 * layer + {0: SA, 1: CA, 2: FFN}``. Row 0 never prunes, so there is always something to reuse.
+Of a network without cross-attention, masks are bool [*B, K, 2L], column ``2 * layer + {0: SA, 1: FFN}``.
 
 A pruned block adds an earlier output to the residual stream. Which one is the *reuse rule*:
 
@@ -28,9 +29,11 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.errors import InputError
-from torchrl_sparse.networks.diffusion.transformer import BLOCK_TYPES, TransformerForDiffusion
+from torchrl_sparse.networks.diffusion.adaln import AdaLNTransformer
+from torchrl_sparse.networks.diffusion.denoiser import ALL_BLOCK_TYPES, BLOCK_TYPES, Denoiser
 
 __all__ = [
+    "ALL_BLOCK_TYPES",
     "BLOCK_TYPES",
     "REUSED_COLOR",
     "REUSE_RULES",
@@ -62,21 +65,27 @@ Reuse = Literal["block", "type", "single"]
 REUSE_RULES: tuple[Reuse, ...] = get_args(Reuse)
 
 
-def block_name(column: int) -> str:
-    """Return the name of a mask column, as in the BAC paper.
+def block_name(column: int, types: Sequence[str] = BLOCK_TYPES) -> str:
+    """Return the name of a mask column, as in the BAC paper; ``types`` are the blocks of a layer.
 
-    >>> block_name(17)
-    'layers.5.FFN'
+    >>> block_name(17), block_name(17, ("SA", "FFN"))
+    ('layers.5.FFN', 'layers.8.FFN')
     """
-    layer, kind = divmod(column, len(BLOCK_TYPES))
-    return f"layers.{layer}.{BLOCK_TYPES[kind]}"
+    layer, kind = divmod(column, len(types))
+    return f"layers.{layer}.{types[kind]}"
 
 
 class MaskError(InputError):
     """Error for a tensor that is not a prune mask; the message says what was expected and what came."""
 
 
-def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
+def validate_mask(
+    mask: Tensor,
+    num_steps: int,
+    num_layers: int,
+    batch: Sequence[int] | None = None,
+    types: Sequence[str] = BLOCK_TYPES,
+) -> None:
     """Refuse anything that is not a prune mask.
 
     Args:
@@ -84,31 +93,38 @@ def validate_mask(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence
         num_steps: denoising steps K.
         num_layers: layers L.
         batch: expected leading dimensions; None accepts any.
+        types: blocks of a layer.
 
     Raises:
         MaskError: if ``mask`` is no bool tensor [*batch, K, 3L] or if its first row prunes.
 
     >>> validate_mask(torch.zeros(4, 10, 6, dtype=torch.bool), num_steps=10, num_layers=2)
     """
-    check_form(mask, num_steps, num_layers, batch)
+    check_form(mask, num_steps, num_layers, batch, types)
     first = mask.select(-2, 0)
     if (
         first.any()
     ):  # one operation where nothing is wrong: every policy call of every method comes through here
         pruned = first.reshape(-1, first.shape[-1]).any(dim=0).nonzero().flatten().tolist()
-        names = ", ".join(block_name(column) for column in pruned)
+        names = ", ".join(block_name(column, types) for column in pruned)
         raise MaskError(
             f"prune mask: expected row 0 (the first denoising step) to prune nothing, got True for {names}"
         )
 
 
-def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[int] | None = None) -> None:
+def check_form(
+    mask: Tensor,
+    num_steps: int,
+    num_layers: int,
+    batch: Sequence[int] | None = None,
+    types: Sequence[str] = BLOCK_TYPES,
+) -> None:
     """Check type and shape of a prune mask, without reading its values; see :func:`validate_mask`.
 
     Raises:
         MaskError: if ``mask`` is no bool tensor [*batch, K, 3L].
     """
-    tail = (num_steps, len(BLOCK_TYPES) * num_layers)
+    tail = (num_steps, len(types) * num_layers)
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         came = f"dtype {mask.dtype}" if isinstance(mask, Tensor) else type(mask).__name__
         raise MaskError(f"prune mask: expected a tensor of dtype torch.bool, got {came}")
@@ -119,7 +135,7 @@ def check_form(mask: Tensor, num_steps: int, num_layers: int, batch: Sequence[in
     if mask.shape[-2:] != tail or (batch is not None and mask.shape[:-2] != tuple(batch)):
         raise MaskError(
             f"prune mask: expected shape [{lead}{tail[0]}, {tail[1]}] (K={num_steps} denoising steps, "
-            f"3L={tail[1]} blocks), got {list(mask.shape)}"
+            f"{len(types)}L={tail[1]} blocks), got {list(mask.shape)}"
         )
 
 
@@ -129,14 +145,16 @@ def check_reuse(reuse: str) -> None:
         raise InputError(f"reuse: expected one of {list(REUSE_RULES)}, got {reuse!r}")
 
 
-def num_buffers(reuse: Reuse, num_blocks: int) -> int:
+def num_buffers(reuse: Reuse, num_blocks: int, types: Sequence[str] = BLOCK_TYPES) -> int:
     """Return the number of block outputs that a reuse rule keeps; block ``b`` uses buffer ``b % num_buffers``.
+
+    ``types`` are the blocks of a layer.
 
     >>> num_buffers("type", num_blocks=24)
     3
     """
     check_reuse(reuse)
-    return {"block": num_blocks, "type": len(BLOCK_TYPES), "single": 1}[reuse]
+    return {"block": num_blocks, "type": len(types), "single": 1}[reuse]
 
 
 def prune_rate(mask: Tensor) -> Tensor:
@@ -170,14 +188,15 @@ class NetworkSizes:
     """Sizes of a denoiser that determine its cost.
 
     Attributes:
-        num_layers: decoder layers L.
+        num_layers: layers L.
         horizon: actions in a chunk H.
-        n_obs_steps: observations To; the memory holds 1 + To tokens.
+        n_obs_steps: observations To; of the published transformer, the memory holds 1 + To tokens.
         width: embedding size d.
         input_dim: size of a noisy action.
-        output_dim: size of a predicted noise vector.
+        output_dim: size of a prediction.
         cond_dim: size of one encoded observation.
         num_cond_layers: layers of the condition encoder; 0 is the token-wise MLP of the published models.
+        time_dim: of an `AdaLNTransformer`, size of the timestep's embedding; None of the published transformer.
     """
 
     num_layers: int
@@ -188,9 +207,10 @@ class NetworkSizes:
     output_dim: int
     cond_dim: int
     num_cond_layers: int = 0
+    time_dim: int | None = None
 
     @classmethod
-    def of(cls, network: TransformerForDiffusion) -> NetworkSizes:
+    def of(cls, network: Denoiser) -> NetworkSizes:
         """Read the sizes of ``network``."""
         return cls(
             num_layers=network.n_layer,
@@ -200,12 +220,20 @@ class NetworkSizes:
             input_dim=network.input_dim,
             output_dim=network.output_dim,
             cond_dim=network.cond_dim,
-            num_cond_layers=network.n_cond_layers,
+            num_cond_layers=network.config.get("n_cond_layers", 0),
+            time_dim=network.time_dim if isinstance(network, AdaLNTransformer) else None,
         )
 
+    @property
+    def block_types(self) -> tuple[str, ...]:
+        """The blocks of a layer."""
+        return BLOCK_TYPES if self.time_dim is None else AdaLNTransformer.block_types
 
-def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
-    """Count the multiply-accumulates of one SA, one CA and one FFN block in one call, batch 1.
+
+def block_macs(sizes: NetworkSizes) -> tuple[int, ...]:
+    """Count the multiply-accumulates of one block of each type in one call, batch 1.
+
+    Adaptive layer norms are counted with their blocks, as published code computes them, time and observations in every call.
 
     >>> lift = NetworkSizes(8, horizon=10, n_obs_steps=2, width=256, input_dim=10, output_dim=10, cond_dim=19)
     >>> [round(macs / sum(block_macs(lift)), 3) for macs in block_macs(lift)]
@@ -213,24 +241,27 @@ def block_macs(sizes: NetworkSizes) -> tuple[int, int, int]:
     """
     d, tokens, memory = sizes.width, sizes.horizon, 1 + sizes.n_obs_steps
     self_attention = 4 * d * d * tokens + 2 * tokens * tokens * d
-    cross_attention = 2 * d * d * tokens + 2 * d * d * memory + 2 * tokens * memory * d
     feed_forward = 8 * d * d * tokens
+    if sizes.time_dim is not None:
+        modulation = 3 * d * (sizes.time_dim + sizes.n_obs_steps * sizes.cond_dim)
+        return self_attention + modulation, feed_forward + modulation
+    cross_attention = 2 * d * d * tokens + 2 * d * d * memory + 2 * tokens * memory * d
     return self_attention, cross_attention, feed_forward
 
 
 def fixed_macs(sizes: NetworkSizes) -> int:
     """Count the multiply-accumulates of one call outside the blocks, which are never pruned: stems, condition encoder, head."""
     d, memory = sizes.width, 1 + sizes.n_obs_steps
+    stem_and_head = (sizes.input_dim + sizes.output_dim) * d * sizes.horizon
+    if sizes.time_dim is not None:
+        return 4 * sizes.time_dim**2 + stem_and_head
     encoder = 8 * d * d * memory
     if sizes.num_cond_layers:
         encoder = sizes.num_cond_layers * (12 * d * d * memory + 2 * memory * memory * d)
-    stems_and_head = (
-        sizes.cond_dim * d * sizes.n_obs_steps + (sizes.input_dim + sizes.output_dim) * d * sizes.horizon
-    )
-    return encoder + stems_and_head
+    return encoder + sizes.cond_dim * d * sizes.n_obs_steps + stem_and_head
 
 
-def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -> Tensor:
+def query_flops(network: Denoiser | NetworkSizes, mask: Tensor) -> Tensor:
     """Count the FLOPs (2 · MAC) of one policy call under ``mask``, over all K calls of the denoiser.
 
     Args:
@@ -249,7 +280,7 @@ def query_flops(network: TransformerForDiffusion | NetworkSizes, mask: Tensor) -
     """
     sizes = network if isinstance(network, NetworkSizes) else NetworkSizes.of(network)
     num_steps = mask.shape[-2] if isinstance(mask, Tensor) and mask.ndim >= 2 else 1
-    validate_mask(mask, num_steps, sizes.num_layers)
+    validate_mask(mask, num_steps, sizes.num_layers, types=sizes.block_types)
     return mask_flops(sizes, mask)
 
 

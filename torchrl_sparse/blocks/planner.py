@@ -34,17 +34,19 @@ class PlanSpec:
         num_layers: layers L of the network.
         policy: fingerprint of the policy; a plan that was made for one policy is refused by another.
         sampler: name of its sampler, see `Sampler.name`.
+        block_types: blocks of a layer.
     """
 
     num_inference_steps: int
     num_layers: int
     policy: str
     sampler: str = "ddpm"
+    block_types: tuple[str, ...] = BLOCK_TYPES
 
     @property
     def num_blocks(self) -> int:
-        """Blocks 3L, the width of a mask."""
-        return len(BLOCK_TYPES) * self.num_layers
+        """Blocks of all layers, 3L or 2L, the width of a mask."""
+        return len(self.block_types) * self.num_layers
 
     def check_is(self, asked: PlanSpec, who: str) -> None:
         """Raise InputError, naming ``who``, unless ``asked`` is the policy and sampler it was built for.
@@ -166,7 +168,7 @@ class Planner(TensorDictModuleBase):
             cond = cond.reshape(rows, *cond.shape[-2:])
         masks = self.masks(cond, **self.options(tensordict, rows))
         try:
-            check_form(masks, spec.num_inference_steps, spec.num_layers, batch=(rows,))
+            check_form(masks, spec.num_inference_steps, spec.num_layers, (rows,), spec.block_types)
         except MaskError as error:
             raise InputError(f"{type(self).__name__}.masks: {error}") from error
         return tensordict.set(PRUNE_MASK, masks if flat else masks.reshape(*batch, *masks.shape[1:]))
@@ -202,7 +204,7 @@ class StaticPlanner(Planner):
     def _prepare(self, spec: PlanSpec) -> None:
         mask = self.mask(spec)
         try:
-            validate_mask(mask, spec.num_inference_steps, spec.num_layers, batch=())
+            validate_mask(mask, spec.num_inference_steps, spec.num_layers, (), spec.block_types)
         except ValueError as error:
             raise InputError(f"{type(self).__name__}.mask: {error}") from error
         self._mask = mask

@@ -124,4 +124,5 @@ def _storable(planner: Planner) -> Any:
         policy=spec.policy,
         sampler=spec.sampler,
         reuse=planner.reuse,
+        block_types=spec.block_types,
     )

@@ -33,6 +33,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from torchrl_sparse.blocks.mask import (
+    ALL_BLOCK_TYPES,
     BLOCK_TYPES,
     Reuse,
     block_name,
@@ -72,7 +73,8 @@ class _ScheduleFile:
     def schedule(self) -> CacheSchedule:
         """Return the schedule; InputError if its blocks are not those of the network."""
         steps = self.computed_steps
-        names = [block_name(column) for column in range(len(steps))]
+        types = next((types for types in ALL_BLOCK_TYPES if block_name(1, types) in steps), BLOCK_TYPES)
+        names = [block_name(column, types) for column in range(len(steps))]
         if missing := [name for name in names if name not in steps]:
             raise InputError(f"computed_steps: expected {', '.join(names)}; missing {missing}")
         return CacheSchedule(
@@ -84,6 +86,7 @@ class _ScheduleFile:
             self.sampler,
             self.reuse,
             self.settings,
+            types,
         )
 
 
@@ -96,11 +99,12 @@ class CacheSchedule:
         policy: fingerprint of the policy that it was made for.
         num_inference_steps: denoising steps K.
         num_layers: layers L.
-        computed_steps: for each of the 3L blocks in column order, its computed steps: increasing, starting
+        computed_steps: for each of the blocks in column order, its computed steps: increasing, starting
             with 0.
         sampler: name of the sampler that it was made for, see `Sampler.name`.
         reuse: what its pruned blocks reuse, see :mod:`torchrl_sparse.blocks.mask`.
         settings: how it was made; numbers, strings, lists and the like, for people and reports.
+        block_types: blocks of a layer, as its network has them.
 
     Raises:
         InputError: if a field does not hold what is described here.
@@ -119,6 +123,7 @@ class CacheSchedule:
     sampler: str = "ddpm"
     reuse: Reuse = "block"
     settings: dict[str, Any] = field(default_factory=dict)
+    block_types: tuple[str, ...] = BLOCK_TYPES
 
     def __post_init__(self) -> None:
         for name in ("method", "policy"):
@@ -128,13 +133,14 @@ class CacheSchedule:
         check_size("num_layers", self.num_layers, MAX_LAYERS)
         SamplerName.parse(self.sampler)
         check_reuse(self.reuse)
-        expected = len(BLOCK_TYPES) * self.num_layers
-        if len(self.computed_steps) != expected:
+        types = len(self.block_types)
+        if len(self.computed_steps) != types * self.num_layers:
             raise InputError(
-                f"computed_steps: expected {expected} blocks (3 * num_layers), got {len(self.computed_steps)}"
+                f"computed_steps: expected {types * self.num_layers} blocks ({types} * num_layers), "
+                f"got {len(self.computed_steps)}"
             )
         for column, steps in enumerate(self.computed_steps):
-            _check_steps(block_name(column), steps, self.num_inference_steps)
+            _check_steps(block_name(column, self.block_types), steps, self.num_inference_steps)
         object.__setattr__(self, "computed_steps", tuple(tuple(steps) for steps in self.computed_steps))
 
     @classmethod
@@ -147,23 +153,25 @@ class CacheSchedule:
         sampler: str = "ddpm",
         reuse: Reuse = "block",
         settings: dict[str, Any] | None = None,
+        block_types: tuple[str, ...] = BLOCK_TYPES,
     ) -> CacheSchedule:
-        """Build the schedule of a mask bool [K, 3L].
+        """Make the schedule of a mask bool [K, 3L], or of as many as ``block_types`` in each layer.
 
         Raises:
             InputError: if ``mask`` is no prune mask.
         """
         num_steps, num_blocks = mask.shape if mask.ndim == 2 else (1, 0)
-        num_layers = max(1, num_blocks // len(BLOCK_TYPES))
-        validate_mask(mask, num_steps, num_layers, batch=())
-        return cls(
-            method, policy, num_steps, num_layers, steps_from_mask(mask), sampler, reuse, settings or {}
-        )
+        num_layers = max(1, num_blocks // len(block_types))
+        validate_mask(mask, num_steps, num_layers, (), block_types)
+        steps = steps_from_mask(mask)
+        return cls(method, policy, num_steps, num_layers, steps, sampler, reuse, settings or {}, block_types)
 
     @property
     def spec(self) -> PlanSpec:
         """The policy and the sampler that the schedule was made for."""
-        return PlanSpec(self.num_inference_steps, self.num_layers, self.policy, self.sampler)
+        return PlanSpec(
+            self.num_inference_steps, self.num_layers, self.policy, self.sampler, self.block_types
+        )
 
     def mask(self) -> Tensor:
         """Return the prune mask bool [K, 3L]."""
@@ -207,7 +215,7 @@ class CacheSchedule:
         }
         lines = [f"  {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
         blocks = [
-            f"    {json.dumps(block_name(column))}: {json.dumps(steps)}"
+            f"    {json.dumps(block_name(column, self.block_types))}: {json.dumps(steps)}"
             for column, steps in enumerate(self.computed_steps)
         ]
         return "\n".join(["{", *lines, '  "computed_steps": {', ",\n".join(blocks), "  }", "}", ""])

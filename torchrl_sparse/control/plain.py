@@ -67,7 +67,7 @@ class PlainLoop:
         return self._carried[self._executor.tensor_keys["action"]].cpu().numpy()
 
     def _read(self, name: str, value: np.ndarray) -> Tensor:
-        if name in ("image", "wrist_image"):
+        if name in ("image", "wrist_image", *getattr(self._policy.vision, "cameras", ())):
             return _image(name, value, tuple(self._policy.vision.image_size))
         size = self._policy.normalizer.state_scale.numel() if name == "state" else None
         return _numbers(name, value, size)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.rotations import ABSOLUTE_DIM
 
-__all__ = ["MIN_RANGE", "Normalizer"]
+__all__ = ["MIN_RANGE", "Normalizer", "ShiftedNormalizer"]
 
 _POSITION = slice(0, 3)
 MIN_RANGE = 1e-4
@@ -88,6 +88,10 @@ class Normalizer(nn.Module):
             raise InputError(f'state_mode: expected "global" or "range", got {state_mode!r}')
         return cls(scale.clone(), offset.clone(), *(_pose_map(action) if poses else _range_map(action)))
 
+    def state_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest states [Ds] that are mapped to [-1, 1], in environment units."""
+        return (-1 - self.state_offset) / self.state_scale, (1 - self.state_offset) / self.state_scale
+
     def normalize_state(self, state: Tensor) -> Tensor:
         """Map states [..., Ds] from environment units to the policy's."""
         return state * self.state_scale + self.state_offset
@@ -99,6 +103,55 @@ class Normalizer(nn.Module):
     def unnormalize_action(self, action: Tensor) -> Tensor:
         """Map actions [..., A] from the policy's units to environment units."""
         return (action - self.action_offset) / self.action_scale
+
+
+class ShiftedNormalizer(Normalizer):
+    """``normalised = (x - shift) * scale + offset``, for statistics of dimensions that hardly vary.
+
+    Where a range is 1e-8, as LeRobot's normalisers have it for a constant, ``x * scale`` has lost x before the offset comes.
+
+    Args:
+        state_scale, state_offset, state_shift: f32 [Ds].
+        action_scale, action_offset, action_shift: f32 [A].
+
+    Examples:
+        >>> constant, one, zero = torch.full((1,), 0.3), torch.ones(1), torch.zeros(1)
+        >>> ShiftedNormalizer(one * 2e8, -one, one, zero, state_shift=constant, action_shift=zero).normalize_state(constant)
+        tensor([-1.])
+    """
+
+    def __init__(
+        self,
+        state_scale: Tensor,
+        state_offset: Tensor,
+        action_scale: Tensor,
+        action_offset: Tensor,
+        *,
+        state_shift: Tensor,
+        action_shift: Tensor,
+    ) -> None:
+        super().__init__(state_scale, state_offset, action_scale, action_offset)
+        _check_pair("state", state_scale, state_shift)
+        _check_pair("action", action_scale, action_shift)
+        self.register_buffer("state_shift", state_shift.float())
+        self.register_buffer("action_shift", action_shift.float())
+
+    def state_range(self) -> tuple[Tensor, Tensor]:
+        """See `Normalizer.state_range`."""
+        low, high = super().state_range()
+        return low + self.state_shift, high + self.state_shift
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Map states [..., Ds] in environment units to the policy's."""
+        return super().normalize_state(state - self.state_shift)
+
+    def normalize_action(self, action: Tensor) -> Tensor:
+        """Map actions [..., A] in environment units to the policy's."""
+        return super().normalize_action(action - self.action_shift)
+
+    def unnormalize_action(self, action: Tensor) -> Tensor:
+        """Map actions [..., A] of the policy to environment units."""
+        return super().unnormalize_action(action) + self.action_shift
 
 
 def _pose_map(action: Tensor) -> tuple[Tensor, Tensor]:

@@ -47,7 +47,8 @@ def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike
     Raises:
         InputError: if a curve is missing.
     """
-    needed = ["train/fidelity", "train/rate_cost", *(f"train/rate_{kind}" for kind in BLOCK_TYPES)]
+    types = [kind for kind in BLOCK_TYPES if kind != "CA" or f"train/rate_{kind}" in curves]
+    needed = ["train/fidelity", "train/rate_cost", *(f"train/rate_{kind}" for kind in types)]
     if missing := [name for name in needed if name not in curves]:
         raise InputError(f"curves: expected {needed}, missing {missing}")
     figure, grid = make_figure(9, 6.6, rows=3, columns=1, sharex=True)
@@ -62,7 +63,8 @@ def plot_pruner_curves(curves: Mapping[str, np.ndarray], path: str | os.PathLike
     _plot_held_out(sparsity, None if held_out is None else np.stack(_percent(held_out), axis=1))
     sparsity.axhline(100 * rate, color="#333333", linestyle=(0, (4, 3)), linewidth=1)
     sparsity.set_ylabel("cost pruned (%)")
-    for kind, color in zip(BLOCK_TYPES, TYPE_COLORS, strict=True):
+    for kind in types:
+        color = TYPE_COLORS[BLOCK_TYPES.index(kind)]
         shares.plot(*_percent(curves[f"train/rate_{kind}"]), color=color, label=kind)
     shares.set_ylabel("blocks pruned (%)")
     shares.set_xlabel("update")

@@ -47,7 +47,7 @@ def test_names_and_configs_of_old_files_are_unchanged():
 @pytest.mark.parametrize(
     ("arguments", "entry"),
     [
-        ({"kind": "flow"}, "kind"),
+        ({"kind": "euler"}, "kind"),
         ({"spacing": "even"}, "spacing"),
         ({"eta": 0.5}, "eta"),
         ({"kind": "ddim", "eta": 1.5}, "eta"),
@@ -80,7 +80,7 @@ def test_timesteps_that_do_not_fall_are_refused(kind, steps, timesteps):
 
 @pytest.mark.parametrize(
     "name",
-    ["ddim_", "ddim_-3", "flow", "ddim_9_x", "ddpm10_82_14", "ddim0", "ddim_eta", "ddim_eta0.5_trailing",
+    ["ddim_", "ddim_-3", "euler", "ddim_0.5", "ddim_9_x", "ddpm10_82_14", "ddim0", "ddim_eta", "ddim_eta0.5_trailing",
      "ddim_123456", None],
 )  # fmt: skip
 def test_other_names_are_refused(name):

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl_sparse.blocks.mask import Reuse, check_reuse, validate_mask
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["Engine", "Overhead", "check_input", "check_query"]
 
@@ -76,10 +76,10 @@ class Engine(Protocol):
         ...
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
-        """Measure the seconds of one block of each type, ``{"SA": ..., "CA": ..., "FFN": ...}``, batch 1."""
+        """Measure the seconds of one block of each of the network's types, ``{"SA": ..., "FFN": ..., ...}``, batch 1."""
         ...
 
-    def block_macs(self) -> tuple[int, int, int]:
+    def block_macs(self) -> tuple[int, ...]:
         """Return the multiply-accumulates of one SA, one CA and one FFN block in this engine, batch 1."""
         ...
 
@@ -89,7 +89,7 @@ class Engine(Protocol):
 
 
 def check_query(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -114,11 +114,11 @@ def check_query(
         expected |= {"guide.actions": (batch, *chunk), "guide.pull": (batch, network.horizon, 1)}
         given |= {"guide.actions": guide.actions, "guide.pull": guide.pull}
     for name, shape in expected.items():
-        check_input(name, given[name], shape, network.pos_emb)
+        check_input(name, given[name], shape, network.like)
     if guide is not None and not ((guide.pull >= 0) & (guide.pull <= 1)).all():
         raise InputError(f"guide.pull: expected numbers in [0, 1], got {guide.pull.flatten().tolist()}")
     if mask is not None:
-        validate_mask(mask, num_steps, network.n_layer, batch=(batch,))
+        validate_mask(mask, num_steps, network.n_layer, (batch,), network.block_types)
     check_reuse(reuse)
 
 

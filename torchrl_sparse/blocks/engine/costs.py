@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sparse.blocks.engine.base import Engine, Overhead
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, block_macs
+from torchrl_sparse.blocks.mask import NetworkSizes, block_macs
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = [
@@ -36,9 +36,9 @@ class BlockCost:
 
 
 def engine_block_costs(engine: Engine) -> dict[str, BlockCost]:
-    """Measure the cost of one ``"SA"``, ``"CA"`` and ``"FFN"`` block in ``engine``."""
+    """Measure the cost of one block of each type in ``engine``: ``"SA"``, ``"FFN"``, and ``"CA"`` where the network has it."""
     seconds, macs = engine.block_seconds(), engine.block_macs()
-    return {kind: BlockCost(seconds[kind], 2 * macs[index]) for index, kind in enumerate(BLOCK_TYPES)}
+    return {kind: BlockCost(seconds[kind], 2 * macs[index]) for index, kind in enumerate(seconds)}
 
 
 def folded_block_macs(network: TransformerForDiffusion) -> tuple[int, int, int]:
@@ -99,8 +99,11 @@ def executed_flops(engine: Engine, mask: Tensor, num_steps: Tensor | None = None
     taken = torch.full((*mask.shape[:-2], 1), last) if num_steps is None else num_steps.cpu()
     before = torch.arange(last) - (last - taken)  # steps from the first that is taken, [*B, K]
     computed = (~mask | (before == 0)[..., None]) & (before >= 0)[..., None]
-    macs = torch.tensor(engine.block_macs(), dtype=torch.float64).repeat(blocks // len(BLOCK_TYPES))
+    types = engine.block_macs()
+    macs = torch.tensor(types, dtype=torch.float64).repeat(blocks // len(types))
     of_blocks = (computed.double() @ macs).sum(dim=-1)
-    reading = computed[..., BLOCK_TYPES.index("CA") :: len(BLOCK_TYPES)].any(dim=-1).sum(dim=-1)
     outside = engine.overhead_macs()
+    reading: Tensor | int = 0
+    if outside.memory:  # of cross-attention, which stands in the middle of a layer
+        reading = computed[..., 1 :: len(types)].any(dim=-1).sum(dim=-1)
     return 2 * (of_blocks + taken.squeeze(-1) * outside.step + reading * outside.memory + outside.query)

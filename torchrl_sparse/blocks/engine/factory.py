@@ -10,19 +10,30 @@ from torchrl_sparse.blocks.engine.base import Engine
 from torchrl_sparse.blocks.engine.native.engine import NativeEngine
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.reference import ReferenceEngine
+from torchrl_sparse.blocks.engine.torch.adaln_engine import AdaLNEngine
 from torchrl_sparse.blocks.engine.torch.engine import TorchEngine
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.adaln import AdaLNTransformer
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["ENGINES", "EngineEntry", "EngineName", "EngineSlot", "check_engine", "make_engine"]
 
 EngineName = str  # a name in ENGINES, or "auto"
-Applies = Callable[[TransformerForDiffusion], tuple[bool, str]]
+Applies = Callable[[Denoiser], tuple[bool, str]]
 
 
-def _always(network: TransformerForDiffusion) -> tuple[bool, str]:
+def _always(network: Denoiser) -> tuple[bool, str]:
     return True, ""
+
+
+def _torch_engine(network: Denoiser, sampler: Sampler) -> Engine:
+    """Make the PyTorch engine of the network's shape."""
+    if isinstance(network, AdaLNTransformer):
+        return AdaLNEngine(network, sampler)
+    assert isinstance(network, TransformerForDiffusion)  # there is no other
+    return TorchEngine(network, sampler)
 
 
 class EngineEntry(NamedTuple):
@@ -39,14 +50,14 @@ class EngineEntry(NamedTuple):
         >>> del ENGINES["mine"]
     """
 
-    make: Callable[[TransformerForDiffusion, Sampler], Engine]
+    make: Callable[[Denoiser, Sampler], Engine]
     applies: Applies = _always
 
 
 # By name; "auto" takes the first that applies, so that those that round come last.
 ENGINES: dict[str, EngineEntry] = {
     "native": EngineEntry(NativeEngine, native_supports),
-    "torch": EngineEntry(TorchEngine),
+    "torch": EngineEntry(_torch_engine),
     "reference": EngineEntry(ReferenceEngine),
     "native_bf16": EngineEntry(partial(NativeEngine, weights="bfloat16"), native_supports),
     "native_int8": EngineEntry(partial(NativeEngine, weights="int8"), native_supports),
@@ -60,7 +71,7 @@ def check_engine(name: str) -> None:
         raise InputError(f"engine: expected one of {names}, got {name!r}")
 
 
-def make_engine(name: EngineName, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
+def make_engine(name: EngineName, network: Denoiser, sampler: Sampler) -> Engine:
     """Make the engine ``name`` for ``network`` and ``sampler``.
 
     ``"auto"`` takes the first of :data:`ENGINES` that applies: native on a CPU where it was built, else torch.
@@ -104,13 +115,13 @@ class EngineSlot:
         self._made: tuple[Any, Engine | None] = (None, None)
         self._stale = False
 
-    def get(self, network: TransformerForDiffusion, sampler: Sampler) -> Engine:
+    def get(self, network: Denoiser, sampler: Sampler) -> Engine:
         """Return the engine for ``network`` and ``sampler``.
 
         Raises:
             InputError: if the chosen engine cannot run the network.
         """
-        parameter = network.pos_emb
+        parameter = network.like
         wanted = (network, sampler, parameter.device, parameter.dtype)
         made_for, engine = self._made  # read and replaced in one go: other threads may do the same
         if engine is None or made_for != wanted:
@@ -124,7 +135,7 @@ class EngineSlot:
         """Rebuild the engine at the next policy call from the network's weights at that time."""
         self._made, self._stale = (None, None), True
 
-    def describe(self, network: TransformerForDiffusion, sampler: Sampler) -> str:
+    def describe(self, network: Denoiser, sampler: Sampler) -> str:
         """Describe the engine and its device; for ``"auto"``, also why faster engines were not used."""
         engine = self.get(network, sampler)
         text = f"{engine.name}: {engine.detail}"

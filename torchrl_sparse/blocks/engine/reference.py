@@ -13,10 +13,10 @@ from torch import Tensor
 from torchrl_sparse.blocks.engine.base import Overhead, check_query
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.weights import check_weights
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, NetworkSizes, Reuse, block_macs, fixed_macs, num_buffers
+from torchrl_sparse.blocks.mask import NetworkSizes, Reuse, block_macs, fixed_macs, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["ComputedRows", "FeatureRecorder", "ReferenceEngine", "denoise"]
 
@@ -48,7 +48,7 @@ class FeatureRecorder:
 
 
 def denoise(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -99,7 +99,7 @@ def denoise(
     """
     check_query(network, sampler, noise, cond, mask, reuse, guide)
     computed = ComputedRows(mask)
-    latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks)
+    latest: list[Tensor | None] = [None] * num_buffers(reuse, network.num_blocks, network.block_types)
     sample, cleans = noise[:, 0], ()
     for step, timestep in enumerate(sampler.timesteps.tolist()):
         x, memory = network.embed(sample), network.memory(timestep, cond)
@@ -118,7 +118,7 @@ def denoise(
 
 
 def _block_output(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     block: int,
     x: Tensor,
     memory: Tensor,
@@ -171,7 +171,7 @@ class ReferenceEngine:
     name = "reference"
     detail = "eager and differentiable"
 
-    def __init__(self, network: TransformerForDiffusion, sampler: Sampler) -> None:
+    def __init__(self, network: Denoiser, sampler: Sampler) -> None:
         check_weights(network)
         self._network, self._sampler = network, sampler
 
@@ -193,17 +193,17 @@ class ReferenceEngine:
     @torch.no_grad()
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
-        network, like = self._network, self._network.pos_emb
+        network, like = self._network, self._network.like
         x = network.embed(like.new_zeros(1, network.horizon, network.input_dim))
         memory = network.memory(0, like.new_zeros(1, network.n_obs_steps, network.cond_dim))
 
         def walk(kind: int) -> None:
-            for block in range(kind, network.num_blocks, len(BLOCK_TYPES)):
+            for block in range(kind, network.num_blocks, len(network.block_types)):
                 network.block(block, x, memory)
 
-        return time_blocks(walk, network.n_layer, repeats, like.device)
+        return time_blocks(walk, network.block_types, network.n_layer, repeats, like.device)
 
-    def block_macs(self) -> tuple[int, int, int]:
+    def block_macs(self) -> tuple[int, ...]:
         """Return the published count, see :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""
         return block_macs(NetworkSizes.of(self._network))
 

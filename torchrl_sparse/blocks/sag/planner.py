@@ -31,7 +31,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, check_reuse
+from torchrl_sparse.blocks.mask import ALL_BLOCK_TYPES, BLOCK_TYPES, Reuse, check_reuse
 from torchrl_sparse.blocks.planner import Planner, PlanSpec, tensors_fingerprint
 from torchrl_sparse.blocks.sag.network import PrunerNetwork
 from torchrl_sparse.errors import InputError
@@ -74,6 +74,7 @@ class PrunerInfo:
         rate_range: lowest and highest rate that may be asked for; None where the rate is no input.
         reuse: what pruned blocks reuse.
         settings: how it was trained, for people and reports.
+        block_types: blocks of a layer of the policy's network.
 
     Raises:
         InputError: if a field does not hold what is described here.
@@ -85,8 +86,12 @@ class PrunerInfo:
     rate_range: tuple[float, float] | None = None
     reuse: Reuse = "block"
     settings: dict[str, Any] = field(default_factory=dict)
+    block_types: tuple[str, ...] = BLOCK_TYPES
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "block_types", tuple(self.block_types))  # files bring a list
+        if self.block_types not in ALL_BLOCK_TYPES:
+            raise InputError(f"block_types: expected one of {ALL_BLOCK_TYPES}, got {self.block_types}")
         check_reuse(self.reuse)
         check_rates(self.rate, self.rate_range)
         if self.rate_range is not None:  # options bring a list
@@ -144,9 +149,8 @@ class SAGPruner(Planner):
                 f"got {info.rate_range} and rate_input={network.rate_input}"
             )
         self.network, self.info, self.reuse = network.eval(), info, info.reuse
-        self.made_for = PlanSpec(
-            len(network.timesteps), network.num_blocks // len(BLOCK_TYPES), info.policy, info.sampler
-        )
+        steps, layers = len(network.timesteps), network.num_blocks // len(info.block_types)
+        self.made_for = PlanSpec(steps, layers, info.policy, info.sampler, info.block_types)
         self.in_keys = [COND, PRUNE_RATE] if network.rate_input else [COND]
         self._rate = info.rate
 
@@ -222,6 +226,8 @@ class SAGPruner(Planner):
             "rate": self.rate,
             "network": self.network.config,
         }
+        if self.info.block_types == BLOCK_TYPES:  # of the published transformer, which files do not name
+            del config["block_types"]
         write_json(path / "config.json", config)
 
     @classmethod

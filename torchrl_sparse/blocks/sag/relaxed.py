@@ -24,8 +24,8 @@ from torchrl_sparse.blocks.engine.base import check_query
 from torchrl_sparse.blocks.engine.reference import ComputedRows
 from torchrl_sparse.blocks.mask import Reuse, num_buffers
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["denoise_relaxed", "gumbel_gate", "step_errors", "straight_through_gate"]
 
@@ -64,7 +64,7 @@ def _spare_first(gate: Tensor) -> Tensor:
 
 
 def denoise_relaxed(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -96,7 +96,7 @@ def denoise_relaxed(
 
 
 def step_errors(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -124,7 +124,7 @@ def step_errors(
         if k == 0:  # dense by definition
             continue
         with torch.no_grad():
-            eps = network(before, int(sampler.timesteps[k]), cond)
+            eps = network(before, sampler.timesteps[k].item(), cond)
             dense = sampler.step(eps, k, before, _transition_noise(noise, k), cleans)
         errors.append((after - dense).abs())
     return torch.stack(errors, dim=1)
@@ -140,7 +140,7 @@ class _Options(NamedTuple):
 
 
 def _chain(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -158,7 +158,7 @@ def _chain(
     explored = torch.rand(gate.shape[1:], device=gate.device) < explore
     computed = ComputedRows(pruned & ~explored)
     gate = _scale_gradient(gate, torch.where(pruned, 1 / explore, 1.0))
-    slots = num_buffers(reuse, network.num_blocks)
+    slots = num_buffers(reuse, network.num_blocks, network.block_types)
     buffers: tuple[Tensor, ...] = ()
     cleans: tuple[Tensor, ...] = ()
     sample = noise[:, 0]
@@ -180,7 +180,7 @@ class _Step:
 
     def __init__(
         self,
-        network: TransformerForDiffusion,
+        network: Denoiser,
         sampler: Sampler,
         k: int,
         cond: Tensor,
@@ -198,7 +198,7 @@ class _Step:
     ) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Return the next sample, and clean predictions and buffers after the step; ``gate`` is [B, 3L]."""
         network, latest = self._network, list(buffers) or [None] * self._slots
-        memory = network.memory(int(self._sampler.timesteps[self._k]), self._cond)
+        memory = network.memory(self._sampler.timesteps[self._k].item(), self._cond)
         x = network.embed(sample)
         for block in range(network.num_blocks):
             slot = block % self._slots

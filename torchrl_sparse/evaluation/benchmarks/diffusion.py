@@ -223,12 +223,13 @@ def draw_methods(
     """
     plot_pareto(results, out / "pareto.png")
     plot_success_within(results, out / "success_within.png")
-    plot_similarity(calibration.similarity.numpy(), out / "similarity.png")
+    types = methods["dense"].network.block_types
+    plot_similarity(calibration.similarity.numpy(), out / "similarity.png", types)
     # The first policy call of an episode has no last chunk to begin from.
     masks = {name: answer(method, queries[:2])[keys.PRUNE_MASK][-1] for name, method in methods.items()}
     for name, mask in masks.items():
         ratio = results.methods[name].flops.ratio_to_dense
-        plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio)
+        plot_schedule(mask.numpy(), out / f"schedule_{name}.png", name=name, flops_ratio=ratio, types=types)
     for name, method in _adaptive(methods).items():
         _draw_masks(name, method, queries, out)
     surging = {name: masks[name] for name in _SURGING if name in masks}
@@ -240,6 +241,7 @@ def draw_methods(
             {name: error.numpy() for name, error in errors.items()},
             {name: mask.numpy() for name, mask in surging.items()},
             out / "error_surge.png",
+            types,
         )
 
 
@@ -250,10 +252,10 @@ def _adaptive(methods: Mapping[str, DiffusionPolicy]) -> dict[str, DiffusionPoli
 
 def _draw_masks(name: str, method: DiffusionPolicy, queries: TensorDictBase, out: Path) -> None:
     """Draw the masks along an episode, and their statistics over all policy calls."""
-    masks = answer(method, queries)[keys.PRUNE_MASK].numpy()
-    plot_mask_statistics(masks, out / f"masks_{name}.png", name=name)
+    masks, types = answer(method, queries)[keys.PRUNE_MASK].numpy(), method.network.block_types
+    plot_mask_statistics(masks, out / f"masks_{name}.png", name=name, types=types)
     step = queries[keys.EPISODE_STEP].flatten()
     first_episode = (queries[keys.EPISODE_SEED] == queries[keys.EPISODE_SEED][0]).flatten()
     steps_per_query = int(step[1] - step[0]) if first_episode.sum() > 1 else 1
     strip = masks[first_episode.numpy()]
-    plot_mask_strip(strip, out / f"strip_{name}.png", name=name, steps_per_query=steps_per_query)
+    plot_mask_strip(strip, out / f"strip_{name}.png", name=name, steps_per_query=steps_per_query, types=types)

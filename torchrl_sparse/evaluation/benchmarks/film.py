@@ -42,12 +42,12 @@ def film_masks(
     Raises:
         RuntimeError: without a GL library, before any call.
     """
-    frames = []
+    frames, types = [], actor.policy.network.block_types
 
     def photograph(env: EnvBase, step: TensorDictBase) -> None:
         frame = env.base_env.render(_CAMERA, _SIZE, _SIZE)
         if not actor.policy.plan.is_static:
-            frame = np.hstack([frame, mask_panel(step[keys.PRUNE_MASK].numpy(), height=_SIZE)])
+            frame = np.hstack([frame, mask_panel(step[keys.PRUNE_MASK].numpy(), _SIZE, types)])
         frames.append(frame)
 
     with closing(make_env(seeds=[seed])) as env, num_threads(threads):

@@ -128,7 +128,7 @@ class EngineCase:
     ) -> None:
         self.network, self.batch, self._compiled = network, batch, compiled
         self._instruction_sets = instruction_sets
-        self.device = network.pos_emb.device
+        self.device = network.like.device
         self._dense = dense or Sampler("ddpm")
         generator = torch.Generator().manual_seed(0)
         self.cond = torch.randn(batch, network.n_obs_steps, network.cond_dim, generator=generator)

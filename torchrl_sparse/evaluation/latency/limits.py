@@ -31,7 +31,7 @@ def measure_bandwidth(network: TransformerForDiffusion, repeats: int = 20) -> fl
     The best of ``repeats``; of a network on a GPU, that is what reads.
     """
     size = network.n_layer * sum(block_weights(network))
-    array = torch.ones(size, device=network.pos_emb.device)
+    array = torch.ones(size, device=network.like.device)
     return 4 * size / min(_timed(array.sum, repeats, array.device))
 
 

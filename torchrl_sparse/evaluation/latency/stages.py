@@ -63,7 +63,7 @@ def image_policy(
         )
     parts = {"vision": vision, "sampler": sampler, "engine": engine}
     policy = DiffusionPolicy(network, _identity(network, state), **parts)
-    return policy.to(network.pos_emb.device)
+    return policy.to(network.like.device)
 
 
 def _identity(network: TransformerForDiffusion, state_dim: int) -> Normalizer:

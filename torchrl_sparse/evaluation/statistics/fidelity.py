@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchrl_sparse.blocks.engine.reference import FeatureRecorder, denoise
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["action_error", "block_errors", "relative_error"]
 
@@ -64,7 +64,7 @@ def relative_error(features: Tensor, dense_features: Tensor) -> Tensor:
 
 @torch.no_grad()
 def block_errors(
-    network: TransformerForDiffusion,
+    network: Denoiser,
     sampler: Sampler,
     noise: Tensor,
     cond: Tensor,
@@ -95,7 +95,7 @@ def block_errors(
 
 
 def _features(
-    network: TransformerForDiffusion, sampler: Sampler, noise: Tensor, cond: Tensor, mask: Tensor | None
+    network: Denoiser, sampler: Sampler, noise: Tensor, cond: Tensor, mask: Tensor | None
 ) -> Tensor:
     """Return the output of every block at every step, [3L, K, N, H, D]."""
     recorder = FeatureRecorder()

@@ -2,14 +2,16 @@
 
 With ``clip`` to [-1, 1], or another range, and the clean predictions of the two steps before, every sampler is one update::
 
-    clean = clip((sample - noise_scale * eps) / signal_scale)
+    clean = clip((sample_share * sample - noise_scale * eps) / signal_scale)
     next  = clean_weight * clean + sample_weight * sample + eps_weight * eps
           + previous_weight * clean of the last step + earlier_weight * clean of the step before it
           + spread * gaussian
 
 in diffusers' order of operations for DDPM (arXiv:2006.11239, Eq. 7: ``eps_weight = 0``) and DDIM (arXiv:2010.02502,
 Eq. 12: ``sample_weight = 0``), which remember no step. `torchrl_sparse.networks.diffusion.multistep` has the weights of
-those that do. A `Guide` changes the clean prediction before it is used: ``clean + pull * (actions - clean)``.
+those that do. ``eps`` is what the network predicts: noise, or the clean sample itself (``sample_share = 0``), or a
+velocity (`torchrl_sparse.networks.diffusion.flow`). A `Guide` changes the clean prediction before it is used:
+``clean + pull * (actions - clean)``.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class Guide(NamedTuple):
 
 @dataclass(frozen=True)
 class StepCoefficients:
-    """Coefficients of every denoising step; each field but ``clip`` is f32 [K], in execution order.
+    """Coefficients of every denoising step; each field but the last two is f32 [K], in execution order.
 
     Attributes:
         noise_scale: sqrt(1 - abar_t).
@@ -56,6 +58,7 @@ class StepCoefficients:
         previous_weight, earlier_weight: of the clipped predictions one and two steps before; 0 where none is read.
         spread: standard deviation of the noise that is added; 0 where none is.
         clip: largest absolute value of a clean action.
+        sample_share: 0 where the network predicts the clean sample, which then is no part of the prediction; else 1.
     """
 
     noise_scale: Tensor
@@ -67,6 +70,7 @@ class StepCoefficients:
     earlier_weight: Tensor
     spread: Tensor
     clip: float
+    sample_share: float = 1.0
 
     @property
     def history(self) -> int:
@@ -79,7 +83,8 @@ class StepCoefficients:
 
     def clean(self, step: int, sample: Tensor, eps: Tensor, guide: Guide | None = None) -> Tensor:
         """Return the clipped clean prediction of denoising step ``step``; arguments as of :meth:`update`."""
-        clean = (sample - self.noise_scale[step] * eps) / self.signal_scale[step]
+        taken = sample if self.sample_share else 0.0
+        clean = (taken - self.noise_scale[step] * eps) / self.signal_scale[step]
         clean = clean.clamp(-self.clip, self.clip)
         return clean if guide is None else clean + guide.pull * (guide.actions - clean)
 
@@ -110,7 +115,7 @@ class StepCoefficients:
 
     def table(self) -> Tensor:
         """Return the eight coefficients of every step, f32 [K, 8], in the order of the fields."""
-        return torch.stack([getattr(self, field.name) for field in fields(self)[:-1]], dim=1)
+        return torch.stack([getattr(self, field.name) for field in fields(self)[:-2]], dim=1)
 
 
 def squared_cosine(steps: int) -> Tensor:
@@ -132,6 +137,7 @@ def step_coefficients(
     *,
     eta: float = 0.0,
     clip: float = 1.0,
+    prediction: str = "epsilon",
 ) -> StepCoefficients:
     """Tabulate the coefficients of a sampler's steps.
 
@@ -142,6 +148,7 @@ def step_coefficients(
         previous_timesteps: the timestep that each of them leads to; -1 is the clean sample.
         eta: share of DDPM's noise that DDIM adds, in [0, 1].
         clip: largest absolute value of a clean action.
+        prediction: ``"epsilon"``, the noise, or ``"sample"``, the clean sample.
 
     Examples:
         >>> coefficients = step_coefficients("ddim", torch.tensor([0.9, 0.5]), [1, 0], [0, -1])
@@ -157,9 +164,19 @@ def step_coefficients(
         weights = _ddim(abar, abar_next, eta)
     else:
         weights = _ddpm(abar, abar_next)
-    names = [field.name for field in fields(StepCoefficients)[2:-1]]
+    names = [field.name for field in fields(StepCoefficients)[2:-2]]
     all_weights = dict.fromkeys(names, torch.zeros(len(abar))) | weights
-    return StepCoefficients((1 - abar) ** 0.5, abar**0.5, **all_weights, clip=clip)
+    noise, signal = (1 - abar) ** 0.5, abar**0.5
+    if prediction == "epsilon":
+        return StepCoefficients(noise, signal, **all_weights, clip=clip)
+    # The noise that a clean prediction implies is (sample - signal * clean) / noise, before clean is clipped.
+    implied = all_weights["eps_weight"] / noise
+    all_weights |= {
+        "sample_weight": all_weights["sample_weight"] + implied,
+        "eps_weight": -implied * signal,
+    }
+    ones = torch.ones_like(noise)
+    return StepCoefficients(-ones, ones, **all_weights, clip=clip, sample_share=0.0)
 
 
 def _variance(abar: Tensor, abar_next: Tensor) -> Tensor:

@@ -6,7 +6,8 @@
     KIND _T _T ...          [_etaETA]     ddpm_82_14   ddim_90_50_10   ddim_82_14_eta1
 
 KIND is one of :data:`KINDS`, SPACING one of `torchrl_sparse.networks.diffusion.spacing.SPACINGS`, ``leading`` where
-none is written. The timesteps T fall. ETA in [0, 1] is DDIM's. Files that keep the number of steps beside the name
+none is written. The timesteps T fall; those of ``flow`` are times that rise from 0, ``flow_0_0.4``. ETA in [0, 1] is
+DDIM's. Files that keep the number of steps beside the name
 leave STEPS out (``ddim``, ``ddpm_logsnr``).
 """
 
@@ -23,9 +24,9 @@ from torchrl_sparse.networks.diffusion.spacing import SPACINGS
 
 __all__ = ["CHAIN_PATTERN", "KINDS", "SamplerName"]
 
-KINDS = ("ddpm", "ddim", "dpmpp2m", "sde2m", "unipc")
+KINDS = ("ddpm", "ddim", "dpmpp2m", "sde2m", "unipc", "flow")
 _KIND, _SPACING = (rf"(?:{'|'.join(words)})" for words in (KINDS, SPACINGS))
-_STEPS, _TIMESTEPS, _ETA = r"[1-9]\d{0,4}", r"(?:_\d{1,5})+", r"_eta\d(?:\.\d{1,20})?"
+_STEPS, _TIMESTEPS, _ETA = r"[1-9]\d{0,4}", r"(?:_\d{1,5}(?:\.\d{1,9})?)+", r"_eta\d(?:\.\d{1,20})?"
 
 CHAIN_PATTERN = rf"{_KIND}(?:{_STEPS}(?:_{_SPACING})?|{_TIMESTEPS})(?:{_ETA})?"
 """Regular expression of the names that say how many steps there are; it has no groups."""
@@ -53,7 +54,7 @@ class SamplerName:
 
     kind: str
     num_inference_steps: int | None = None
-    timesteps: tuple[int, ...] | None = None
+    timesteps: tuple[float, ...] | None = None
     spacing: str = "leading"
     eta: float = 0.0
 
@@ -61,6 +62,8 @@ class SamplerName:
     def parse(cls, text: str) -> SamplerName:
         """Parse ``text``; raise InputError unless it follows the module's grammar."""
         match = _NAME.fullmatch(text) if isinstance(text, str) else None
+        if match is not None and match[1] != "flow" and "." in (match[4] or ""):
+            match = None
         if match is None:
             raise InputError(
                 f"sampler: expected KIND[STEPS][_SPACING][_etaETA] or KIND_T_T...[_etaETA] of kind {', '.join(KINDS)} "
@@ -70,15 +73,19 @@ class SamplerName:
         return cls(
             kind,
             int(steps) if steps else None,
-            tuple(map(int, timesteps.split("_")[1:])) if timesteps else None,
+            tuple(float(t) if "." in t else int(t) for t in timesteps.split("_")[1:]) if timesteps else None,
             spacing or "leading",
             float(eta.removeprefix("_eta")) if eta else 0.0,
         )
 
     def __str__(self) -> str:
-        parts = [f"{self.kind}{self.num_inference_steps or ''}", *map(str, self.timesteps or ())]
+        parts = [f"{self.kind}{self.num_inference_steps or ''}", *map(_short, self.timesteps or ())]
         if self.spacing != "leading":
             parts.append(self.spacing)
         if self.eta:
-            parts.append(f"eta{np.format_float_positional(self.eta, trim='-')}")
+            parts.append(f"eta{_short(self.eta)}")
         return "_".join(parts)
+
+
+def _short(number: float) -> str:
+    return np.format_float_positional(number, trim="-")

@@ -11,6 +11,7 @@ ddim     none, or eta arXiv:2010.02502; ``eta`` times DDPM's standard deviation,
 dpmpp2m  none         DPM-Solver++ (2M), arXiv:2211.01095
 sde2m    every step   its SDE form, "sde-dpmsolver++"
 unipc    none         UniPC of order 2, B2(h), arXiv:2302.04867
+flow     none         Euler steps of flow matching, `torchrl_sparse.networks.diffusion.flow`
 ======== ============ =====================================================================================
 
 in any number of steps, at the timesteps of a spacing (`torchrl_sparse.networks.diffusion.spacing`) or at any that
@@ -18,9 +19,8 @@ fall. DDPM and DDIM equal diffusers' classes to the last bit; the solvers equal 
 diffusers' solvers never clip. The equations are in `torchrl_sparse.networks.diffusion.coefficients` and
 `torchrl_sparse.networks.diffusion.multistep`, the names in `torchrl_sparse.networks.diffusion.naming`.
 
-Two steps are not new: GDP (arXiv:2510.21991) makes two network calls and chooses among a population of chains. MIP
-(arXiv:2512.01809) trains two steps of regression and finds that supervised steps and stochasticity help. Hydra-DP3
-(arXiv:2605.01581) argues that the denoising error of smooth actions saturates after very few steps, and takes two of DDIM.
+Two steps are not new: GDP (arXiv:2510.21991) chooses among a population of chains of two network calls, MIP
+(arXiv:2512.01809) trains two steps of regression, and Hydra-DP3 (arXiv:2605.01581) takes two of DDIM.
 """
 
 from __future__ import annotations
@@ -29,26 +29,18 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchrl_sparse.errors import InputError
-from torchrl_sparse.networks.diffusion.coefficients import (
-    Guide,
-    StepCoefficients,
-    squared_cosine,
-    step_coefficients,
-)
-from torchrl_sparse.networks.diffusion.multistep import MULTISTEP
+from torchrl_sparse.networks.diffusion.coefficients import Guide, StepCoefficients
 from torchrl_sparse.networks.diffusion.naming import KINDS, SamplerName
-from torchrl_sparse.networks.diffusion.spacing import check_timesteps, spaced_timesteps
+from torchrl_sparse.networks.diffusion.steps import check_clip, check_prediction, sampler_steps
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["MAX_TRAIN_TIMESTEPS", "Sampler"]
 
 MAX_TRAIN_TIMESTEPS = 10_000
 """Far beyond any diffusion model: tables as long as this are made of what a file asks for."""
-_MAX_CLIP = 1e6
 
 
 class Sampler:
@@ -58,18 +50,21 @@ class Sampler:
     noise of a call. A sampler cannot be changed: engines keep tables of its steps.
 
     Args:
-        kind: ``"ddpm"``, ``"ddim"``, ``"dpmpp2m"``, ``"sde2m"`` or ``"unipc"``, see the module.
+        kind: ``"ddpm"``, ``"ddim"``, ``"dpmpp2m"``, ``"sde2m"``, ``"unipc"`` or ``"flow"``, see the module.
         num_inference_steps: denoising steps K of a call, 1 to ``num_train_timesteps``; None for one per entry of
             ``timesteps``, or without those for all training steps.
         num_train_timesteps: diffusion steps that the network was trained with, at most `MAX_TRAIN_TIMESTEPS`.
-        timesteps: K falling diffusion timesteps, where no spacing shall decide.
+        timesteps: K falling diffusion timesteps, where no spacing shall decide; of flow, K rising times in [0, 1).
         eta: of DDIM, in [0, 1]: 0 is deterministic, 1 has DDPM's variance, and is DDPM where nothing is clipped.
         spacing: ``"leading"``, ``"trailing"``, ``"linspace"`` or ``"logsnr"``, see
             :mod:`~torchrl_sparse.networks.diffusion.spacing`; a warning says where one begins far from noise.
-        clip_sample_range: largest absolute value of a predicted clean action, as in diffusers; 1 for normalised actions.
+        clip_sample_range: largest absolute value of a predicted clean action, as in diffusers; 1 for normalised actions, None
+            for any. Flow clips nothing.
+        prediction: what the network predicts, ``"epsilon"``, the noise, or ``"sample"``, the clean sample; of flow
+            ``"velocity"``. None is the first of those that the kind has.
 
     Attributes:
-        timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest.
+        timesteps: i64 [K], the diffusion timestep of each denoising step; the first is the noisiest. Of flow f32, times.
         previous_timesteps: the timestep that each of them leads to; -1, the clean sample, in the end.
         alphas_cumprod: abar of every diffusion timestep, f32 [T].
         coefficients: the update of each denoising step in numbers, for loops without a sampler.
@@ -96,12 +91,13 @@ class Sampler:
     num_train_timesteps: int
     eta: float
     spacing: str
-    clip_sample_range: float
+    clip_sample_range: float | None
+    prediction: str
     timesteps: Tensor
     previous_timesteps: tuple[int, ...]
     alphas_cumprod: Tensor
     coefficients: StepCoefficients
-    _chosen: tuple[int, ...] | None
+    _chosen: tuple[float, ...] | None
 
     def __init__(
         self,
@@ -109,49 +105,38 @@ class Sampler:
         num_inference_steps: int | None = None,
         num_train_timesteps: int = 100,
         *,
-        timesteps: Sequence[int] | None = None,
+        timesteps: Sequence[float] | None = None,
         eta: float = 0.0,
         spacing: str = "leading",
-        clip_sample_range: float = 1.0,
+        clip_sample_range: float | None = 1.0,
+        prediction: str | None = None,
     ) -> None:
         if kind not in KINDS:
             raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
         if num_inference_steps is None:
             num_inference_steps = num_train_timesteps if timesteps is None else len(timesteps)
         check_size("num_train_timesteps", num_train_timesteps, MAX_TRAIN_TIMESTEPS)
-        check_size("num_inference_steps", num_inference_steps, num_train_timesteps)
+        flows = kind == "flow"
+        check_size(
+            "num_inference_steps", num_inference_steps, MAX_TRAIN_TIMESTEPS if flows else num_train_timesteps
+        )
         if not isinstance(eta, Real) or not 0 <= eta <= 1 or (eta and kind != "ddim"):
             raise InputError(
                 f'eta: expected a number in [0, 1], other than 0 of kind "ddim" alone, got {eta!r} of kind "{kind}"'
             )
-        if not isinstance(clip_sample_range, Real) or not 0 < clip_sample_range <= _MAX_CLIP:
-            raise InputError(
-                f"clip_sample_range: expected a number above 0, at most {_MAX_CLIP:g}, got {clip_sample_range!r}"
-            )
-        alphas_cumprod = squared_cosine(num_train_timesteps)
-        clip, eta = float(clip_sample_range), float(eta)
-        if timesteps is None:
-            order = spaced_timesteps(
-                spacing, num_inference_steps, alphas_cumprod, without_last=kind in MULTISTEP
-            )
-        elif spacing != "leading":
+        if timesteps is not None and spacing != "leading":
             raise InputError(f"spacing: expected none beside timesteps, got {spacing!r}")
-        else:
-            order = check_timesteps(timesteps, num_inference_steps, num_train_timesteps)
-        previous = (*order[1:], -1)
         vars(self).update(
             kind=kind,
             num_inference_steps=num_inference_steps,
             num_train_timesteps=num_train_timesteps,
-            eta=eta,
+            eta=float(eta),
             spacing=spacing,
-            clip_sample_range=clip,
-            timesteps=torch.tensor(order),
-            previous_timesteps=previous,
-            alphas_cumprod=alphas_cumprod,
-            coefficients=step_coefficients(kind, alphas_cumprod, order, previous, eta=eta, clip=clip),
-            _chosen=None if timesteps is None else tuple(order),
+            clip_sample_range=check_clip(kind, clip_sample_range),
+            prediction=check_prediction(kind, prediction),
+            _chosen=None if timesteps is None else tuple(timesteps),
         )
+        vars(self).update(sampler_steps(self, self._chosen))
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"{name}: expected a sampler to stay as it was made; make another Sampler")
@@ -201,8 +186,13 @@ class Sampler:
 
     @property
     def trained(self) -> dict[str, Any]:
-        """Arguments fixed by the network's training: ``num_train_timesteps``, ``clip_sample_range``."""
-        return {"num_train_timesteps": self.num_train_timesteps, "clip_sample_range": self.clip_sample_range}
+        """The arguments that follow from how the network was trained: ``num_train_timesteps``, ``clip_sample_range``, and
+        ``prediction`` where that is not the noise."""
+        trained = {
+            "num_train_timesteps": self.num_train_timesteps,
+            "clip_sample_range": self.clip_sample_range,
+        }
+        return trained if self.prediction == "epsilon" else trained | {"prediction": self.prediction}
 
     def last_steps(self, number: int) -> Sampler:
         """Return a sampler of the last ``number`` steps alone, 1 to K, with unchanged coefficients.
@@ -233,7 +223,9 @@ class Sampler:
         }
         if self._chosen is not None:
             config["timesteps"] = list(self._chosen)
-        defaults = {"eta": 0.0, "spacing": "leading", "clip_sample_range": 1.0}
+        defaults = {"eta": 0.0, "spacing": "leading", "clip_sample_range": 1.0, "prediction": "epsilon"}
+        if self.kind == "flow":
+            defaults |= {"clip_sample_range": None, "prediction": "velocity"}
         return config | {
             name: found for name, default in defaults.items() if (found := vars(self)[name]) != default
         }
@@ -291,8 +283,11 @@ class Sampler:
         Args:
             clean: normalised actions [B, H, A].
             noise: standard normal [B, H, A].
-            timestep: i64 [B], 0 .. num_train_timesteps - 1.
+            timestep: i64 [B], 0 .. num_train_timesteps - 1; of flow f32, times.
         """
+        if self.kind == "flow":
+            time = timestep.to(clean)[:, None, None]
+            return time * clean + (1 - time) * noise
         abar = self.alphas_cumprod.to(clean.device)[timestep][:, None, None]
         return (abar**0.5).to(clean) * clean + ((1 - abar) ** 0.5).to(clean) * noise
 

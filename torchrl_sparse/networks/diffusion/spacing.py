@@ -87,7 +87,7 @@ def spaced_timesteps(
         warnings.warn(
             f"num_inference_steps={num_steps}: {spacing!r} begins at timestep {found[0]} of {num_train}, where the network "
             f'expects {amplitude:.2f} of the actions\' amplitude and is shown noise; "logsnr" begins where it expects 0.12',
-            stacklevel=3,
+            stacklevel=4,
         )
     return found
 
@@ -98,7 +98,7 @@ def _first_clear(alphas_cumprod: Tensor) -> int:
     return int((log_ratio >= _SMALLEST_LOG_RATIO).sum())
 
 
-def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timesteps: int) -> list[int]:
+def check_timesteps(timesteps: Sequence[float], num_steps: int, num_train_timesteps: int) -> list[int]:
     """Return chosen timesteps as ints; ValueError unless they are ``num_steps`` decreasing integers.
 
     >>> check_timesteps((82, 14), 2, 100)
@@ -114,7 +114,7 @@ def check_timesteps(timesteps: Sequence[int], num_steps: int, num_train_timestep
     return [int(timestep) for timestep in chosen]
 
 
-def timesteps_fall(timesteps: Sequence[int], num_train_timesteps: int) -> bool:
+def timesteps_fall(timesteps: Sequence[float], num_train_timesteps: int) -> bool:
     """Return whether timesteps decrease strictly, from below ``num_train_timesteps`` down to at least 0.
 
     >>> timesteps_fall([99, 0], 100), timesteps_fall([100, 0], 100), timesteps_fall([9, 9], 100)

@@ -14,17 +14,16 @@ Block ``3 * layer + {0: SA, 1: CA, 2: FFN}`` is the unit that caching methods sk
 from __future__ import annotations
 
 import math
-from operator import attrgetter
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import BLOCK_TYPES, Denoiser
 from torchrl_sparse.networks.sizes import check_size
 
 __all__ = ["BLOCK_TYPES", "MAX_LAYERS", "TransformerForDiffusion"]
 
-BLOCK_TYPES = ("SA", "CA", "FFN")
 _INIT_STD = 0.02
 # Attention masks are as large as the square of the horizon, and a layer takes a millisecond to make.
 _MAX_WIDTH, _MAX_TOKENS = 1 << 16, 4096
@@ -57,7 +56,7 @@ class SinusoidalPosEmb(nn.Module):
         return torch.cat((angle.sin(), angle.cos()), dim=-1)
 
 
-class TransformerForDiffusion(nn.Module):
+class TransformerForDiffusion(Denoiser):
     """Noise predictor ``eps(sample, timestep, cond)`` of Diffusion Policy (arXiv:2303.04137, Table VII).
 
     Args:
@@ -77,9 +76,6 @@ class TransformerForDiffusion(nn.Module):
         n_cond_layers: 0 makes the condition encoder a token-wise MLP (all published models), more a
             transformer encoder.
 
-    Attributes:
-        made_shapes: of its weights by name, as it was made with them.
-
     Raises:
         InputError: if a size is no positive number or far too large, or ``n_emb`` is not a multiple of ``n_head``.
 
@@ -92,6 +88,8 @@ class TransformerForDiffusion(nn.Module):
         >>> network(torch.zeros(3, 10, 10), 99, torch.zeros(3, 2, 19)).shape
         torch.Size([3, 10, 10])
     """
+
+    block_types = BLOCK_TYPES
 
     def __init__(
         self,
@@ -127,14 +125,14 @@ class TransformerForDiffusion(nn.Module):
         _check_config(self.config)
         for name, value in self.config.items():
             setattr(self, name, value)
-        self.num_blocks = len(BLOCK_TYPES) * n_layer
         self._build()
         self._init_weights()
-        self.made_shapes = {name: tuple(weight.shape) for name, weight in self.named_parameters()}
+        self._finish()
 
-    def present_shapes(self) -> dict[str, tuple[int, ...]]:
+    @property
+    def like(self) -> nn.Parameter:
         """Return the current shapes of the weights, which may have been replaced; see ``made_shapes``."""
-        return {name: tuple(attrgetter(name)(self).shape) for name in self.made_shapes}
+        return self.pos_emb
 
     def _build(self) -> None:
         width = self.n_emb
@@ -185,7 +183,7 @@ class TransformerForDiffusion(nn.Module):
         self._check("sample", sample, (self.horizon, self.input_dim))
         return self.drop(self.input_emb(sample) + self.pos_emb)
 
-    def memory(self, timestep: int | Tensor, cond: Tensor) -> Tensor:
+    def memory(self, timestep: float | Tensor, cond: Tensor) -> Tensor:
         """Encode the condition tokens, [B, 1 + To, n_emb].
 
         Args:
@@ -193,12 +191,7 @@ class TransformerForDiffusion(nn.Module):
             cond: encoded observations [B, To, cond_dim].
         """
         self._check("cond", cond, (self.n_obs_steps, self.cond_dim))
-        timestep = torch.as_tensor(timestep, device=cond.device)
-        if timestep.shape not in ((), (1,), (cond.shape[0],)):
-            raise InputError(
-                f"timestep: expected a number or shape [{cond.shape[0]}], got {list(timestep.shape)}"
-            )
-        time_token = self.time_emb(timestep.expand(cond.shape[0])).to(cond.dtype)[:, None]
+        time_token = self.time_emb(self._timesteps(timestep, cond)).to(cond.dtype)[:, None]
         tokens = torch.cat((time_token, self.cond_obs_emb(cond)), dim=1)
         return self.encoder(self.drop(tokens + self.cond_pos_emb))
 
@@ -235,27 +228,6 @@ class TransformerForDiffusion(nn.Module):
     def head_out(self, x: Tensor) -> Tensor:
         """Normalise the residual stream [B, H, n_emb] and project it to noise [B, H, output_dim]."""
         return self.head(self.ln_f(x))
-
-    def forward(self, sample: Tensor, timestep: int | Tensor, cond: Tensor) -> Tensor:
-        """Predict the noise, [B, H, output_dim].
-
-        Args:
-            sample: noisy actions [B, H, input_dim].
-            timestep: a number, or i64 [B].
-            cond: encoded observations [B, To, cond_dim].
-        """
-        x = self.embed(sample)
-        memory = self.memory(timestep, cond)
-        for index in range(self.num_blocks):
-            x = x + self.block(index, x, memory)
-        return self.head_out(x)
-
-    @staticmethod
-    def _check(name: str, value: Tensor, trailing: tuple[int, int]) -> None:
-        if value.ndim != 3 or tuple(value.shape[1:]) != trailing:
-            raise InputError(
-                f"{name}: expected shape [B, {trailing[0]}, {trailing[1]}], got {list(value.shape)}"
-            )
 
 
 def _causal_masks(horizon: int, num_memory: int) -> tuple[Tensor, Tensor]:

@@ -128,6 +128,8 @@ class VisionEncoder(nn.Module):
         torch.Size([5, 2, 64])
     """
 
+    text_dim = 0  # of instructions, which it does not read
+
     def __init__(
         self,
         cameras: Sequence[str],

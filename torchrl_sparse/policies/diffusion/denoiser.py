@@ -15,10 +15,10 @@ from torchrl_sparse.blocks.mask import NetworkSizes, Reuse, mask_flops
 from torchrl_sparse.blocks.planner import Planner
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.noise import sample_noise
 from torchrl_sparse.networks.diffusion.philox import philox_noise
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
 __all__ = ["NOISES", "ActionDenoiser", "check_noise"]
@@ -47,7 +47,7 @@ class ActionDenoiser(TensorDictModuleBase):
 
     def __init__(
         self,
-        network: TransformerForDiffusion,
+        network: Denoiser,
         normalizer: Normalizer,
         sampler: Sampler,
         engine: EngineName,
@@ -110,7 +110,7 @@ class ActionDenoiser(TensorDictModuleBase):
         shape = (self.network.horizon, self.network.input_dim)
         seed = tensordict.get(keys.SEED).reshape(-1)
         noise = NOISES[self.noise](seed, self.sampler.num_inference_steps, shape)
-        dtype = self.network.pos_emb.dtype
+        dtype = self.network.like.dtype
         noise, cond = noise.to(dtype), cond.to(dtype)
         guide = Guide(*guided) if guided else None
         actions, flops = self._denoise(noise, cond, mask, guide, *begin)

@@ -47,6 +47,5 @@ def describe(policy: Any) -> str:
 
 
 def _ranges(policy: Any) -> list[tuple[float, float]]:
-    scale, offset = policy.normalizer.state_scale, policy.normalizer.state_offset
-    low, high = (-1 - offset) / scale, (1 - offset) / scale
+    low, high = policy.normalizer.state_range()
     return list(zip(low.tolist(), high.tolist(), strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -12,8 +13,9 @@ from torch import Tensor, nn
 from torchrl_sparse import keys
 from torchrl_sparse.carried import TensorKeys
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.clip_encoder import ClipEncoder
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.noise import check_whole, query_seed
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.cameras import CameraSlot
@@ -22,7 +24,7 @@ __all__ = ["ConditionEncoder", "ObservationEncoder"]
 
 
 class ConditionEncoder(TensorKeys, nn.Module):
-    """Encoder of observations to the condition f32 [*B, To, D]; D is the features' plus the state's size.
+    """Computes the condition f32 [*B, To, D] of observations; D is the size of features, instruction and state together.
 
     Args:
         normalizer: of states.
@@ -32,12 +34,13 @@ class ConditionEncoder(TensorKeys, nn.Module):
         bf16: whether the cameras' encoder rounds to bfloat16 in use; False unless another is assigned.
         in_keys: ``("history", "state")`` f32 [*B, To, Ds], and ``("history", name)``
             u8 [*B, To, 3, h, w] of each camera; with cameras, also what the policy call before left of them,
-            ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there.
+            ``("diffusion", "frame_features")``, and the steps since, ``("control", "elapsed")``, if they are there. Where the
+            encoder reads instructions, ``"language_instruction"``, if it is there.
     """
 
     tensor_keys = {"state": keys.STATE}
 
-    def __init__(self, normalizer: Normalizer, vision: VisionEncoder | None = None) -> None:
+    def __init__(self, normalizer: Normalizer, vision: VisionEncoder | ClipEncoder | None = None) -> None:
         super().__init__()
         self.normalizer, self.vision = normalizer, vision
         self.cameras, self.bf16 = CameraSlot(), False
@@ -52,7 +55,8 @@ class ConditionEncoder(TensorKeys, nn.Module):
         if self.vision is None:
             return [self.state_key]
         cameras = [keys.history(name) for name in self.vision.cameras]
-        return [self.state_key, *cameras, keys.ELAPSED, keys.FRAME_FEATURES]
+        texts = [keys.INSTRUCTION] if self.vision.text_dim else []
+        return [self.state_key, *cameras, keys.ELAPSED, keys.FRAME_FEATURES, *texts]
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """Encode one batch of observations.
@@ -65,8 +69,15 @@ class ConditionEncoder(TensorKeys, nn.Module):
         if self.vision is None:
             return state
         images = {name: keys.read(tensordict, keys.history(name)) for name in self.vision.cameras}
-        encode = self.cameras.get(self.vision, frames=state.shape[-2], bf16=self.bf16)
-        return torch.cat([self._features(tensordict, images, encode), state], dim=-1)
+        parts = []
+        if images:
+            encode = self.cameras.get(self.vision, frames=state.shape[-2], bf16=self.bf16)
+            parts.append(self._features(tensordict, images, encode))
+        if isinstance(self.vision, ClipEncoder):
+            told = _instructions(tensordict, self.vision.instruction)
+            features = self.vision.text_features(told)
+            parts.append(features.view(*tensordict.batch_size, 1, -1).expand(*state.shape[:-1], -1))
+        return torch.cat([*parts, state], dim=-1)
 
     def _features(
         self, tensordict: TensorDictBase, images: dict[str, Tensor], encode: Callable[..., Tensor]
@@ -102,16 +113,16 @@ class ObservationEncoder(TensorDictModuleBase):
     """
 
     def __init__(
-        self, network: TransformerForDiffusion, normalizer: Normalizer, vision: VisionEncoder | None = None
+        self, network: Denoiser, normalizer: Normalizer, vision: VisionEncoder | ClipEncoder | None = None
     ) -> None:
         super().__init__()
         self.condition = ConditionEncoder(normalizer, vision)
         self.out_keys = [keys.COND, keys.SEED, *(() if vision is None else (keys.FRAME_FEATURES,))]
-        features = 0 if vision is None else vision.feature_dim
+        features = 0 if vision is None else vision.feature_dim + vision.text_dim
         state = len(normalizer.state_scale)
         if features + state != network.cond_dim:
             raise InputError(
-                f"network: expected cond_dim {features + state} (image features {features}, state {state}), "
+                f"network: expected cond_dim {features + state} (features {features}, state {state}), "
                 f"got {network.cond_dim}"
             )
         self.state_shape = (network.n_obs_steps, state)
@@ -138,8 +149,10 @@ class ObservationEncoder(TensorDictModuleBase):
         self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
 
     def refresh(self) -> None:
-        """Read the cameras' weights again at the next policy call."""
+        """Read the encoders' weights anew in the next policy call."""
         self.condition.cameras.refresh()
+        if isinstance(self.condition.vision, ClipEncoder):
+            self.condition.vision.refresh()
 
     def _check(self, state: Tensor) -> None:
         key = self.condition.state_key
@@ -164,3 +177,24 @@ class ObservationEncoder(TensorDictModuleBase):
         check_whole(keys.EPISODE_SEED, seed)
         check_whole(keys.EPISODE_STEP, step)
         return query_seed(seed, step, self.noise_stream)
+
+
+def _instructions(tensordict: TensorDictBase, usual: str | None) -> list[str]:
+    """Return the instruction of each row, the usual one if none is written; ValueError for another number of them."""
+    rows, value = tensordict.batch_size.numel(), tensordict.get(keys.INSTRUCTION, None)
+    if value is None:
+        value = usual
+    found = _texts(value.tolist() if hasattr(value, "tolist") else value)
+    found = found * rows if len(found) == 1 else found
+    if len(found) != rows or not all(isinstance(text, str) for text in found):
+        raise InputError(
+            f"{keys.INSTRUCTION}: expected the text of each of {rows} rows, or a policy of one task "
+            f"(DiffusionPolicy.from_lerobot(folder, task=...)), got {value!r}"
+        )
+    return found
+
+
+def _texts(value: Any) -> list:
+    if isinstance(value, (list, tuple)):
+        return [text for item in value for text in _texts(item)]
+    return [value]

@@ -7,6 +7,7 @@ bit on a CPU with the same instruction set.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,8 @@ def export_policy(
     supported, reason = native_supports(network)
     if not supported:
         raise InputError(f"export: {reason}")
+    if not (sampler.coefficients.sample_share and math.isfinite(sampler.coefficients.clip)):
+        raise InputError(f"sampler: expected one of clipped noise predictions in a file, got {sampler!r}")
     if weights == "int8":
         raise InputError("weights: expected one of ['float32', 'float16', 'bfloat16'] in a file, got 'int8'")
     if network.horizon < network.n_obs_steps:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -21,27 +20,26 @@ from torchrl_sparse.blocks.engine.costs import BlockCost, engine_block_costs
 from torchrl_sparse.blocks.engine.factory import EngineName
 from torchrl_sparse.blocks.mask import MaskError, Reuse
 from torchrl_sparse.blocks.planner import Dense, Planner, PlanSpec
-from torchrl_sparse.blocks.saved import load_planner, save_beside
+from torchrl_sparse.blocks.saved import save_beside
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.denoiser import NOISES, ActionDenoiser, check_noise
 from torchrl_sparse.policies.diffusion.describe import describe
 from torchrl_sparse.policies.diffusion.encoder import ObservationEncoder
 from torchrl_sparse.policies.diffusion.export import export_policy
-from torchrl_sparse.policies.diffusion.freezing import FreezablePolicy
 from torchrl_sparse.policies.diffusion.kinds import check_kinds, check_trained
+from torchrl_sparse.policies.diffusion.loading import LoadablePolicy
 from torchrl_sparse.policies.diffusion.shortcut import answer_directly
-from torchrl_sparse.policies.diffusion.warm_start import QueryStart, WarmStart, stored_start
+from torchrl_sparse.policies.diffusion.warm_start import QueryStart, stored_start
 from torchrl_sparse.runtime.clock import synchronised_clock
 from torchrl_sparse.storage.convention import source_convention
-from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, read_pretrained, write_pretrained
-from torchrl_sparse.storage.published.diffusion_policy import read_diffusion_policy
+from torchrl_sparse.storage.diffusion import RoundedEngine, StoredPolicy, write_pretrained
 
 
-class DiffusionPolicy(FreezablePolicy):
+class DiffusionPolicy(LoadablePolicy):
     """Diffusion Policy (arXiv:2303.04137) with a transformer denoiser: encode -> plan -> denoise.
 
     Reads ``("history", "state")``, f32 [*B, n_obs_steps, Ds], and with ``vision`` the cameras' histories. The noise of a call
@@ -79,7 +77,7 @@ class DiffusionPolicy(FreezablePolicy):
 
     def __init__(
         self,
-        network: TransformerForDiffusion,
+        network: Denoiser,
         normalizer: Normalizer,
         *,
         vision: VisionEncoder | None = None,
@@ -136,7 +134,7 @@ class DiffusionPolicy(FreezablePolicy):
         check_kinds(plan=(plan, Planner), sampler=(sampler, Sampler), start=(start, QueryStart))
         check_trained(sampler, self.sampler)
         start.bind(self.network, self.normalizer, sampler)
-        plan.bind(PlanSpec(sampler.num_inference_steps, self.network.n_layer, self.fingerprint, sampler.name))
+        plan.bind(self._spec(sampler))
         denoise = self.module["denoise"]
         denoise.sampler = sampler
         denoise.warm, denoise.guided = keys.START in start.out_keys, keys.KNOWN in start.out_keys
@@ -144,6 +142,11 @@ class DiffusionPolicy(FreezablePolicy):
         self.module["plan"], self.module["start"] = plan, start
         self.in_keys, out_keys = self._compute_in_and_out_keys([*self.module.values()])
         self.out_keys = [*out_keys, keys.LATENCY]
+
+    def _spec(self, sampler: Sampler) -> PlanSpec:
+        network = self.network
+        of_sampler = sampler.num_inference_steps, network.n_layer, self.fingerprint, sampler.name
+        return PlanSpec(*of_sampler, network.block_types)
 
     def with_plan(
         self, plan: Planner | None, sampler: Sampler | None = None, start: QueryStart | None = None
@@ -258,40 +261,3 @@ class DiffusionPolicy(FreezablePolicy):
         facts = {"policy": self.fingerprint, "state_keys": self.source.get("state_keys")}
         facts["robosuite"] = source_convention(self.source)  # whose meaning the objects' state has
         export_policy(Path(path), *self.module.values(), weights=weights, facts=facts)
-
-    @classmethod
-    def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> DiffusionPolicy:
-        """Load a folder written by `save_pretrained`, or a ``.ckpt`` as `from_diffusion_policy` does.
-
-        A policy that was saved with rounded weights rounds them again under ``engine="auto"``; ``"native"`` does not.
-
-        Raises:
-            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
-        """
-        stored = read_diffusion_policy(path) if Path(path).suffix == ".ckpt" else read_pretrained(Path(path))
-        policy = cls._assemble(stored, engine)
-        if stored.plan is not None:
-            policy.plan = load_planner(Path(path) / stored.plan, policy.plan.spec)
-        return policy
-
-    @classmethod
-    def from_diffusion_policy(
-        cls, path: str | Path, *, engine: EngineName = "auto", ignore: Collection[str] = ()
-    ) -> DiffusionPolicy:
-        """Load a ``.ckpt`` of the published code; see `torchrl_sparse.storage.published.diffusion_policy`, also on ``ignore``.
-
-        Averaged weights are used unless ``use_ema`` is false; ``source`` says what it was trained for. Nothing is executed.
-
-        Raises:
-            FileNotFoundError, CheckpointError: naming the file, what was expected in it and what was found.
-        """
-        return cls._assemble(read_diffusion_policy(path, ignore), engine)
-
-    @classmethod
-    def _assemble(cls, stored: StoredPolicy, engine: EngineName) -> DiffusionPolicy:
-        engine = stored.engine or engine if engine == "auto" else engine
-        parts: dict[str, Any] = {"vision": stored.vision, "sampler": stored.sampler, "engine": engine}
-        policy = cls(stored.network, stored.normalizer, **parts)
-        policy.source = stored.source
-        policy.start = None if stored.warm_start is None else WarmStart(stored.warm_start)
-        return policy

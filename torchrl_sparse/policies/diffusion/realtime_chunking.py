@@ -23,8 +23,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_sparse import keys
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.policies.diffusion.warm_start import QueryStart, shift_chunk
 
@@ -75,7 +75,7 @@ class RealtimeChunking(QueryStart):
     def name(self) -> str:
         return "rtc"
 
-    def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
+    def bind(self, network: Denoiser, normalizer: Normalizer, sampler: Sampler) -> None:
         self._parts = network, normalizer  # in a tuple: they stay modules of the policy alone
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,8 +8,8 @@ from torch import nn
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import Entry, carried_keys
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 
@@ -25,7 +25,7 @@ class PolicySizes:
     out_keys: list[NestedKey]
 
     @property
-    def network(self) -> TransformerForDiffusion:
+    def network(self) -> Denoiser:
         return self.module["denoise"].network
 
     @property
@@ -39,8 +39,8 @@ class PolicySizes:
 
     @property
     def device(self) -> torch.device:
-        """Device of the networks, required of policy calls and their noise; ``policy.to("cuda")`` changes it."""
-        return self.network.pos_emb.device
+        """Where the networks are, and policy calls and their noise must be; ``policy.to("cuda")`` moves it."""
+        return self.network.like.device
 
     @property
     def n_obs_steps(self) -> int:

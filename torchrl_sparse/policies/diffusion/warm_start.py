@@ -31,8 +31,8 @@ from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.errors import InputError
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.sampler import Sampler
-from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.normalize import Normalizer
 
 __all__ = ["QueryStart", "WarmStart", "shift_chunk", "stored_start"]
@@ -64,8 +64,8 @@ class QueryStart(TensorDictModuleBase):
     in_keys: list[NestedKey] = []
     out_keys: list[NestedKey] = []
 
-    def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
-        """Prepare for a policy with these parts; the policy calls it on assignment of the start or another sampler.
+    def bind(self, network: Denoiser, normalizer: Normalizer, sampler: Sampler) -> None:
+        """Prepare to serve a policy of these parts; it calls this when it is given the start or another sampler.
 
         Raises:
             InputError: if the start cannot serve them; it then stays as it was.
@@ -115,7 +115,7 @@ class WarmStart(QueryStart):
     def name(self) -> str:
         return f"warm{self.num_steps}"
 
-    def bind(self, network: TransformerForDiffusion, normalizer: Normalizer, sampler: Sampler) -> None:
+    def bind(self, network: Denoiser, normalizer: Normalizer, sampler: Sampler) -> None:
         if self.num_steps >= sampler.num_inference_steps:
             raise InputError(
                 f"num_steps: expected fewer than the sampler's {sampler.num_inference_steps}, got {self.num_steps}"

@@ -37,6 +37,7 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
         sampler=policy.sampler.name,
         reuse=config.reuse,
         settings=settings,
+        block_types=policy.network.block_types,
     )
     if is_static:
         path = folder / f"{static_name}.json"
@@ -50,6 +51,7 @@ def export_planner(trainer: PrunerTrainer, folder: str | Path, settings: Mapping
         rate_range=config.rate_range,
         reuse=config.reuse,
         settings=settings,
+        block_types=policy.network.block_types,
     )
     SAGPruner(trainer.gates, info).save_pretrained(folder / "pruner")
     return folder / "pruner"

@@ -36,8 +36,12 @@ def _sag(policy: DiffusionPolicy, rate_input: bool, *, reads: str = "all", **siz
     if reads not in ("all", "state"):
         raise InputError(f"reads: expected 'all' or 'state', got {reads!r}")
     features = 0 if policy.vision is None else policy.vision.feature_dim
+    sampler = policy.sampler
+    # Coordinates are whole numbers that fall toward the clean sample; times of flow are neither.
+    flow = sampler.kind == "flow"
+    falling = range(sampler.num_inference_steps)[::-1] if flow else sampler.timesteps.tolist()
     return PrunerNetwork(
-        policy.sampler.timesteps.tolist(),
+        falling,
         policy.num_blocks,
         (policy.n_obs_steps, policy.network.cond_dim),
         rate_input=rate_input,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -98,14 +99,14 @@ def block_weights(policy: DiffusionPolicy, cost: Cost) -> Tensor:
         return torch.ones(policy.num_blocks)
     costs = policy.block_costs()
     return (
-        torch.tensor([getattr(costs[kind], cost) for kind in BLOCK_TYPES])
+        torch.tensor([getattr(costs[kind], cost) for kind in policy.network.block_types])
         .float()
         .repeat(policy.network.n_layer)
     )
 
 
-def rate_metrics(gate: Tensor, weight: Tensor) -> dict[str, Tensor]:
-    """Return scalar prune rates: of all blocks, of the cost, and of each block type; see `sparsity_loss`."""
-    by_type = gate.mean(dim=(0, 1)).view(-1, len(BLOCK_TYPES)).mean(dim=0)
-    shares = {f"rate_{kind}": value for kind, value in zip(BLOCK_TYPES, by_type, strict=True)}
+def rate_metrics(gate: Tensor, weight: Tensor, types: Sequence[str] = BLOCK_TYPES) -> dict[str, Tensor]:
+    """Return prune rates, scalars: of all blocks, of the cost, and of each type of block; see `sparsity_loss`."""
+    by_type = gate.mean(dim=(0, 1)).view(-1, len(types)).mean(dim=0)
+    shares = {f"rate_{kind}": value for kind, value in zip(types, by_type, strict=True)}
     return {"rate": gate.mean(), "rate_cost": weighted_rate(gate, weight).mean(), **shares}

@@ -112,7 +112,7 @@ class PrunerTrainer(Trainer):
             "fidelity": fidelity,
             "sparsity": sparsity,
             "information": information.detach(),
-            **rate_metrics(gate.detach(), self.weight),
+            **rate_metrics(gate.detach(), self.weight, self.policy.network.block_types),
         }
 
     @torch.no_grad()
@@ -136,7 +136,7 @@ class PrunerTrainer(Trainer):
             "error": error,
             "variance": variance,
             "varying": varying_share(masks),
-            **rate_metrics(gate, self.weight),
+            **rate_metrics(gate, self.weight, self.policy.network.block_types),
         }
         return {name: value.item() for name, value in metrics.items()}
 

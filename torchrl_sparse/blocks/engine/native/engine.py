@@ -24,7 +24,7 @@ from torchrl_sparse.blocks.engine.native.packing import PackedNetwork, weight_ty
 from torchrl_sparse.blocks.engine.native.supports import native_supports
 from torchrl_sparse.blocks.engine.native.weights import SharedWeights
 from torchrl_sparse.blocks.engine.timing import time_blocks
-from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
@@ -93,6 +93,10 @@ class NativeEngine:
         supported, reason = native_supports(network)
         if not supported:
             raise InputError(f"native engine: {reason}")
+        if not sampler.coefficients.sample_share:
+            raise InputError(
+                'native engine: it reads predicted noise or velocities, the sampler has prediction="sample"'
+            )
         if threads is not None:
             check_size("threads", threads, MAX_THREADS)
         self._network, self._sampler, self._weights, self._threads = network, sampler, weights, threads
@@ -228,7 +232,7 @@ class NativeEngine:
         def walk(kind: int) -> None:
             loaded().sparse_blocks(self._level, threads, byref(packed.model), kind, scratch.data_ptr())
 
-        return time_blocks(walk, self._network.n_layer, repeats, scratch.device)
+        return time_blocks(walk, BLOCK_TYPES, self._network.n_layer, repeats, scratch.device)
 
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""

@@ -6,6 +6,7 @@ import torch
 
 from torchrl_sparse.blocks.engine.native.layout import CONSTANTS
 from torchrl_sparse.blocks.engine.native.library import native_available
+from torchrl_sparse.networks.diffusion.denoiser import Denoiser
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 
 __all__ = ["native_supports"]
@@ -13,12 +14,14 @@ __all__ = ["native_supports"]
 _MAX_OBS_STEPS = CONSTANTS["MAX_OBS_STEPS"]
 
 
-def native_supports(network: TransformerForDiffusion) -> tuple[bool, str]:
+def native_supports(network: Denoiser) -> tuple[bool, str]:
     """Return whether the native engine can run ``network`` on this machine, and if not, why.
 
     It needs the compiled library, f32 weights on the CPU, a token-wise condition encoder (``n_cond_layers`` = 0,
     as all published models have), a noise vector as large as an action, and at most 63 observation steps.
     """
+    if not isinstance(network, TransformerForDiffusion):
+        return False, f"it runs the published transformer, the network is a {type(network).__name__}"
     available, reason = native_available()
     if not available:
         return False, reason

@@ -135,7 +135,7 @@ class FeedForward:
 
     def __init__(self, network: TransformerForDiffusion, layer: FoldedLayer) -> None:
         like = network.pos_emb.detach()
-        self._inner = make_linear(layer.up.weight.to(like), layer.up.bias.to(like), gelu=True)
+        self._inner = make_linear(layer.up.weight.to(like), layer.up.bias.to(like), gelu="none")
         self._outer = make_linear(layer.down.weight.to(like), layer.down.bias.to(like))
 
     def __call__(self, x: Tensor, out: Tensor, scratch: BlockScratch) -> Tensor:

@@ -25,7 +25,7 @@ from torchrl_sparse.blocks.engine.torch.pool import WorkspacePool
 from torchrl_sparse.blocks.engine.torch.program import build_loop
 from torchrl_sparse.blocks.engine.torch.tables import Tables
 from torchrl_sparse.blocks.engine.weights import WeightWatch
-from torchrl_sparse.blocks.mask import Reuse, num_buffers
+from torchrl_sparse.blocks.mask import BLOCK_TYPES, Reuse, num_buffers
 from torchrl_sparse.networks.diffusion.coefficients import Guide
 from torchrl_sparse.networks.diffusion.sampler import Sampler
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
@@ -107,7 +107,7 @@ class TorchEngine:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
         tables, pool = self._current()
         with _in_weights_type(tables.device), pool.take(1, self._network.num_blocks) as workspace:
-            return time_blocks(workspace.walk, self._network.n_layer, repeats, tables.device)
+            return time_blocks(workspace.walk, BLOCK_TYPES, self._network.n_layer, repeats, tables.device)
 
     def block_macs(self) -> tuple[int, int, int]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`."""

@@ -12,8 +12,9 @@ __all__ = ["Linear", "can_pack", "make_linear", "transposed"]
 Linear = Callable[[Tensor, Tensor], Tensor]
 
 
-def make_linear(weight: Tensor, bias: Tensor, gelu: bool = False) -> Linear:
-    """Prepare ``(x [N, in], out [N, out]) -> [N, out]``, optionally followed by GELU.
+def make_linear(weight: Tensor, bias: Tensor, gelu: str | None = None) -> Linear:
+    """Prepare ``(x [N, in], out [N, out]) -> [N, out]``, with GELU behind it if asked for: ``"none"``, or ``"tanh"``, as
+    `torch.nn.GELU` names its approximations.
 
     The general product puts its result into ``out``. But ten rows leave it at a half of the speed that the
     weights could be read with; oneDNN's product on weights that were laid out for it in advance (what
@@ -23,11 +24,11 @@ def make_linear(weight: Tensor, bias: Tensor, gelu: bool = False) -> Linear:
     if can_pack(weight):
         packed = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous())
         product = torch.ops.mkldnn._linear_pointwise.default
-        activation, algorithm = ("gelu", "none") if gelu else ("none", "")
+        activation, algorithm = ("gelu", gelu) if gelu else ("none", "")
         return lambda x, out: product(x, packed, bias, activation, [], algorithm)
     right = transposed(weight)
     if gelu:
-        return lambda x, out: torch.ops.aten.gelu_(torch.addmm(bias, x, right, out=out))
+        return lambda x, out: torch.ops.aten.gelu_(torch.addmm(bias, x, right, out=out), approximate=gelu)
     return lambda x, out: torch.addmm(bias, x, right, out=out)
 
 

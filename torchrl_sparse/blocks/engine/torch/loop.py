@@ -212,7 +212,10 @@ class Workspace:
         eps = torch.addmm(
             tables.head_bias, self._scratch.normalise(self._x), tables.head_weight, out=self._eps
         )
-        torch.addcmul(sample, eps, noise_scale, out=clean)
+        if tables.sample_share:
+            torch.addcmul(sample, eps, noise_scale, out=clean)
+        else:
+            torch.mul(eps, noise_scale, out=clean)
         clean.div_(signal_scale).clamp_(-tables.clip, tables.clip)
         if self._guide is not None:
             clean.addcmul_(self._guide.actions - clean, self._guide.pull)

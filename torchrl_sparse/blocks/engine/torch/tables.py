@@ -42,6 +42,7 @@ class Tables:
         coefficients: [K, 7], those of :mod:`torchrl_sparse.networks.diffusion.coefficients` but the last, the first
             with a minus.
         weighs_eps: the weight of the predicted noise is not 0 throughout.
+        sample_share: see :mod:`torchrl_sparse.networks.diffusion.coefficients`.
         history: earlier clean predictions that the steps read.
         spread: [K].
         counts: ``counts[slots][first][last]``, how often the blocks first .. last-1 read each of the buffers that
@@ -64,6 +65,7 @@ class Tables:
         self.num_steps = sampler.num_inference_steps
         self.time = self._fold_time(layers) if self.encoder.separable else None
         coefficients = sampler.coefficients
+        self.sample_share = coefficients.sample_share
         self.clip, self.spread = coefficients.clip, coefficients.spread.to(self.stem_weight)
         columns = coefficients.table()[:, :-1].clone()
         columns[:, 0].neg_()

@@ -1,0 +1,5 @@
+"""Policies that LeRobot saved, read without LeRobot and without executing anything in them."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+from .policy import is_lerobot as is_lerobot, read_lerobot as read_lerobot
