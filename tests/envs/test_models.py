@@ -1,4 +1,4 @@
-"""Models that outlive resets against models that robosuite compiles anew, byte for byte."""
+"""Models that outlive resets against models that robosuite compiles fresh, byte for byte."""
 
 import mujoco
 import numpy as np
@@ -29,19 +29,19 @@ def pair(name, monkeypatch, absolute=True):
     task = find_robosuite_task(name)
     with monkeypatch.context() as patch:
         patch.setattr(simulator, "compile_what_changes", lambda _: None)
-        anew = make_simulator(task, absolute=absolute)
-    return make_simulator(task, absolute=absolute), anew
+        fresh = make_simulator(task, absolute=absolute)
+    return make_simulator(task, absolute=absolute), fresh
 
 
 @pytest.mark.parametrize("name", ROBOSUITE)
 def test_models_and_states_of_successive_episodes_are_those_of_robosuite(name, monkeypatch):
-    kept, anew = pair(name, monkeypatch)
+    kept, fresh = pair(name, monkeypatch)
     for seed in (0, 1, 2, 1):
         start(kept, seed)
-        start(anew, seed)
-        assert np.array_equal(whole(kept), whole(anew))
-        assert np.array_equal(kept.sim.get_state().flatten(), anew.sim.get_state().flatten())
-        assert kept.sim.model.get_xml() == anew.sim.model.get_xml()
+        start(fresh, seed)
+        assert np.array_equal(whole(kept), whole(fresh))
+        assert np.array_equal(kept.sim.get_state().flatten(), fresh.sim.get_state().flatten())
+        assert kept.sim.model.get_xml() == fresh.sim.model.get_xml()
 
 
 @pytest.mark.parametrize("name", ["Lift", "PickPlaceCan"])
@@ -54,8 +54,8 @@ def test_meshes_are_compiled_once(name):
 
 
 def test_what_an_episode_changes_in_its_model_is_gone_in_the_next(monkeypatch):
-    kept, anew = pair("PickPlaceCan", monkeypatch)
-    for sim_env in (kept, anew):
+    kept, fresh = pair("PickPlaceCan", monkeypatch)
+    for sim_env in (kept, fresh):
         start(sim_env, 0)
         model = sim_env.sim.model._model
         model.body_mass[:] *= 2
@@ -64,26 +64,26 @@ def test_what_an_episode_changes_in_its_model_is_gone_in_the_next(monkeypatch):
         model.opt.timestep = 0.001
         model.stat.meaninertia = 3.0
         start(sim_env, 1)
-    assert np.array_equal(whole(kept), whole(anew))
+    assert np.array_equal(whole(kept), whole(fresh))
 
 
 def test_another_scene_is_compiled_whole(monkeypatch):
-    kept, anew = pair("Lift", monkeypatch)
-    for sim_env in (kept, anew):
+    kept, fresh = pair("Lift", monkeypatch)
+    for sim_env in (kept, fresh):
         start(sim_env, 0)
         sim_env._xml_processors.append(
             lambda xml: xml.replace('mesh="', 'friction="0.3 0.005 0.0001" mesh="', 1)
         )
         start(sim_env, 1)
-    assert np.array_equal(whole(kept), whole(anew))
-    for sim_env in (kept, anew):
+    assert np.array_equal(whole(kept), whole(fresh))
+    for sim_env in (kept, fresh):
         sim_env._xml_processors[-1] = lambda xml: xml.replace(
             ' name="cube_main"', ' name="cube_main" gravcomp="1"'
         )
         start(sim_env, 2)
         sim_env._xml_processors[-1] = lambda xml: xml.replace('timestep="0.002"', 'timestep="0.004"')
         start(sim_env, 3)
-    assert np.array_equal(whole(kept), whole(anew))
+    assert np.array_equal(whole(kept), whole(fresh))
 
 
 def test_a_simulator_that_makes_its_models_itself_keeps_that():
