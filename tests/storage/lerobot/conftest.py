@@ -1,4 +1,8 @@
-"""Policies that the real LeRobot wrote."""
+"""Two `multi_task_dit` policies of random weights, and what LeRobot 0.6.1, which wrote them, answers (``reference.safetensors``).
+
+`tests/peers/lerobot/write_policies.py` made them in an environment of LeRobot's own; `make test-peers` makes all variants again and
+compares.
+"""
 
 import shutil
 from pathlib import Path

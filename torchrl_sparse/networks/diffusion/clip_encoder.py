@@ -163,7 +163,7 @@ class ClipEncoder(nn.Module):
         self.instructions, self.instruction = known, instruction
 
     def refresh(self) -> None:
-        """Encode instructions anew in the next call."""
+        """Encode instructions again in the next call."""
         self._texts = (None, {})
 
     def _ids(self, text: str) -> Sequence[int]:

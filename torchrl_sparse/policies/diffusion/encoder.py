@@ -149,7 +149,7 @@ class ObservationEncoder(TensorDictModuleBase):
         self.noise_stream, self.condition.cameras = other.noise_stream, other.condition.cameras
 
     def refresh(self) -> None:
-        """Read the encoders' weights anew in the next policy call."""
+        """Read the encoders' weights again in the next policy call."""
         self.condition.cameras.refresh()
         if isinstance(self.condition.vision, ClipEncoder):
             self.condition.vision.refresh()

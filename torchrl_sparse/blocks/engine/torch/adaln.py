@@ -155,7 +155,7 @@ def run_loop(
         time, x = tables.time[step], tables.embed(sample)
         for op, first, last, rows in ops:
             if op == COLLAPSE:
-                if first:  # what all blocks add, anew
+                if first:  # what all blocks add, again
                     collapsed = _reused(latest, 0, network.num_blocks)
                 x = x + collapsed
             elif op != COMPUTE:

@@ -80,7 +80,7 @@ class AdaLNEngine:
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
     def refresh(self) -> None:
-        """Tabulate the weights anew in the next query."""
+        """Tabulate the weights again in the next query."""
         self._watch.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
