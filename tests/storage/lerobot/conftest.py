@@ -1,7 +1,7 @@
-"""Two `multi_task_dit` policies of random weights, and what LeRobot 0.6.1, which wrote them, answers (``reference.safetensors``).
+"""Two `multi_task_dit` policies of random weights, and what LeRobot 0.6.1 answers (``reference.safetensors``).
 
-`tests/peers/lerobot/write_policies.py` made them in an environment of LeRobot's own; `make test-peers` makes all variants again and
-compares.
+LeRobot wrote them, by `tests/peers/lerobot/write_policies.py` in an environment of its own; `make test-peers` makes all variants
+again and compares.
 """
 
 import shutil
