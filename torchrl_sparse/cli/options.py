@@ -146,6 +146,12 @@ OPTIONS: dict[str, Any] = {
     "profile_policy.engine": Literal["auto", "native", "native_bf16", "native_int8", "openvino", "torch"],
     "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"] | None,
+    # a server
+    **dict.fromkeys(("serve.task", "serve.method", "serve.planners"), Word | None),
+    "answers": Literal["action", "chunk"],
+    "host": Word,
+    "port": Annotated[int, Field(ge=0, le=65535)],
+    **dict.fromkeys(("max_clients", "max_message_bytes", "report_every"), Count),
     # cameras
     "cameras": Section,
     "convert_demos.cameras": list[Word],  # none: nothing is rendered
