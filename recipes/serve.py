@@ -14,7 +14,7 @@ episode. http://HOST:PORT/healthz and /status answer plain requests. Ctrl-C or S
 
 from __future__ import annotations
 
-import logging
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ from torchrl_sparse.policies.diffusion.policy import DiffusionPolicy
 from torchrl_sparse.serving.server import PolicyServer
 from torchrl_sparse.training.diffusion.published import executed_steps
 
+tell = partial(print, flush=True)  # also where nobody reads along
+
 
 @recipe("serve", out=None)
 def main(config: DictConfig) -> None:
@@ -47,15 +49,14 @@ def main(config: DictConfig) -> None:
         max_message_bytes=config.max_message_bytes,
         threads=config.threads,
         facts={"policy": str(config.policy), "method": config.method},
+        log=tell,
     )
-    logging.basicConfig(format="%(asctime)s %(message)s")
-    logging.getLogger("torchrl_sparse.serving").setLevel(logging.INFO)
 
     def ready(port: int) -> None:
-        print(f"serving {config.policy} at ws://{config.host}:{port}, {policy.engine_info()}", flush=True)
+        tell(f"serving {config.policy} at ws://{config.host}:{port}, {server.metadata['engine']}")
 
     server.run(config.host, config.port, ready=ready, report_every=config.report_every)
-    print(f"served {server.status()['requests']} requests")
+    tell(f"served {server.status()['requests']} requests")
 
 
 def find_contract(task: str | None, policy: DiffusionPolicy) -> Contract | None:
@@ -78,7 +79,7 @@ def make_actor(config: DictConfig, policy: DiffusionPolicy, contract: Contract |
         steps = min(chosen or policy.source.get("n_action_steps") or 8, policy.chunk_shape[0])
     if config.method is None:
         return make_executor("dense", policy.freeze(), steps)
-    planners = Path(config.planners or config.policy)
+    planners = Path(config.planners)
     check_method(config.method, planners)
     options: dict[str, Any] = {"num_updates": config.num_updates, "planners": planners}
     made = make_method(config.method, policy, calibration=no_calibration, **options)

@@ -147,7 +147,7 @@ OPTIONS: dict[str, Any] = {
     "device": Annotated[Word, AfterValidator(check_device)],
     "dtype": Literal["float32", "float16", "bfloat16"] | None,
     # a server
-    **dict.fromkeys(("serve.task", "serve.method", "serve.planners"), Word | None),
+    **dict.fromkeys(("serve.task", "serve.method"), Word | None),
     "answers": Literal["action", "chunk"],
     "host": Word,
     "port": Annotated[int, Field(ge=0, le=65535)],

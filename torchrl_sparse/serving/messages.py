@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -95,12 +96,11 @@ def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
 def _scalar(data: Any, dtype: Any) -> Any:
     if isinstance(data, str) and isinstance(dtype, str) and _TEXT.fullmatch(dtype):
         return data
-    plain = isinstance(dtype, str) and _NUMERIC.fullmatch(dtype) and isinstance(data, (bool, int, float))
-    try:
-        if plain:
-            return np.dtype(dtype).type(data)
-    except (ValueError, OverflowError):
-        pass
+    if isinstance(dtype, str) and _NUMERIC.fullmatch(dtype) and isinstance(data, (bool, int, float)):
+        with suppress(OverflowError), np.errstate(all="ignore"):
+            value = np.asarray(data).astype(dtype)[()]
+            if value == data or data != data:  # a number that was packed is one of its dtype
+                return value
     raise InputError(f"dtype: expected a number of a plain numeric dtype, got {_short(data)} of {_short(dtype)}")
 
 

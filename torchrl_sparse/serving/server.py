@@ -7,6 +7,7 @@ import json
 import logging
 import signal
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
@@ -50,6 +51,7 @@ class PolicyServer:
         max_message_bytes: of a request; longer ones end the connection with code 1009.
         threads: of a policy call; None for as many as PyTorch has.
         facts: further metadata, such as the method's name.
+        log: takes a line on each client that is dropped and, now and then, on what was served.
 
     Raises:
         InputError: as of `RobotSetup`.
@@ -67,12 +69,14 @@ class PolicyServer:
         max_message_bytes: int = 2**22,
         threads: int | None = None,
         facts: Mapping[str, Any] | None = None,
+        log: Callable[[str], None] = logger.warning,
     ):
         self._websockets = import_extra("websockets.asyncio.server", "serve")
         self._closed = import_extra("websockets.exceptions", "serve").ConnectionClosed
         self._setup = RobotSetup(executor, answers, seed)
         self._read = RequestReader(contract)
         self._most, self._size, self._threads = max_clients, max_message_bytes, threads
+        self._log = log
         self.metadata = describe_service(self._setup, contract, facts or {})
         self._greeting = pack(self.metadata)
         self._clients: set[Any] = set()
@@ -121,7 +125,7 @@ class PolicyServer:
             host: address to bind; robots elsewhere need one that they reach.
             port: 0 for any that is free.
             ready: called with the port once clients may connect.
-            report_every: seconds from one line of this module's logger on clients and percentiles to the next.
+            report_every: seconds from one line on clients and percentiles to the next.
 
         Raises:
             OSError: if the address cannot be bound.
@@ -145,7 +149,7 @@ class PolicyServer:
     def _report(self) -> None:
         """Log a line on what has been served, where anything has."""
         if self._counts["requests"]:
-            logger.info("%s", json.dumps(self.status()))
+            self._log(json.dumps(self.status()))
 
     def _page(self, connection: Any, request: Any) -> Any:
         """Answer plain HTTP requests, and refuse robots that are too many."""
@@ -186,7 +190,7 @@ class PolicyServer:
                 await self._drop(connection, 1007, str(error))
                 return
             except Exception as error:  # of the policy, whose robots all others still are
-                logger.exception("a policy call failed")
+                self._log(traceback.format_exc())
                 await self._drop(connection, 1011, f"policy: {type(error).__name__}: {error}")
                 return
             took = time.perf_counter() - begin
@@ -215,11 +219,10 @@ class PolicyServer:
         took = time.perf_counter() - begin
         return [(answer, took) for answer in answers]
 
-    @staticmethod
-    async def _drop(connection: Any, code: int, why: str) -> None:
+    async def _drop(self, connection: Any, code: int, why: str) -> None:
         """Tell a client why, in text as openpi's server does, and end its connection."""
         line = " ".join(why.split())
-        logger.warning("%s: %s", connection.remote_address, line)
+        self._log(f"dropped {connection.remote_address}: {line}")
         await connection.send(line)
         await connection.close(code, "see the message before")
 
