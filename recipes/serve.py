@@ -72,7 +72,9 @@ def make_actor(config: DictConfig, policy: DiffusionPolicy, contract: Contract |
     if config.answers == "chunk":
         steps = 1  # every request is a policy call
         if chosen is not None or (config.method and MethodSpec.parse(config.method).every):
-            raise InputError("n_action_steps: expected null with answers=chunk, as the client plays the chunk")
+            raise InputError(
+                "n_action_steps: expected null with answers=chunk, as the client plays the chunk"
+            )
     elif task:
         steps = executed_steps(task, policy.source, chosen)
     else:
@@ -87,7 +89,9 @@ def make_actor(config: DictConfig, policy: DiffusionPolicy, contract: Contract |
 
 
 def no_calibration() -> Any:
-    raise InputError("method: expected a schedule of num_updates updates in planners, got none; see calibrate_bac")
+    raise InputError(
+        "method: expected a schedule of num_updates updates in planners, got none; see calibrate_bac"
+    )
 
 
 if __name__ == "__main__":

