@@ -1,0 +1,170 @@
+"""Load on the policy server: how many requests it answers, what it adds to a policy call, and how much memory it takes.
+
+    python -m tests.serving.load                    # 1, 8 and 64 clients, server and clients on a core each
+    python -m tests.serving.load fleet=8 rounds=4   # and the same robots as processes that each load the policy, on one core
+
+Prints Markdown rows. Rounds of what is compared alternate, so that a busy machine disturbs all alike; only ratios are told.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgpack
+import numpy as np
+from websockets.asyncio.client import connect
+
+from tests.serving.robots import packed, unpacked
+
+OPTIONS = {
+    "policy": "assets/lift", "method": "ddpm5_logsnr:int8", "clients": "1,8,64", "seconds": "5", "rounds": "3", "fleet": "0",
+}  # fmt: skip
+CORE = {"policy": 0, "clients": 1}
+
+
+@contextmanager
+def served(options, answers):
+    """The recipe as a program on its core; gives its port and process."""
+    command = [sys.executable, "recipes/serve.py", "port=0", f"answers={answers}", "report_every=3600"]
+    words = [f"{name}={options[name]}" for name in ("policy", "method")]
+    process = subprocess.Popen(
+        [*command, *words], stdout=subprocess.PIPE, text=True, preexec_fn=lambda: pin("policy")
+    )
+    try:
+        yield int(re.search(r"ws://[^:]+:(\d+)", process.stdout.readline())[1]), process
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def pin(part):
+    os.sched_setaffinity(0, {CORE[part] % os.cpu_count()})
+
+
+def memory(pid):
+    """Proportional set size, MB: shared pages count once among those that share them."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    return int(re.search(r"^Pss:\s+(\d+)", text, re.M)[1]) / 1024
+
+
+async def drive(port, clients, seconds, shape):
+    """Requests of so many robots, one after the other each; returns [n, 2]: seconds of a request, and of its policy call."""
+    message = msgpack.packb({"observation/state": np.zeros(shape)}, default=packed)
+    taken, end = [], time.perf_counter() + seconds
+
+    async def play():
+        async with connect(f"ws://127.0.0.1:{port}", compression=None) as socket:
+            await socket.recv()
+            while time.perf_counter() < end:
+                begin = time.perf_counter()
+                await socket.send(message)
+                answer = await socket.recv()
+                took = time.perf_counter() - begin
+                told = msgpack.unpackb(answer, object_hook=unpacked)
+                taken.append((took, told["server_timing"]["policy_ms"] / 1000))
+
+    await asyncio.gather(*(play() for _ in range(clients)))
+    return np.array(taken)
+
+
+def process_robot(options, answers, begin, end, counts, number):
+    """One of the processes that each load the policy; begins a round when told so."""
+    import torch
+
+    from torchrl_sparse import ChunkExecutor, DiffusionPolicy, make_method
+
+    torch.set_num_threads(1)
+    policy = DiffusionPolicy.from_pretrained(options["policy"])
+    made = {"num_updates": 10, "planners": Path(options["policy"]), "calibration": None}
+    actor = ChunkExecutor(
+        make_method(options["method"], policy, **made).freeze(), 8 if answers == "action" else 1
+    )
+    actor.reset(seed=number)
+    observation = {"state": np.zeros(policy.normalizer.state_scale.numel())}
+    actor.act(observation)
+    pin("policy")
+    while True:
+        begin.wait()
+        count, stop = 0, time.perf_counter() + float(options["seconds"])
+        while time.perf_counter() < stop:
+            actor.act(observation)
+            count += 1
+        counts[number] = count
+        end.wait()
+
+
+def table(options, state):
+    """Rows of the load of 1, 8 and 64 clients."""
+    print(
+        "| answers | clients | requests/s | call p50, ms | added p50, ms | added p99, ms | served p50, ms | memory, MB |"
+    )
+    for answers, shape in (("action", state[-1:]), ("chunk", state)):
+        with served(options, answers) as (port, process):
+            for clients in map(int, options["clients"].split(",")):
+                taken = asyncio.run(drive(port, clients, float(options["seconds"]), shape))
+                called = taken[taken[:, 1] > 0]
+                added = 1000 * (called[:, 0] - called[:, 1])
+                within = 1000 * taken[taken[:, 1] == 0, 0]
+                cells = [
+                    len(taken) / float(options["seconds"]), 1000 * np.median(called[:, 1]), *np.percentile(added, (50, 99)),
+                    np.median(within) if len(within) else np.nan, memory(process.pid),
+                ]  # fmt: skip
+                print(
+                    f"| {answers} | {clients} | " + " | ".join(f"{cell:.3g}" for cell in cells) + " |",
+                    flush=True,
+                )
+
+
+def fleet(options, state):
+    """Rates of one server and of as many processes as it has robots, all on one core, in alternating rounds."""
+    robots, seconds = int(options["fleet"]), float(options["seconds"])
+    spawn = multiprocessing.get_context("spawn")
+    for answers, shape in (("action", state[-1:]), ("chunk", state)):
+        begin, end, counts = spawn.Barrier(robots + 1), spawn.Barrier(robots + 1), spawn.Array("q", robots)
+        arguments = [(options, answers, begin, end, counts, number) for number in range(robots)]
+        processes = [spawn.Process(target=process_robot, args=a, daemon=True) for a in arguments]
+        for process in processes:
+            process.start()
+        with served(options, answers) as (port, server):
+            found = []
+            for number in range(int(options["rounds"]) + 1):
+                begin.wait()
+                end.wait()
+                alone = sum(counts) / seconds
+                together = len(asyncio.run(drive(port, robots, seconds, shape))) / seconds
+                if number:  # the first warms up
+                    found.append((together, alone, together / alone))
+            memories = memory(server.pid), sum(memory(process.pid) for process in processes)
+            together, alone, ratio = np.median(found, axis=0)
+            print(
+                f"{answers}, {robots} robots: server {together:.4g}/s, processes {alone:.4g}/s, ratio {ratio:.3g} "
+                f"({', '.join(f'{row[2]:.3g}' for row in found)}); memory {memories[0]:.0f} MB and {memories[1]:.0f} MB",
+                flush=True,
+            )
+        for process in processes:
+            process.terminate()
+
+
+def main():
+    options = OPTIONS | dict(word.split("=", 1) for word in sys.argv[1:])
+    from torchrl_sparse import DiffusionPolicy
+
+    policy = DiffusionPolicy.from_pretrained(options["policy"])
+    state = (policy.n_obs_steps, policy.normalizer.state_scale.numel())
+    pin("clients")
+    if options["clients"] != "0":
+        table(options, state)
+    if options["fleet"] != "0":
+        fleet(options, state)
+
+
+if __name__ == "__main__":
+    main()
