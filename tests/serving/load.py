@@ -55,6 +55,16 @@ def memory(pid):
     return int(re.search(r"^Pss:\s+(\d+)", text, re.M)[1]) / 1024
 
 
+def busy(pid):
+    """CPU seconds of a server's event loop, which is its main thread, and of all its other threads."""
+    times = {
+        int(task.name): int((task / "schedstat").read_text().split()[0])
+        for task in Path(f"/proc/{pid}/task").iterdir()
+    }
+    loop = times.pop(pid)
+    return np.array([loop, sum(times.values())]) / 1e9
+
+
 async def drive(port, clients, seconds, shape):
     """Requests of so many robots, one after the other each; returns [n, 2]: seconds of a request, and of its policy call."""
     message = msgpack.packb({"observation/state": np.zeros(shape)}, default=packed)
@@ -109,13 +119,15 @@ def table(options, state):
     for answers, shape in (("action", state[-1:]), ("chunk", state)):
         with served(options, answers) as (port, process):
             for clients in map(int, options["clients"].split(",")):
+                before = busy(process.pid)
                 taken = asyncio.run(drive(port, clients, float(options["seconds"]), shape))
+                loop, other = 1000 * (busy(process.pid) - before)
                 called = taken[taken[:, 1] > 0]
                 added = 1000 * (called[:, 0] - called[:, 1])
                 within = 1000 * taken[taken[:, 1] == 0, 0]
                 cells = [
                     len(taken) / float(options["seconds"]), 1000 * np.median(called[:, 1]), *np.percentile(added, (50, 99)),
-                    np.median(within) if len(within) else np.nan, memory(process.pid),
+                    np.median(within) if len(within) else np.nan, loop / len(taken), other / len(called), memory(process.pid),
                 ]  # fmt: skip
                 print(
                     f"| {answers} | {clients} | " + " | ".join(f"{cell:.3g}" for cell in cells) + " |",

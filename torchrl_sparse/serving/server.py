@@ -132,6 +132,7 @@ class PolicyServer:
         """
         self._batcher = Batcher(self._call, self._threads)
         options = {"compression": None, "max_size": self._size, "max_queue": 2, "close_timeout": 2}
+        options |= {"origins": [None]}  # robots; no page in a browser of this machine
         try:
             if (row := first_request(self._setup)) is not None:  # builds what the engine runs
                 await self._batcher.ask(row)
