@@ -50,9 +50,9 @@ def pin(part):
 
 
 def memory(pid):
-    """Proportional set size, MB: shared pages count once among those that share them."""
-    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    return int(re.search(r"^Pss:\s+(\d+)", text, re.M)[1]) / 1024
+    """Resident MB of a process: its own, and of files, which processes share."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    return [int(re.search(rf"^Rss{kind}:\s+(\d+)", text, re.M)[1]) / 1024 for kind in ("Anon", "File")]
 
 
 def busy(pid):
@@ -138,11 +138,11 @@ def table(options, state):
 def fleet(options, state):
     """Rates of one server and of as many processes as it has robots, all on one core, in alternating rounds."""
     robots, seconds = int(options["fleet"]), float(options["seconds"])
-    spawn = multiprocessing.get_context("spawn")
+    fork = multiprocessing.get_context("fork")  # what they import is there already; the policy is not
     for answers, shape in (("action", state[-1:]), ("chunk", state)):
-        begin, end, counts = spawn.Barrier(robots + 1), spawn.Barrier(robots + 1), spawn.Array("q", robots)
+        begin, end, counts = fork.Barrier(robots + 1), fork.Barrier(robots + 1), fork.Array("q", robots)
         arguments = [(options, answers, begin, end, counts, number) for number in range(robots)]
-        processes = [spawn.Process(target=process_robot, args=a, daemon=True) for a in arguments]
+        processes = [fork.Process(target=process_robot, args=one, daemon=True) for one in arguments]
         for process in processes:
             process.start()
         with served(options, answers) as (port, server):
@@ -154,20 +154,27 @@ def fleet(options, state):
                 together = len(asyncio.run(drive(port, robots, seconds, shape))) / seconds
                 if number:  # the first warms up
                     found.append((together, alone, together / alone))
-            memories = memory(server.pid), sum(memory(process.pid) for process in processes)
-            together, alone, ratio = np.median(found, axis=0)
-            print(
-                f"{answers}, {robots} robots: server {together:.4g}/s, processes {alone:.4g}/s, ratio {ratio:.3g} "
-                f"({', '.join(f'{row[2]:.3g}' for row in found)}); memory {memories[0]:.0f} MB and {memories[1]:.0f} MB",
-                flush=True,
-            )
+            (own, files), (each, _) = memory(server.pid), memory(processes[0].pid)
+        rounds = ", ".join(f"{row[2]:.3g}" for row in found)
+        together, alone, ratio = np.median(found, axis=0)
+        print(
+            f"{answers}: server {together:.4g}/s, {robots} processes {alone:.4g}/s, ratio {ratio:.3g} of {rounds}"
+        )
+        print(
+            f"server {own:.0f} MB and {files:.0f} of files, each process {each:.0f} and those files",
+            flush=True,
+        )
         for process in processes:
             process.terminate()
 
 
 def main():
     options = OPTIONS | dict(word.split("=", 1) for word in sys.argv[1:])
-    from torchrl_sparse import DiffusionPolicy
+    from torchrl_sparse import (  # noqa: F401  for those that are forked
+        ChunkExecutor,
+        DiffusionPolicy,
+        make_method,
+    )
 
     policy = DiffusionPolicy.from_pretrained(options["policy"])
     state = (policy.n_obs_steps, policy.normalizer.state_scale.numel())
