@@ -3,7 +3,8 @@
     python -m tests.serving.load                    # 1, 8 and 64 clients, server and clients on a core each
     python -m tests.serving.load fleet=8 rounds=4   # and the same robots as processes that each load the policy, on one core
 
-Prints Markdown rows. Rounds of what is compared alternate, so that a busy machine disturbs all alike; only ratios are told.
+Prints Markdown rows. Rounds of what is compared alternate, and rates of the fleet are per second of CPU time, of all threads of
+the server or of all processes: on a machine that does other work eight processes get more of a core than one.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ async def drive(port, clients, seconds, shape):
     return np.array(taken)
 
 
-def process_robot(options, answers, begin, end, counts, number):
+def process_robot(options, answers, begin, end, counts, spent, number):
     """One of the processes that each load the policy; begins a round when told so."""
     import torch
 
@@ -104,17 +105,19 @@ def process_robot(options, answers, begin, end, counts, number):
     while True:
         begin.wait()
         count, stop = 0, time.perf_counter() + float(options["seconds"])
+        before = time.process_time()
         while time.perf_counter() < stop:
             actor.act(observation)
             count += 1
-        counts[number] = count
+        counts[number], spent[number] = count, time.process_time() - before
         end.wait()
 
 
 def table(options, state):
     """Rows of the load of 1, 8 and 64 clients."""
     print(
-        "| answers | clients | requests/s | call p50, ms | added p50, ms | added p99, ms | served p50, ms | memory, MB |"
+        "| answers | clients | requests/s | call, ms | added, ms | added at most in 99 %, ms | from the chunk, ms "
+        "| loop's CPU a request, ms | other CPU a policy call, ms | memory, MB |"
     )
     for answers, shape in (("action", state[-1:]), ("chunk", state)):
         with served(options, answers) as (port, process):
@@ -140,8 +143,14 @@ def fleet(options, state):
     robots, seconds = int(options["fleet"]), float(options["seconds"])
     fork = multiprocessing.get_context("fork")  # what they import is there already; the policy is not
     for answers, shape in (("action", state[-1:]), ("chunk", state)):
-        begin, end, counts = fork.Barrier(robots + 1), fork.Barrier(robots + 1), fork.Array("q", robots)
-        arguments = [(options, answers, begin, end, counts, number) for number in range(robots)]
+        shared = [
+            fork.Barrier(robots + 1),
+            fork.Barrier(robots + 1),
+            fork.Array("q", robots),
+            fork.Array("d", robots),
+        ]
+        begin, end, counts, spent = shared
+        arguments = [(options, answers, *shared, number) for number in range(robots)]
         processes = [fork.Process(target=process_robot, args=one, daemon=True) for one in arguments]
         for process in processes:
             process.start()
@@ -150,15 +159,18 @@ def fleet(options, state):
             for number in range(int(options["rounds"]) + 1):
                 begin.wait()
                 end.wait()
-                alone = sum(counts) / seconds
-                together = len(asyncio.run(drive(port, robots, seconds, shape))) / seconds
+                alone = sum(counts) / sum(spent)
+                before = sum(busy(server.pid))
+                together = len(asyncio.run(drive(port, robots, seconds, shape))) / (
+                    sum(busy(server.pid)) - before
+                )
                 if number:  # the first warms up
                     found.append((together, alone, together / alone))
             (own, files), (each, _) = memory(server.pid), memory(processes[0].pid)
         rounds = ", ".join(f"{row[2]:.3g}" for row in found)
         together, alone, ratio = np.median(found, axis=0)
         print(
-            f"{answers}: server {together:.4g}/s, {robots} processes {alone:.4g}/s, ratio {ratio:.3g} of {rounds}"
+            f"{answers}: a CPU second: server {together:.4g}, {robots} processes {alone:.4g}, ratio {ratio:.3g} of {rounds}"
         )
         print(
             f"server {own:.0f} MB and {files:.0f} of files, each process {each:.0f} and those files",
