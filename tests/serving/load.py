@@ -130,7 +130,8 @@ def table(options, state):
                 within = 1000 * taken[taken[:, 1] == 0, 0]
                 cells = [
                     len(taken) / float(options["seconds"]), 1000 * np.median(called[:, 1]), *np.percentile(added, (50, 99)),
-                    np.median(within) if len(within) else np.nan, loop / len(taken), other / len(called), sum(memory(process.pid)),
+                    np.median(within) if len(within) else np.nan, loop / len(taken), other / len(called),
+                    sum(memory(process.pid)),
                 ]  # fmt: skip
                 print(
                     f"| {answers} | {clients} | " + " | ".join(f"{cell:.3g}" for cell in cells) + " |",

@@ -6,7 +6,7 @@ import threading
 import msgpack
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.serving.robots import Client, packed, running
 from torchrl_sparse import keys
@@ -166,3 +166,9 @@ def test_at_the_end_every_robot_is_told_so(actor):
     with pytest.raises(OSError, match="refused"):
         Client(server.port)
     assert threading.active_count() <= threads
+
+
+def test_no_page_in_a_browser_may_connect(server):
+    with pytest.raises(InvalidStatus) as raised:
+        Client(server.port, origin="https://example.org")
+    assert raised.value.response.status_code == 403

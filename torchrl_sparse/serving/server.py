@@ -131,8 +131,8 @@ class PolicyServer:
             OSError: if the address cannot be bound.
         """
         self._batcher = Batcher(self._call, self._threads)
-        options = {"compression": None, "max_size": self._size, "max_queue": 2, "close_timeout": 2}
-        options |= {"origins": [None]}  # robots; no page in a browser of this machine
+        options: dict[str, Any] = {"compression": None, "max_size": self._size, "max_queue": 2}
+        options |= {"close_timeout": 2, "origins": [None]}  # robots send none, pages in a browser do
         try:
             if (row := first_request(self._setup)) is not None:  # builds what the engine runs
                 await self._batcher.ask(row)
