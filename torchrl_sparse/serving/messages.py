@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
+from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ def pack(content: Any) -> bytes:
     >>> unpack(pack({"actions": np.ones((1, 2), np.float32)}))
     {'actions': array([[1., 1.]], dtype=float32)}
     """
-    return import_extra("msgpack", "serve").packb(content, default=_pack_array)
+    return _msgpack().packb(content, default=_pack_array)
 
 
 def unpack(message: bytes | str) -> Any:
@@ -52,7 +54,7 @@ def unpack(message: bytes | str) -> Any:
             raise InputError(f"message: expected at most {_CONTAINERS} maps and lists, got more")
         return _unpack_array(content) if isinstance(content, dict) else content
 
-    msgpack = import_extra("msgpack", "serve")
+    msgpack = _msgpack()
     most = {"max_array_len": _ITEMS, "max_map_len": _ITEMS, "max_ext_len": 0}
     try:
         return msgpack.unpackb(message, object_hook=count, list_hook=count, **most)
@@ -68,6 +70,11 @@ def unpack(message: bytes | str) -> Any:
         raise InputError(
             f"message: expected msgpack, got {len(message)} bytes that are none: {why}"
         ) from error
+
+
+@cache
+def _msgpack() -> ModuleType:
+    return import_extra("msgpack", "serve")
 
 
 def _pack_array(value: Any) -> Any:
