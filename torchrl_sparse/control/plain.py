@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -49,8 +49,11 @@ class PlainLoop:
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the action of the current step; see `ChunkExecutor.act`."""
         self.remember(observation)
+        for key, value in self.reads().items():
+            self._carried[key] = value
         device = self._policy.normalizer.state_scale.device
-        self.keep(self._executor(self.ask().to(device)).detach())
+        self._carried = self._executor(self._carried.to(device)).detach()
+        self.advance()
         return self._carried[self._executor.tensor_keys["action"]].cpu().numpy()
 
     def remember(self, *observations: Mapping[str, np.ndarray]) -> None:
@@ -64,24 +67,20 @@ class PlainLoop:
                 past.extend([step[name]] * (1 if past else past.maxlen or 1))
             self._now = {name: step[name] for name in self._read_now}
 
-    def ask(self) -> TensorDictBase:
-        """Return what the executor reads at the current step, and what its last call left."""
-        td = self._carried
-        for name, past in self._past.items():
-            td[keys.history(name)] = torch.stack([*past])
-        for name, value in self._now.items():
-            td["observation", name] = value
-        td[keys.IS_INIT] = torch.tensor([self._step == 0])
+    def reads(self) -> dict[NestedKey, Tensor]:
+        """Return what the executor reads at the current step, but for what its last call left."""
+        read: dict[NestedKey, Tensor] = {
+            keys.history(name): torch.stack([*past]) for name, past in self._past.items()
+        }
+        read |= {("observation", name): value for name, value in self._now.items()}
+        read[keys.IS_INIT] = torch.tensor([self._step == 0])
         if self._seed is not None:
-            td[keys.EPISODE_SEED], td[keys.EPISODE_STEP] = (
-                torch.tensor([self._seed]),
-                torch.tensor([self._step]),
-            )
-        return td
+            read[keys.EPISODE_SEED] = torch.tensor([self._seed])
+            read[keys.EPISODE_STEP] = torch.tensor([self._step])
+        return read
 
-    def keep(self, left: TensorDictBase) -> None:
-        """Keep what the executor left of a step for the next one, which then is the current one."""
-        self._carried = left
+    def advance(self) -> None:
+        """Go on to the next step."""
         self._step += 1
 
     def _check(self, observation: Mapping[str, np.ndarray]) -> dict[str, Tensor]:

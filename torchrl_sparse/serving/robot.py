@@ -7,7 +7,8 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict
+from torch import Tensor
 
 from torchrl_sparse import keys
 from torchrl_sparse.carried import Entry, carried_entries
@@ -16,8 +17,10 @@ from torchrl_sparse.control.plain import PlainLoop
 from torchrl_sparse.errors import InputError
 from torchrl_sparse.serving.requests import Request
 
-__all__ = ["Answers", "Robot", "RobotSetup", "first_request"]
+__all__ = ["Answers", "Robot", "RobotSetup", "Row", "first_request"]
 
+Row = dict[NestedKey, Tensor]
+"""What the executor reads of one client, or leaves to it, by key; TensorDicts are made of whole batches."""
 Answers = Literal["action", "chunk"]
 """What a request is answered with: the action of one control step, or the chunk of one policy call."""
 
@@ -49,19 +52,21 @@ class RobotSetup:
                 "answers: expected action for a method that reads its last chunk or has a controller, got chunk"
             )
         self._entries = carried_entries(executor, Entry(self.chunk_shape))
-        self.carried: list[NestedKey] = [*self._entries]
+        self.action: NestedKey = executor.tensor_keys["action"]
+        self._wanted = list(dict.fromkeys([*self._entries, keys.CHUNK, keys.UNTIL_QUERY, self.action]))
+        self.carried = [*self._entries]
 
-    def begin(self) -> TensorDict:
+    def begin(self) -> Row:
         """Return what an environment's reset writes of the keys that steps leave to each other."""
         entries = self._entries.items()
-        return TensorDict({key: torch.full(one.shape, one.begin, dtype=one.dtype) for key, one in entries})
+        return {key: torch.full(one.shape, one.begin, dtype=one.dtype) for key, one in entries}
 
-    def ask(self, rows: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+    def ask(self, rows: Sequence[Row]) -> list[Row]:
         """Run the executor on what several clients read, as one batch, and return what it leaves to each."""
-        device = self.executor.policy.device
-        left = self.executor(torch.stack([*rows]).to(device))
-        answer = (keys.CHUNK, keys.UNTIL_QUERY, self.executor.tensor_keys["action"])
-        return [*left.select(*self.carried, *answer).cpu().unbind(0)]
+        stacked = {key: torch.stack([row[key] for row in rows]) for key in rows[0]}
+        left = self.executor(TensorDict(stacked, [len(rows)]).to(self.executor.policy.device))
+        columns = [left.get(key).cpu().unbind(0) for key in self._wanted]
+        return [dict(zip(self._wanted, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 class Robot:
@@ -75,9 +80,9 @@ class Robot:
         self._setup, self._episode = setup, -1
         self._loop: PlainLoop | None = None
         self._until, self._age = 0, -1  # steps whose actions are in the chunk; the position of the last one
-        self._left: TensorDictBase = TensorDict()
+        self._left: Row = {}
 
-    def take(self, request: Request) -> np.ndarray | TensorDictBase:
+    def take(self, request: Request) -> np.ndarray | Row:
         """Return the answer where the chunk holds it, else what the executor reads of this step.
 
         Raises:
@@ -93,38 +98,37 @@ class Robot:
         self._loop.remember(*self._steps(request))
         if self._until > 0:
             self._until, self._age = self._until - 1, self._age + 1
-            self._loop.keep(self._left)
-            return self._chunk[self._age : self._age + 1].numpy()
-        row = self._loop.ask()
-        if not self._left.is_empty():
-            row[keys.AGE], row[keys.QUERIED] = torch.tensor([self._age]), torch.tensor([self._age == 0])
-            return row
-        return self._setup.begin().update(row)
+            self._loop.advance()
+            return self._chunk[self._age : self._age + 1]
+        if not self._left:
+            return {**self._setup.begin(), **self._loop.reads()}
+        played = {keys.AGE: torch.tensor([self._age]), keys.QUERIED: torch.tensor([self._age == 0])}
+        return {**self._left, **played, **self._loop.reads()}
 
-    def keep(self, left: TensorDictBase) -> np.ndarray:
+    def keep(self, left: Row) -> np.ndarray:
         """Return the answer, f32 [1, A] or [n, A], from what the executor left.
 
         Raises:
             InputError: if it is not finite, which only an observation far from all demonstrations has led to.
         """
         assert self._loop is not None
-        chunk = left[keys.CHUNK]
-        if not chunk.isfinite().all():
+        chunk = left[keys.CHUNK].numpy()
+        if not np.isfinite(chunk).all():
             raise InputError("observation: expected one with a finite answer, got one without")
         self._chunk, self._age = chunk, int(left[keys.AGE])
-        self._left = left.select(*self._setup.carried)
-        self._loop.keep(self._left)
+        self._left = {key: left[key] for key in self._setup.carried}
+        self._loop.advance()
         if self._setup.answers == "chunk":
-            return chunk.numpy()
+            return chunk
         self._until = int(left[keys.UNTIL_QUERY])
-        return left[self._setup.executor.tensor_keys["action"]][None].numpy()
+        return left[self._setup.action][None].numpy()
 
     def _begin(self, seed: int | None) -> None:
         self._episode += 1
         self._loop = PlainLoop(
             self._setup.executor, self._setup.seed + self._episode if seed is None else seed
         )
-        self._left, self._until, self._age = TensorDict(), 0, -1
+        self._left, self._until, self._age = {}, 0, -1
 
     def _steps(self, request: Request) -> list[dict[str, np.ndarray]]:
         """Return the observations of a request, oldest first."""
@@ -139,7 +143,7 @@ class Robot:
         return [{name: value[step] for name, value in request.observation.items()} for step in range(count)]
 
 
-def first_request(setup: RobotSetup) -> TensorDictBase | None:
+def first_request(setup: RobotSetup) -> Row | None:
     """Return what the executor reads where all that is observed is 0; None where it reads more than a state and cameras."""
     policy = setup.executor.policy
     zeros = {"state": np.zeros(policy.normalizer.state_scale.numel())}

@@ -14,7 +14,6 @@ from http import HTTPStatus
 from typing import Any
 
 import numpy as np
-from tensordict import TensorDictBase
 
 from torchrl_sparse.control.chunk_executor import ChunkExecutor
 from torchrl_sparse.envs.contract import Contract
@@ -25,7 +24,7 @@ from torchrl_sparse.serving.latencies import Latencies
 from torchrl_sparse.serving.messages import pack, unpack
 from torchrl_sparse.serving.metadata import describe_service
 from torchrl_sparse.serving.requests import RequestReader
-from torchrl_sparse.serving.robot import Answers, Robot, RobotSetup, first_request
+from torchrl_sparse.serving.robot import Answers, Robot, RobotSetup, Row, first_request
 
 __all__ = ["PolicyServer"]
 
@@ -212,7 +211,7 @@ class PolicyServer:
         self._counts["policy_calls"] += 1
         return robot.keep(left), {"policy_ms": _ms(seconds)}
 
-    def _call(self, rows: list[TensorDictBase]) -> list[tuple[TensorDictBase, float]]:
+    def _call(self, rows: list[Row]) -> list[tuple[Row, float]]:
         """Ask the policy in the batcher's thread."""
         begin = time.perf_counter()
         answers = self._setup.ask(rows)
