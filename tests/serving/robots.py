@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 import msgpack
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from torchrl_sparse.serving import PolicyServer
@@ -54,9 +55,9 @@ class Client:
         self.socket.send(message)
         told = self.socket.recv(timeout=20)
         assert isinstance(told, str)
-        with pytest.raises(Exception, match="received"):  # a close frame
+        with pytest.raises(ConnectionClosed) as raised:
             self.socket.recv(timeout=20)
-        return told, self.socket.close_code
+        return told, raised.value.rcvd.code
 
     def _read(self):
         answer = self.socket.recv(timeout=60)
