@@ -58,7 +58,7 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("files", "aggregate", "budgets"), list[Word]),
     "title": str,
     "errors": Literal["refuse", "failure", "exclude"],
-    **dict.fromkeys(("reference", "html", "table_file", "lerobot", "picture"), Word | None),
+    **dict.fromkeys(("reference", "html", "table_file", "lerobot", "picture", "serve.method"), Word | None),
     **dict.fromkeys(("sweep", "host"), Word),
     "project": Word,
     "mode": Literal["offline", "online", "disabled"] | None,
@@ -116,8 +116,7 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("horizon", "n_action_steps"), Count | None),
     "steps": Count,
     "latencies": list[NotNegative],  # none: each method at its own
-    "num_envs": Count,
-    "workers": Count,
+    **dict.fromkeys(("num_envs", "workers"), Count),
     "backend": Literal["process", "ray"],
     **dict.fromkeys(("skipped_layers", "warmup"), Whole),
     "quality": Word,
@@ -133,9 +132,7 @@ OPTIONS: dict[str, Any] = {
     **dict.fromkeys(("compile", "instruction_sets", "calibrated", "world"), bool),
     "tables": Annotated[list[Literal["call", "engines"]], Field(min_length=1)],
     "batches": Annotated[list[Count], Field(min_length=1)],
-    **dict.fromkeys(
-        ("shape", "instruction", "profile_policy.task", "serve.task", "serve.method"), Word | None
-    ),
+    **dict.fromkeys(("shape", "instruction", "profile_policy.task", "serve.task"), Word | None),
     "threads": Count | None,
     "thread_counts": Annotated[list[Annotated[int, Field(ge=1, le=64)]], Field(min_length=1)],
     "hz": Positive | None,
