@@ -42,7 +42,7 @@ test-rest: $(VENV)/.ray
 
 test-all: test test-rest
 
-# Against other people's packages, each in an environment of its own: LeRobot needs Python 3.12 and numpy 2.
+# Against other people's packages: LeRobot in an environment of its own, since it needs Python 3.12 and numpy 2.
 PEER_PYTHON ?= python3.12
 LEROBOT := .venv-lerobot
 $(LEROBOT)/.installed: tests/peers/lerobot/requirements.txt
@@ -52,6 +52,7 @@ $(LEROBOT)/.installed: tests/peers/lerobot/requirements.txt
 	touch $@
 
 test-peers: install $(LEROBOT)/.installed
+	$(BIN)/python -m pip install --quiet openpi-client==0.1.2
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 0 tests/peers
 
 $(VENV)/.ray: $(VENV)/.installed

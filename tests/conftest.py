@@ -18,7 +18,7 @@ def ctrl_c_interrupts():
 
 
 FULL = (
-    "pinned", "torture", "studies", "envs", "training", "data", "options",
+    "pinned", "torture", "peers", "studies", "envs", "training", "data", "options",
     "evaluation/accelerate", "evaluation/benchmarks", "evaluation/figures", "evaluation/rollouts",
     "cli/test_sweep_recipe.py", "evaluation/results/test_engine_report.py",
     "evaluation/statistics/test_sequential.py", "cli/test_recipe.py", "control/test_matrix.py",

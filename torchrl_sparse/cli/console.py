@@ -33,6 +33,7 @@ RECIPES = {
         *("plan", "benchmark", "benchmark_vla", "realtime", "profile", "sweep"),
         *("compare", "report"),
     ),
+    "Robots": ("serve",),
 }
 """What one wants -> the recipes for it, all in the order in which they are used."""
 

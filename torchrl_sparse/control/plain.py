@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -37,34 +37,59 @@ class PlainLoop:
         self._past: dict[str, deque[Tensor]] = {
             key[1]: deque(maxlen=policy.n_obs_steps) for key in executor.in_keys if key[0] == "history"
         }
-        self._now = {key[1] for key in executor.in_keys if key[0] == "observation"} - self._past.keys()
+        self._now: dict[str, Tensor] = {}
+        self._read_now = {key[1] for key in executor.in_keys if key[0] == "observation"} - self._past.keys()
         self._carried: TensorDictBase = TensorDict()
+
+    @property
+    def names(self) -> set[str]:
+        """What an observation consists of."""
+        return self._past.keys() | self._read_now
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the action of the current step; see `ChunkExecutor.act`."""
-        if observation.keys() != self._past.keys() | self._now:
-            expected, got = sorted(self._past.keys() | self._now), sorted(observation)
+        self.remember(observation)
+        for key, value in self.reads().items():
+            self._carried[key] = value
+        device = self._policy.normalizer.state_scale.device
+        self._carried = self._executor(self._carried.to(device)).detach()
+        self.advance()
+        return self._carried[self._executor.tensor_keys["action"]].cpu().numpy()
+
+    def remember(self, *observations: Mapping[str, np.ndarray]) -> None:
+        """Take observations into the history, oldest first; the last is that of the current step.
+
+        Raises:
+            InputError: as of `ChunkExecutor.act`; none of them is kept, so that they can be handed over again mended.
+        """
+        for step in [self._check(observation) for observation in observations]:
+            for name, past in self._past.items():
+                past.extend([step[name]] * (1 if past else past.maxlen or 1))
+            self._now = {name: step[name] for name in self._read_now}
+
+    def reads(self) -> dict[NestedKey, Tensor]:
+        """Return what the executor reads at the current step, but for what its last call left."""
+        read: dict[NestedKey, Tensor] = {
+            keys.history(name): torch.stack([*past]) for name, past in self._past.items()
+        }
+        read |= {("observation", name): value for name, value in self._now.items()}
+        read[keys.IS_INIT] = torch.tensor([self._step == 0])
+        if self._seed is not None:
+            read[keys.EPISODE_SEED] = torch.tensor([self._seed])
+            read[keys.EPISODE_STEP] = torch.tensor([self._step])
+        return read
+
+    def advance(self) -> None:
+        """Go on to the next step."""
+        self._step += 1
+
+    def _check(self, observation: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+        if observation.keys() != self.names:
+            expected, got = sorted(self.names), sorted(observation)
             raise InputError(
                 f"observation: expected {', '.join(expected)}, got {', '.join(got) or 'nothing'}"
             )
-        # everything is checked before anything is kept, so that a refused observation can be handed over again mended
-        read = {name: self._read(name, np.asarray(value)) for name, value in observation.items()}
-        td = self._carried
-        for name, past in self._past.items():
-            past.extend([read[name]] * (1 if past else past.maxlen or 1))
-            td[keys.history(name)] = torch.stack([*past])
-        for name in self._now:
-            td["observation", name] = read[name]
-        td[keys.IS_INIT] = torch.tensor([self._step == 0])
-        if self._seed is not None:
-            td[keys.EPISODE_SEED], td[keys.EPISODE_STEP] = (
-                torch.tensor([self._seed]),
-                torch.tensor([self._step]),
-            )
-        device = self._policy.normalizer.state_scale.device
-        self._carried = self._executor(td.to(device)).detach()
-        self._step += 1
-        return self._carried[self._executor.tensor_keys["action"]].cpu().numpy()
+        return {name: self._read(name, np.asarray(value)) for name, value in observation.items()}
 
     def _read(self, name: str, value: np.ndarray) -> Tensor:
         if name in ("image", "wrist_image", *getattr(self._policy.vision, "cameras", ())):
@@ -79,9 +104,11 @@ def _numbers(name: str, value: np.ndarray, size: int | None) -> Tensor:
         raise InputError(f"{expected}, got dtype {value.dtype}")
     if value.ndim != 1 or size not in (None, len(value)):
         raise InputError(f"{expected}, got shape {value.shape}")
-    if not np.isfinite(value).all():
-        raise InputError(f"{expected}, got {value.tolist()}")
-    return torch.from_numpy(value.astype(np.float32))
+    with np.errstate(over="ignore"):
+        numbers = value.astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{expected} of float32, got {value.tolist()}")
+    return torch.from_numpy(numbers)
 
 
 def _image(name: str, value: np.ndarray, size: tuple[int, int]) -> Tensor:
