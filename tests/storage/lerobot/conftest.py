@@ -1,6 +1,6 @@
 """Two `multi_task_dit` policies of random weights, and what LeRobot 0.6.1 answers (``reference.safetensors``).
 
-LeRobot wrote them, by `tests/peers/lerobot/write_policies.py` in an environment of its own; `make test-peers` makes all variants
+LeRobot wrote them, by `tests/peers/lerobot/write_policies.py` in its own environment; `make test-peers` makes all variants
 again and compares.
 """
 
