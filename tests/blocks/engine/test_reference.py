@@ -25,7 +25,7 @@ class TracingNetwork:
 
     n_layer, num_blocks = NUM_LAYERS, NUM_BLOCKS
     horizon, input_dim, n_obs_steps, cond_dim = HORIZON, ACTION_DIM, OBS_STEPS, COND_DIM
-    pos_emb = torch.zeros(1)
+    like = torch.zeros(1)
 
     def __init__(self):
         self.step = -1

@@ -217,7 +217,7 @@ VLA, SHAPE = "policy=assets/vla", "shape=low_dim"
         (["tables=[engines]", "hz=50"], "hz: expected null without the table call, got 50"),
         (["tables=[blocks]"], "tables: 0: expected 'call' or 'engines', got 'blocks'"),
         (["sampler=magic"], "sampler: expected KIND[STEPS]"),
-        (["engine=torch"], "engine: expected 'auto', 'native', 'native_bf16' or 'native_int8', got 'torch'"),
+        (["engine=torch"], "engine: expected native, got torch"),
         (["device=abacus"], "device: expected one that this machine and PyTorch have, got 'abacus'"),
         (["thread_counts=[2,0]"], "thread_counts: 1: expected greater than or equal to 1, got 0"),
         (["policy=nowhere"], "policy: expected a folder that holds config.json, or a .ckpt"),

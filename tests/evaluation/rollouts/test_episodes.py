@@ -157,7 +157,7 @@ def test_damage_before_the_last_line_names_the_line(path):
     missing = json.loads(lines[1])
     del missing["queries"]
     path.write_text("\n".join([lines[0], json.dumps(missing)]) + "\n")
-    with refused("bac.jsonl:2: policy calls"):
+    with refused("bac.jsonl:2: queries"):
         EpisodeLog(path)
 
 

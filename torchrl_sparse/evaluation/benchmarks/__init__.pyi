@@ -14,7 +14,7 @@ from .film import (
     film_masks as film_masks,
     film_tokens as film_tokens,
 )
-from .late import RealtimeBenchmark as RealtimeBenchmark
+from .delayed import RealtimeBenchmark as RealtimeBenchmark
 from .rounds import (
     episode_horizon as episode_horizon,
     make_design as make_design,
