@@ -1,4 +1,4 @@
-"""Find out where the time of one policy call goes, or of the simulated world between two.
+"""Find out where the time of one policy call goes.
 
     python recipes/profile_policy.py policy=assets/lift                                  # parts, threads and tail of a call
     python recipes/profile_policy.py policy=assets/lift tables=[engines] batches=[1,16]  # every engine against PyTorch eager

@@ -75,5 +75,5 @@ def test_the_answers_are_those_of_the_policy(policy, targets):
 
 
 def test_too_few_draws_are_refused(policy, targets):
-    with refused("got 2 draws of 4 policy calls"):
+    with refused("got 2 draws of 4 calls"):
         carried_noise(policy, targets, Sampler("ddim", 2), draws=2)

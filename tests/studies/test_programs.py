@@ -76,7 +76,7 @@ def test_whether_masks_follow_observations(work, demos, policy):
     oracle = ("oracle.attempts=2", "oracle.draws=3", f"out={work}/looking")
     looked = run("studies.looking", f"policy={policy}", pruner, *few, *oracle)
     assert "own_minus_mean: " in looked
-    assert "policy call minus all: " in looked
+    assert "query minus all: " in looked
     assert "reuse of own: cosine similarity" in looked
     for name in ("looking_Lift.png", "reuse_sources_Lift.png"):
         assert iio.imread(work / "looking" / name).std() > 5

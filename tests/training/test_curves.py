@@ -35,7 +35,7 @@ def test_what_a_resumed_training_logged_twice_counts_once(folder):
 
 
 def test_missing_curves_and_folders_are_named(folder, tmp_path):
-    (folder / "scalars" / "train" / "rate_CA.csv").unlink()
+    (folder / "scalars" / "train" / "rate_SA.csv").unlink()
     with refused("curves"):
         plot_pruner_curves(read_scalars(folder), folder / "curves.png", rate=0.9)
     with refused("scalars", FileNotFoundError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import inspect
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -140,6 +141,11 @@ def _read_options(folder: Path, name: str, positional: str | None) -> list[DictC
         patch.object(sys, "argv", words),
     ):  # so that Hydra raises its errors instead of printing them
         hydra.main(version_base=None, config_path=str(folder), config_name=name)(note)()
+    for (
+        logger
+    ) in logging.root.manager.loggerDict.values():  # Hydra's setting has switched off those that were there
+        if isinstance(logger, logging.Logger) and logger.name.startswith("torchrl_sparse"):
+            logger.disabled = False
     return read
 
 

@@ -38,8 +38,8 @@ def rotary_angles(tokens: int, size: int, base: float) -> tuple[Tensor, Tensor]:
 
     Number j and number j + size / 2 of a head are a pair, which turns by ``position * base ** (-2 j / size)``.
 
-    >>> [values[1].tolist() for values in rotary_angles(2, 2, 10000.0)]
-    [[0.5403022766113281, 0.5403022766113281], [0.8414709568023682, 0.8414709568023682]]
+    >>> [[round(value, 6) for value in values[1].tolist()] for values in rotary_angles(2, 2, 10000.0)]
+    [[0.540302, 0.540302], [0.841471, 0.841471]]
     """
     frequency = 1.0 / (base ** (torch.arange(0, size, 2).float() / size))
     angle = torch.outer(torch.arange(tokens).float(), frequency).repeat(1, 2)

@@ -76,6 +76,7 @@ class Sampler:
             ``clip_sample_range`` that is not positive.
 
     Examples:
+        >>> import torch
         >>> sampler = Sampler("ddim", num_inference_steps=10)
         >>> sampler.timesteps.tolist()
         [90, 80, 70, 60, 50, 40, 30, 20, 10, 0]

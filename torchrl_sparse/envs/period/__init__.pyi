@@ -1,0 +1,1 @@
+from .control import ControlPeriod as ControlPeriod
