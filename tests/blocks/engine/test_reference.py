@@ -23,7 +23,7 @@ def dense_loop(network, sampler, noise, cond):
 class TracingNetwork:
     """Stands in for the network: block b of step k outputs the number 100 k + b, which shows every reuse."""
 
-    n_layer, num_blocks = NUM_LAYERS, NUM_BLOCKS
+    n_layer, num_blocks, block_types = NUM_LAYERS, NUM_BLOCKS, ("SA", "CA", "FFN")
     horizon, input_dim, n_obs_steps, cond_dim = HORIZON, ACTION_DIM, OBS_STEPS, COND_DIM
     like = torch.zeros(1)
 

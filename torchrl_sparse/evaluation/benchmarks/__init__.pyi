@@ -2,6 +2,7 @@ from .benchmark import (
     Benchmark as Benchmark,
     BenchmarkOptions as BenchmarkOptions,
 )
+from .delayed import RealtimeBenchmark as RealtimeBenchmark
 from .diffusion import (
     DiffusionBenchmark as DiffusionBenchmark,
     default_methods as default_methods,
@@ -14,7 +15,6 @@ from .film import (
     film_masks as film_masks,
     film_tokens as film_tokens,
 )
-from .delayed import RealtimeBenchmark as RealtimeBenchmark
 from .rounds import (
     episode_horizon as episode_horizon,
     make_design as make_design,
