@@ -136,7 +136,11 @@ def asks_policies(path):
     "recipe", [path.stem for path in sorted(RECIPES.glob("*.yaml")) if asks_policies(path)]
 )
 def test_every_recipe_that_asks_a_policy_takes_a_device_and_refuses_a_missing_one(fail, tmp_path, recipe):
-    out = () if "out" not in yaml.safe_load((RECIPES / f"{recipe}.yaml").read_text()) else (f"out={tmp_path}/out",)
+    out = (
+        ()
+        if "out" not in yaml.safe_load((RECIPES / f"{recipe}.yaml").read_text())
+        else (f"out={tmp_path}/out",)
+    )
     line = fail(recipe, "device=abacus", *out)
     assert line.startswith("device: expected one that this machine and PyTorch have, got 'abacus'")
     assert not any(tmp_path.iterdir())
