@@ -128,6 +128,13 @@ def test_settings_changed_between_steps_are_followed(lift):
         assert_same(lift, own)
 
 
+@pytest.fixture(autouse=True)
+def _logs(monkeypatch):
+    """Whatever Hydra has switched off in this process."""
+    monkeypatch.setattr(control._log, "disabled", False)
+    monkeypatch.setattr(control._log, "propagate", True)
+
+
 def told(caplog):
     return [record.getMessage() for record in caplog.records if record.name == control.__name__]
 
