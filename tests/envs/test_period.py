@@ -129,10 +129,11 @@ def test_settings_changed_between_steps_are_followed(lift):
 
 
 @pytest.fixture(autouse=True)
-def _logs(monkeypatch):
+def _logs(monkeypatch, caplog):
     """Whatever Hydra has switched off in this process."""
     monkeypatch.setattr(control._log, "disabled", False)
     monkeypatch.setattr(control._log, "propagate", True)
+    caplog.set_level(logging.WARNING)
 
 
 def told(caplog):
