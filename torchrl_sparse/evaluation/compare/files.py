@@ -31,7 +31,7 @@ def read_methods(paths: Sequence[str | os.PathLike], errors: Errors = "refuse") 
     """Read the episodes of all methods in these files, in their order; of ours dense is the first.
 
     A method is called as its file calls it; one of a file that names none, as the file or, where that says nothing, its
-    folder. Names that stand twice are told apart by their files.
+    folder. Methods of the same name get the name of their file as a prefix.
 
     Args:
         paths: of files, or of folders that hold ``results.json``, ``eval_info.json`` or logs of episodes.

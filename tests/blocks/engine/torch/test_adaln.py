@@ -1,4 +1,4 @@
-"""The engine of adaptive layer norms gives what the reference does, whatever is pruned, reused or drawn to a guide."""
+"""AdaLNEngine against the reference: masks, reuse rules and guidance."""
 
 import copy
 import pickle
