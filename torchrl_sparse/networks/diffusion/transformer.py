@@ -131,7 +131,7 @@ class TransformerForDiffusion(Denoiser):
 
     @property
     def like(self) -> nn.Parameter:
-        """Return the current shapes of the weights, which may have been replaced; see ``made_shapes``."""
+        """See `Denoiser.like`."""
         return self.pos_emb
 
     def _build(self) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
 from torch import Tensor
 
@@ -12,6 +9,7 @@ from torchrl_sparse.blocks.engine.base import Overhead, check_query
 from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.torch.adaln import AdaLNTables, run_loop
 from torchrl_sparse.blocks.engine.torch.linear import can_pack
+from torchrl_sparse.blocks.engine.torch.precision import weights_precision
 from torchrl_sparse.blocks.engine.torch.program import build_loop
 from torchrl_sparse.blocks.engine.weights import WeightWatch
 from torchrl_sparse.blocks.mask import NetworkSizes, Reuse, block_macs
@@ -69,7 +67,7 @@ class AdaLNEngine:
         check_query(self._network, self._sampler, noise, cond, mask, reuse, guide)
         if not len(cond):
             return torch.empty_like(noise[:, 0])
-        with _in_weights_type(self._network.like.device):
+        with weights_precision(self._network.like.device):
             tables = self._current()
             masks = torch.zeros(1, noise.shape[1], self._network.num_blocks, dtype=torch.bool)
             if mask is not None:
@@ -87,7 +85,7 @@ class AdaLNEngine:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
         network, like = self._network, self._network.like
         types = network.block_types
-        with _in_weights_type(like.device):
+        with weights_precision(like.device):
             tables = self._current()
             x, modulation = like.new_zeros(1, network.horizon, network.n_emb), tables.time[0]
 
@@ -115,14 +113,7 @@ class AdaLNEngine:
         state = self._watch.state()
         known, tables = self._known  # read and replaced in one go: other threads may do the same
         if known != state:
-            with _in_weights_type(self._network.like.device):
+            with weights_precision(self._network.like.device):
                 tables = AdaLNTables(self._network, self._sampler)
             self._known = state, tables
         return tables
-
-
-@contextmanager
-def _in_weights_type(device: torch.device) -> Iterator[None]:
-    """Compute without gradients and in the type of the weights, which autocast would change."""
-    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-        yield

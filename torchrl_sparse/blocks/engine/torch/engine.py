@@ -9,8 +9,6 @@ network, observations once per query, cross-attention reads folded memory
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -22,6 +20,7 @@ from torchrl_sparse.blocks.engine.timing import time_blocks
 from torchrl_sparse.blocks.engine.torch.graphs import padded_batch
 from torchrl_sparse.blocks.engine.torch.linear import can_pack
 from torchrl_sparse.blocks.engine.torch.pool import WorkspacePool
+from torchrl_sparse.blocks.engine.torch.precision import weights_precision
 from torchrl_sparse.blocks.engine.torch.program import build_loop
 from torchrl_sparse.blocks.engine.torch.tables import Tables
 from torchrl_sparse.blocks.engine.weights import WeightWatch
@@ -95,7 +94,7 @@ class TorchEngine:
         if not len(cond):
             return torch.empty_like(noise[:, 0])
         tables, pool = self._current()
-        with _in_weights_type(tables.device):
+        with weights_precision(tables.device):
             actions = self._denoise(tables, pool, noise, cond, mask, reuse, guide)
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
@@ -106,7 +105,7 @@ class TorchEngine:
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
         """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_seconds`."""
         tables, pool = self._current()
-        with _in_weights_type(tables.device), pool.take(1, self._network.num_blocks) as workspace:
+        with weights_precision(tables.device), pool.take(1, self._network.num_blocks) as workspace:
             return time_blocks(workspace.walk, BLOCK_TYPES, self._network.n_layer, repeats, tables.device)
 
     def block_macs(self) -> tuple[int, int, int]:
@@ -124,7 +123,7 @@ class TorchEngine:
         if known != state:
             # Frozen tensors look at every operation: the tables are made of a copy's.
             network = self._network if Frozen.of(self._network) is None else copy.deepcopy(self._network)
-            with _in_weights_type(network.pos_emb.device):
+            with weights_precision(network.pos_emb.device):
                 tables = Tables(network, self._sampler)
             pool = WorkspacePool(tables)
             self._known = state, tables, pool
@@ -154,13 +153,6 @@ class TorchEngine:
             return np.zeros((1, self._sampler.num_inference_steps, self._network.num_blocks), bool)
         host = mask.cpu().numpy()
         return host[:1] if (host == host[0]).all() else host
-
-
-@contextmanager
-def _in_weights_type(device: torch.device) -> Iterator[None]:
-    """Compute without gradients and in the type of the weights, which autocast would change."""
-    with torch.inference_mode(), torch.autocast(device.type, enabled=False):
-        yield
 
 
 def _padded(
