@@ -120,7 +120,7 @@ def counted_episodes(path: Path, results: Results, name: str, n: int) -> list[Ep
 
     Raises:
         FileNotFoundError: if there is no log.
-        ValueError: if the log lacks some of them.
+        InputError: if the log lacks some of them.
     """
     first, log = results.first_seed, path.parent / "episodes" / f"{name}.jsonl"
     found = [episode for episode in read_episodes(log) if first <= episode.seed < first + n]

@@ -74,6 +74,6 @@ def load_world_profile(path: str | Path) -> WorldProfile:
 
     Raises:
         FileNotFoundError: if it is not there.
-        ValueError: if it is of another version or not as `WorldProfile` says.
+        InputError: if it is of another version or not as `WorldProfile` says.
     """
     return read_json(path, WorldProfile)

@@ -68,7 +68,7 @@ class AdaLNTransformer(Denoiser):
         positions: whether a learned vector is added to each token.
 
     Raises:
-        ValueError: if a size is no positive number or far too large, or widths do not divide.
+        InputError: if a size is no positive number or far too large, or widths do not divide.
 
     Examples:
         >>> network = AdaLNTransformer(input_dim=7, horizon=16, n_obs_steps=2, cond_dim=30, n_layer=2, n_emb=64)

@@ -35,7 +35,7 @@ def tower_sizes(**sizes: Any) -> dict[str, Any]:
     """Check and return the sizes of a tower: ``width``, ``heads``, ``layers``, ``inner``, ``act`` and ``eps``.
 
     Raises:
-        ValueError: if one is no positive number or far too large, or ``act`` is not known.
+        InputError: if one is no positive number or far too large, or ``act`` is not known.
     """
     for name in ("width", "heads", "inner"):
         check_size(name, sizes[name], _MAX_WIDTH)
@@ -154,7 +154,7 @@ class ClipText(nn.Module):
         """Encode one instruction.
 
         Raises:
-            ValueError: if an id is none of the vocabulary, or there are none or too many.
+            InputError: if an id is none of the vocabulary, or there are none or too many.
         """
         if not 1 <= len(ids) <= self.tokens or not all(0 <= number < self.words for number in ids):
             raise InputError(

@@ -38,7 +38,7 @@ class ClipEncoder(nn.Module):
         instruction: what a call without one is told to do; None has no such.
 
     Raises:
-        ValueError: if a size is out of range, or images do not become as large as the tower's.
+        InputError: if a size is out of range, or images do not become as large as the tower's.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class ClipEncoder(nn.Module):
         """Return the features [*B, feature_dim] of images by camera, u8 [*B, 3, h, w] or floats in [0, 1].
 
         Raises:
-            ValueError: if images have another type or size.
+            InputError: if images have another type or size.
         """
         return torch.cat([self._encode(index, images[name]) for index, name in enumerate(self.cameras)], -1)
 
@@ -119,7 +119,7 @@ class ClipEncoder(nn.Module):
         """Return the features [N, text_dim] of N instructions, each computed once as long as weights stay.
 
         Raises:
-            ValueError: if one is not known and there is no tokenizer.
+            InputError: if one is not known and there is no tokenizer.
         """
         keyed = {text: tuple(self._ids(text)) for text in dict.fromkeys(instructions)}
         if torch.is_grad_enabled():
@@ -151,7 +151,7 @@ class ClipEncoder(nn.Module):
         The dictionary is kept, so that the source notes what is tokenised later.
 
         Raises:
-            ValueError: if they are no texts with token ids.
+            InputError: if they are no texts with token ids.
         """
         known = source.get("instructions", {})
         for text, ids in known.items() if isinstance(known, dict) else [("", None)]:

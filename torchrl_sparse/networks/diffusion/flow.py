@@ -29,7 +29,7 @@ def flow_times(num_steps: int, chosen: Sequence[float] | None = None) -> Tensor:
     """Return the time of each step, rising from 0, and 1 after the last, f32 [K + 1].
 
     Raises:
-        ValueError: unless ``chosen`` are ``num_steps`` numbers that rise, from at least 0 to below 1.
+        InputError: unless ``chosen`` are ``num_steps`` numbers that rise, from at least 0 to below 1.
 
     >>> flow_times(4).tolist(), flow_times(2, [0, 0.5]).tolist()
     ([0.0, 0.25, 0.5, 0.75, 1.0], [0.0, 0.5, 1.0])

@@ -54,7 +54,7 @@ def sampler_steps(sampler: Any, chosen: Sequence[float] | None) -> dict[str, Any
         chosen: timesteps, or None where the spacing decides.
 
     Raises:
-        ValueError: naming the argument.
+        InputError: naming the argument.
     """
     kind, num_steps, spacing = sampler.kind, sampler.num_inference_steps, sampler.spacing
     if kind == "flow":

@@ -34,7 +34,7 @@ class LoadablePolicy(FreezablePolicy):
         A policy that was saved with rounded weights rounds them again under ``engine="auto"``; ``"native"`` does not.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, what was expected in it and what was found.
+            FileNotFoundError, InputError: naming the file, what was expected in it and what was found.
         """
         if is_lerobot(Path(path)):
             return cls.from_lerobot(path, engine=engine)
@@ -72,7 +72,7 @@ class LoadablePolicy(FreezablePolicy):
         folder or in the one that its configuration names; ``tokens``, text -> ids, are for policies without.
 
         Raises:
-            FileNotFoundError, ValueError: naming the file, the entry, what was expected and what came.
+            FileNotFoundError, InputError: naming the file, the entry, what was expected and what came.
         """
         return cls._assemble(read_lerobot(Path(path), task=task, tokens=tokens), engine)
 

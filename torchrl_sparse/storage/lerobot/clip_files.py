@@ -42,7 +42,7 @@ def clip_facts(folder: Path, entry: str, name: str, tower: str) -> ClipFacts:
         tower: ``"vision_config"`` or ``"text_config"``.
 
     Raises:
-        ValueError: naming the entry, if there is no such folder and the name is not OpenAI's.
+        InputError: naming the entry, if there is no such folder and the name is not OpenAI's.
     """
     file = _beside(folder, name, "config.json")
     if file is None:
@@ -70,7 +70,7 @@ def find_tokenizer(folder: Path, step: TokenizerStep, name: str) -> Callable[[st
     """Return what makes token ids of a text, or None where no ``tokenizer.json`` lies beside the policy.
 
     Raises:
-        ValueError: naming the file, if it holds no tokenizer.
+        InputError: naming the file, if it holds no tokenizer.
         ImportError: if the package that reads it is not installed.
     """
     file = folder / "tokenizer.json"

@@ -138,7 +138,7 @@ def read_config(folder: Path) -> MultiTaskDitConfig:
 
     Raises:
         FileNotFoundError: if it is not there.
-        ValueError: naming file and entry, what was expected and what came.
+        InputError: naming file and entry, what was expected and what came.
     """
     file = folder / _NAME
     kind = read_json(file, dict[str, Any]).get("type")

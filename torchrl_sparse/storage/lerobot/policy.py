@@ -46,7 +46,7 @@ def read_lerobot(
 
     Raises:
         FileNotFoundError: if a file is not there.
-        ValueError: naming file and entry, what was expected and what came.
+        InputError: naming file and entry, what was expected and what came.
     """
     check_folder(folder)
     config = read_config(folder)

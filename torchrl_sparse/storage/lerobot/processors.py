@@ -96,7 +96,7 @@ def read_processors(folder: Path, shapes: dict[str, tuple[int, ...]]) -> Process
 
     Raises:
         FileNotFoundError: if a file is not there.
-        ValueError: naming file and entry, what was expected and what came.
+        InputError: naming file and entry, what was expected and what came.
     """
     before, after = (
         _steps(folder / _PRE, "normalizer_processor"),

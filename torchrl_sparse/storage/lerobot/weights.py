@@ -39,7 +39,7 @@ def shapes_in(file: Path) -> dict[str, tuple[int, ...]]:
 
     Raises:
         FileNotFoundError: if it is not there.
-        ValueError: naming it, if it is damaged or one of several.
+        InputError: naming it, if it is damaged or one of several.
     """
     if not file.is_file():
         if file.with_name(f"{WEIGHTS}.index.json").is_file() or [*file.parent.glob("model-*.safetensors")]:
@@ -90,7 +90,7 @@ def load_weights(
         the states of network and encoder, the latter without the cameras' statistics.
 
     Raises:
-        ValueError: naming the tensor, if one is missing, unknown, of another shape or not finite.
+        InputError: naming the tensor, if one is missing, unknown, of another shape or not finite.
     """
     names = {_network_name(name, config.use_rope): name for name in network.state_dict()}
     seen = {

@@ -1,6 +1,6 @@
 """The PyTorch engine of denoisers with adaptive layer norms (`AdaLNTransformer`): fewer operations, the same results.
 
-What is exact, and saved in dense queries too: a modulation is a sum of a part of the timestep, tabulated with the sampler,
+What is exact, and saved in dense policy calls too: a modulation is a sum of a part of the timestep, tabulated with the sampler,
 and a part of the observations, computed once a query, so that its matrices are read once instead of K times; angles of RoPE
 are tabulated, the pairs that they turn lie beside each other, so that turning is one complex product; layers' matrices are
 packed. Modulations of pruned blocks are not added up. A step without a computed block is its embedding, a sum and the head.
@@ -34,7 +34,7 @@ class AdaLNTables:
     """A snapshot of the weights of a network's layers, prepared, and of the sampler.
 
     Args:
-        network: the denoiser; what observations modulate is read from it in each query.
+        network: the denoiser; what observations modulate is read from it in each policy call.
         sampler: the sampler.
 
     Attributes:
@@ -136,7 +136,7 @@ def _modulated(x: Tensor, modulation: Tensor) -> Tensor:
 def run_loop(
     tables: AdaLNTables, loop: Loop, noise: Tensor, cond: Tensor, reuse: str, guide: Guide | None
 ) -> Tensor:
-    """Return the actions [B, H, A] of one query, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
+    """Return the actions [B, H, A] of one policy call, see :meth:`torchrl_sparse.blocks.engine.base.Engine.denoise`.
 
     Args:
         tables: of the network and the sampler.

@@ -78,7 +78,7 @@ class AdaLNEngine:
         return actions.clone()  # made outside of inference mode, it can be used anywhere
 
     def refresh(self) -> None:
-        """Tabulate the weights again in the next query."""
+        """Tabulate the weights again in the next policy call."""
         self._watch.refresh()
 
     def block_seconds(self, repeats: int = 20) -> dict[str, float]:
@@ -96,7 +96,7 @@ class AdaLNEngine:
             return time_blocks(walk, types, network.n_layer, repeats, like.device)
 
     def block_macs(self) -> tuple[int, ...]:
-        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`: without modulations, which a query adds up."""
+        """See :meth:`~torchrl_sparse.blocks.engine.base.Engine.block_macs`: without modulations, which a call adds up."""
         network = self._network
         modulation = 3 * network.n_emb * (network.time_dim + network.n_obs_steps * network.cond_dim)
         return tuple(macs - modulation for macs in block_macs(NetworkSizes.of(network)))
