@@ -1,4 +1,4 @@
-"""Compiled models of one simulator that outlive its resets: most of a reset was compiling meshes that had not changed."""
+"""Compiled models that a simulator keeps between resets, so that unchanged meshes are not compiled again."""
 
 from __future__ import annotations
 

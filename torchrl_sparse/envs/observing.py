@@ -1,4 +1,4 @@
-"""robosuite's observations, of which only those are computed that are asked for and what they are computed from."""
+"""robosuite's observations, computing only the requested ones and their inputs."""
 
 from __future__ import annotations
 

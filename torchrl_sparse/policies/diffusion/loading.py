@@ -24,7 +24,7 @@ __all__ = ["LoadablePolicy"]
 
 
 class LoadablePolicy(FreezablePolicy):
-    """What of a `DiffusionPolicy` makes one of files."""
+    """Part of a `DiffusionPolicy` that loads it from files."""
 
     @classmethod
     def from_pretrained(cls, path: str | Path, *, engine: EngineName = "auto") -> Self:

@@ -42,7 +42,7 @@ def check_vla_engine(name: str) -> None:
 
 
 class VLAEngineSlot:
-    """Holds the engine of a VLA: made when it is first needed, and again when weights or the number of threads change.
+    """Engine of a VLA, made on first use and again when weights or the number of threads change.
 
     Copies and pickles carry the choice, not the engine.
 
@@ -59,7 +59,7 @@ class VLAEngineSlot:
         self._made: _Made | None = None
 
     def get(self, network: VLANetwork) -> VLAEngine:
-        """Return what computes ``network``: itself where gradients may be asked for or somebody looks at its layers.
+        """Return the engine of ``network``, or the network itself if gradients or forward hooks are in use.
 
         Raises:
             InputError: if the chosen engine cannot run the network; the message says why.
@@ -86,7 +86,7 @@ class VLAEngineSlot:
         return self.name
 
     def describe(self, network: VLANetwork) -> str:
-        """Say which engine runs and on what; and why not a faster one."""
+        """Describe the engine and its device; for ``"auto"``, also why faster engines were not used."""
         name, weight = self.choose(network), next(network.parameters())
         why_not = {}
         if self.name == "auto":
@@ -140,7 +140,7 @@ class _Made:
 
 
 class RunsInEngine:
-    """What of a `VLAPolicy` is about its engine."""
+    """Part of a `VLAPolicy` that chooses and describes its engine."""
 
     network: VLANetwork
     _slot: VLAEngineSlot
@@ -155,7 +155,7 @@ class RunsInEngine:
         self._slot = VLAEngineSlot(name)
 
     def current_engine(self) -> VLAEngine:
-        """Return what computes the network in a call now: the network itself or what was compiled of it."""
+        """Return the engine of the next call: the network itself or its compiled parts."""
         return self._slot.get(self.network)
 
     def engine_info(self) -> str:

@@ -21,7 +21,7 @@ __all__ = ["AdaLNEngine"]
 
 
 class AdaLNEngine:
-    """Runs programs of an `AdaLNTransformer` in PyTorch. Not differentiable; safe to share between threads.
+    """Engine that runs programs of an `AdaLNTransformer` in PyTorch. Not differentiable; safe to share between threads.
 
     Weights are tabulated, and again when they are found changed
     (:class:`~torchrl_sparse.blocks.engine.weights.WeightWatch`).
